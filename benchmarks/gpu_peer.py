@@ -108,7 +108,7 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         peer.gradient(photo)
         optimizer.step()
 
-    capacity = step.trainer._runner.capacity
+    capacity = step.trainer.runner.capacity
     parameters = {
         name: p.clone().requires_grad_() for name, p in step.trainer.gaussians.parameters().items()
     }
@@ -145,7 +145,7 @@ def _our_image(step: Step) -> Tensor:
     camera = step.camera
     splats = project(step.trainer.gaussians, camera)
     return ops.rasterize(
-        splats, camera.width, camera.height, capacity=step.trainer._runner.capacity
+        splats, camera.width, camera.height, capacity=step.trainer.runner.capacity
     )[0]
 
 

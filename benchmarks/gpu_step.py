@@ -33,6 +33,7 @@ from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import AdaptiveDensity
+from snowsplat.training.parts.densification import Densification
 from snowsplat.util.native_layout import Params
 
 GPU = torch.device("cuda")
@@ -76,10 +77,10 @@ class Step:
         )
         gaussians = scene.gaussians.to(device)
         trainer.gaussians = gaussians
-        trainer._optimizer = Adam(
+        trainer.optimizer = Adam(
             gaussians, CONFIG.learning_rates, schedule=trainer.schedule, extent=EXTENT
         )
-        trainer._density = CONFIG.density.control(
+        trainer.part(Densification).control = CONFIG.density.control(
             len(gaussians),
             schedule=trainer.schedule,
             extent=EXTENT,
@@ -87,8 +88,8 @@ class Step:
             generator=torch.Generator(),
             device=device,
         )
-        trainer._runner = StepRunner(len(gaussians), device)
-        trainer._runner.capacity.instances = (
+        trainer.runner = StepRunner(len(gaussians), device)
+        trainer.runner.capacity.instances = (
             INITIAL_INSTANCES_PER_GAUSSIAN * len(gaussians) if capacity is None else capacity
         )
         self.view = view
@@ -112,11 +113,11 @@ class Step:
         """A complete step, repeated until the capacity suffices; returns its loss."""
         gaussians = self.trainer.gaussians
         views, photos = [self.view], [self.photo]
-        return self.trainer._runner.run(self.queue, STEP, gaussians, views, photos)[0]
+        return self.trainer.runner.run(self.queue, STEP, gaussians, views, photos)[0]
 
     def wait(self) -> None:
         """Wait for the loss of the step that was queued last."""
-        self.trainer._runner._readback.wait()
+        self.trainer.runner._readback.wait()
 
     @torch.no_grad()
     def counts(self) -> dict[str, int]:
@@ -127,7 +128,7 @@ class Step:
         return {
             "gaussians": len(gaussians),
             "seen": int((splats.ids >= 0).sum()),
-            "instances": int(self.trainer._runner.capacity.required),
+            "instances": int(self.trainer.runner.capacity.required),
             "pairs": int(ops.count_blended(splats, camera.width, camera.height).double().sum()),
             "width": camera.width,
             "height": camera.height,

@@ -33,6 +33,7 @@ from snowsplat.pipeline.run import processes
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import project
 from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.run_state import row_tensors
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.processes.process_shards import ProcessShards
 from snowsplat.training.processes.shards import Shards
@@ -85,7 +86,7 @@ def work(size: str, batch: int, folder: Path) -> None:
             seconds.append(time.perf_counter() - start)
             sent.append(_sent(shards) - before)
             expected.append(sent_bytes(rows, shards.rank) if shards.size > 1 else 0)
-        tensors = sum(t.nbytes for t in trainer._shard_tensors().values())
+        tensors = sum(t.nbytes for t in row_tensors(trainer).values())
         result = {
             "rank": shards.rank,
             "gaussians": len(trainer.gaussians),
@@ -127,8 +128,8 @@ def _trainer(size: str, batch: int, folder: Path, shards: Shards) -> Trainer:
 def _rows(trainer: Trainer, shards: Shards) -> np.ndarray:
     """(N, V): the number of splats of each process in each view of the next batch."""
     views = trainer.dataset.train
-    order = trainer._queue.order[: len(views)] or range(len(views))
-    counts = [len(project(trainer.gaussians, trainer.poses.camera(i))) for i in order]
+    order = trainer.queue.order[: len(views)] or range(len(views))
+    counts = [len(project(trainer.gaussians, trainer.cameras.camera(i))) for i in order]
     return shards.table(torch.tensor(counts)).numpy()
 
 

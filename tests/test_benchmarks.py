@@ -379,7 +379,7 @@ def test_the_sanitizer_program_runs_every_op_and_kernel(gpu_modules, monkeypatch
     photo, gaussians = step.photo.planes.clone(), step.trainer.gaussians.clone()
     losses = [step.run(), step.run()]
     assert losses[0] == losses[1] > 0  # the workload does not change
-    assert step.trainer._runner.capacity.instances > 7
+    assert step.trainer.runner.capacity.instances > 7
     assert torch.equal(photo, step.photo.planes)
     for name, parameter in gaussians.parameters().items():
         torch.testing.assert_close(parameter, step.trainer.gaussians.parameters()[name])

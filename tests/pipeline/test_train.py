@@ -13,11 +13,10 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run.train_result import TrainingStopped
-from snowsplat.pipeline.run.training_notes import left_out_line
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core import trainer
-from snowsplat.training.parts import overfitting
+from snowsplat.training.parts import overfitting, unexplained
+from snowsplat.training.parts.unexplained import left_out_line
 from snowsplat.util.errors import SettingError, UserError
 
 
@@ -109,7 +108,7 @@ def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_p
         decided.append([view.name for view in views])
         return 1, 3
 
-    monkeypatch.setattr(trainer, "unexplained_views", unexplained_views)
+    monkeypatch.setattr(unexplained, "unexplained_views", unexplained_views)
     settings = {"iterations": 12, "leave_out_after": 0.5}
     names = ("view_02.png", "view_04.png")
     line = (
@@ -122,7 +121,7 @@ def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_p
         train(dataset, tmp_path, TrainOptions(settings=settings, hold_out=8), observer=recorder)
     assert len(decided) == 1
     assert recorder.notes.count(line) == 1
-    assert recorder.events.index("note", 3) == recorder.events.index("step 7") + 1
+    assert recorder.events.index("note", 3) == recorder.events.index("step 7") - 1
 
     recorder = Recorder()
     result = resume(tmp_path, observer=recorder)
@@ -214,7 +213,7 @@ def test_a_training_that_ends_early_says_so_also_when_resumed(dataset, tmp_path,
     with pytest.raises(TrainingStopped):
         train(dataset, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
     assert recorder.notes.count(line) == 1
-    assert recorder.events.index("note", 3) == recorder.events.index("step 111") + 1
+    assert recorder.events.index("note", 3) == recorder.events.index("step 111") - 1
 
     recorder = Recorder()
     result = resume(tmp_path / "out", observer=recorder)

@@ -7,9 +7,10 @@ import torch
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.recipes import recipe
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts.decay import INTERVAL, Decay, DecayRates
 from snowsplat.util.errors import SettingError
+
+from .stage import stage
 
 
 def scene() -> Gaussians:
@@ -22,10 +23,10 @@ def scene() -> Gaussians:
 
 def test_an_epoch_reduces_opacities_and_scales_by_their_rates():
     views, epochs = 50, 3
-    decay = Decay(DecayRates(opacity=0.04, scale=0.01), views, Schedule(1000))
+    decay = Decay(DecayRates(opacity=0.04, scale=0.01))
     before, after = scene(), scene()
     for step in range(1, views * epochs + 1):
-        decay.after_step(step, after)
+        decay.between(stage(after, step, views=views))
     torch.testing.assert_close(
         after.opacities[1:], math.exp(-0.04 * epochs) * before.opacities[1:], rtol=1e-4, atol=1e-7
     )
@@ -39,7 +40,7 @@ def test_an_epoch_reduces_opacities_and_scales_by_their_rates():
 )
 def test_the_rate_of_the_opacity_is_larger_with_few_views(views, factor):
     before, after = scene(), scene()
-    Decay(DecayRates(opacity=0.04, scale=0.01), views, Schedule(1000)).after_step(INTERVAL, after)
+    Decay(DecayRates(opacity=0.04, scale=0.01)).between(stage(after, INTERVAL, views=views))
     epochs = INTERVAL / views
     expected = math.exp(-0.04 * factor * epochs) * before.opacities
     torch.testing.assert_close(after.opacities[1:], expected[1:], rtol=1e-4, atol=1e-7)
@@ -47,10 +48,10 @@ def test_the_rate_of_the_opacity_is_larger_with_few_views(views, factor):
 
 
 def test_logits_stay_finite():
-    decay = Decay(DecayRates(opacity=5.0), 1, Schedule(10_000))
+    decay = Decay(DecayRates(opacity=5.0))
     gaussians = scene()
     for step in range(1000):
-        decay.after_step(step, gaussians)
+        decay.between(stage(gaussians, step, iterations=10_000))
     assert gaussians.opacity_logits.isfinite().all()
     assert float(gaussians.opacities.max()) < 1e-6
 
@@ -60,15 +61,15 @@ def test_logits_stay_finite():
 )
 def test_it_acts_in_every_tenth_step_until_its_end(step, acts):
     gaussians = scene()
-    decay = Decay(DecayRates(opacity=0.1, scale=0.1, until=0.5), 10, Schedule(1000))
-    decay.after_step(step, gaussians)
+    decay = Decay(DecayRates(opacity=0.1, scale=0.1, until=0.5))
+    decay.between(stage(gaussians, step, views=10))
     assert torch.equal(gaussians.log_scales, scene().log_scales) != acts
     assert torch.equal(gaussians.opacity_logits, scene().opacity_logits) != acts
 
 
 def test_without_rates_nothing_changes():
     gaussians = scene()
-    Decay(DecayRates(), 10, Schedule(1000)).after_step(INTERVAL, gaussians)
+    Decay(DecayRates()).between(stage(gaussians, INTERVAL, views=10))
     for name, tensor in scene().parameters().items():
         assert torch.equal(gaussians.parameters()[name], tensor)
 

@@ -6,11 +6,13 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data import load_dataset
@@ -22,14 +24,16 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
+from snowsplat.training.core.batch import BatchView
 from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.recipes import recipe
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.exposure_start import GAMMA, exposure_start, log_gains
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.processes.shards import ALONE
+
+from .stage import stage
 
 CPU = torch.device("cpu")
 CONFIG = recipe("default", iterations=80, init="points", max_gaussians=1500, sh_degree=0)
@@ -140,32 +144,43 @@ def initial(dataset: Dataset) -> Gaussians:
     return Trainer(dataset, replace(CONFIG, initial_opacity=0.7, exposure="off")).gaussians
 
 
-def exposure_of(setting: str, dataset: Dataset, black: bool = False) -> Exposure:
+def exposure_of(setting: str, dataset: Dataset, notes: list[str] | None = None) -> Exposure:
+    exposure = Exposure(setting)
     with ImageLoader(dataset.train) as images:
-        schedule = Schedule(80)
-        return Exposure(setting, dataset, images, schedule, CPU, ALONE, resumed=False, black=black)
+        run = stage(dataset=dataset, images=images, shards=ALONE, resumed=False)
+        run.note = [].append if notes is None else notes.append
+        exposure.prepare(run)
+    return exposure
+
+
+def exposed(exposure: Exposure, render, photo: LoadedImage, behind: Tensor, black: bool = False):
+    """The image of view 0, and its gains. ``render``: a background → an image."""
+    run = SimpleNamespace(config=SimpleNamespace(background="black" if black else "random"))
+    view = BatchView(0, None, None, photo, behind)
+    image = render(exposure.background(run, view, behind))
+    return exposure.image(run, view, image, photo), exposure._present[view]
 
 
 def test_the_decision(clean, degraded):
     same = load_dataset(clean, hold_out=8)
-    assert exposure_of("auto", degraded).active
-    assert "one gain for each photo and channel is learnt" in exposure_of("auto", degraded).reason
-    assert not exposure_of("auto", same).active
-    assert exposure_of("auto", same).reason.endswith(
-        "(standard deviation, from points); no gains are learnt"
-    )
-    assert exposure_of("on", same).active
-    off = exposure_of("off", degraded)
-    assert (off.active, off.reason, off.state_tensors()) == (False, "", {})
-    unknown = exposure_of("auto", replace(degraded, points=None))
-    assert "not known" in unknown.reason
-    assert not unknown.active
+    notes: list[str] = []
+    assert exposure_of("auto", degraded, notes).active
+    assert "one gain for each photo and channel is learnt" in notes[-1]
+    assert not exposure_of("auto", same, notes).active
+    assert notes[-1].endswith("(standard deviation, from points); no gains are learnt")
+    assert exposure_of("on", same, notes).active
+    assert not exposure_of("auto", replace(degraded, points=None), notes).active
+    assert "not known" in notes[-1]
+    assert len(notes) == 4
+    off = Trainer(same, replace(CONFIG, exposure="off"), note=notes.append)
+    assert off.part(Exposure) is None
+    assert len(notes) == 4
 
 
 @pytest.mark.parametrize("background", [(0.3, 0.9, 0.6), (0.0, 0.0, 0.0)])
 def test_the_gradients_of_the_gains_and_of_the_splats(degraded, background):
     """Those of a scene in float64 whose colours are multiplied by the gains."""
-    exposure, view = exposure_of("on", degraded, black=not any(background)), degraded.train[0]
+    exposure, view = exposure_of("on", degraded), degraded.train[0]
     with ImageLoader(degraded.train) as images:
         photo = images.get(view)
     dark = LoadedImage(photo.planes.clamp(max=253))
@@ -173,11 +188,16 @@ def test_the_gradients_of_the_gains_and_of_the_splats(degraded, background):
     size = view.camera.width, view.camera.height
     exposure.log_gains[0] = at = torch.tensor([0.1, -0.2, 0.05])
 
-    exposure.begin_step()
     splats = project(scene, view.camera, 0)
     splats.packed.requires_grad_()
-    image, _, _ = ops.rasterize(splats, *size, exposure.begin_view(behind, 0))
-    value = view_loss(exposure.exposed(image, dark, 0), dark, behind, 0.2)
+    image, present = exposed(
+        exposure,
+        lambda color: ops.rasterize(splats, *size, color)[0],
+        dark,
+        behind,
+        black=not any(background),
+    )
+    value = view_loss(image, dark, behind, 0.2)
     value.backward()
 
     exact = project(scene.to(dtype=torch.float64), view.camera, 0)
@@ -194,7 +214,7 @@ def test_the_gradients_of_the_gains_and_of_the_splats(degraded, background):
     assert torch.equal(splats.ids, exact.ids)
     for found, true in (
         (splats.packed.grad, exact.packed.grad),
-        (exposure._present[0].grad, gains.grad),
+        (present.grad, gains.grad),
     ):
         assert (found - true).abs().max() < 1e-4 * true.abs().max()
 
@@ -212,14 +232,12 @@ def test_overexposed_pixels_count_only_if_the_image_is_darker(degraded, bright_r
     assert 0 < int(bright.sum()) < bright_rows * 9
     for _ in range(2):  # the second time, the positions may be known
         image = values.permute(1, 2, 0).clone().requires_grad_()
-        exposure.begin_step()
-        exposure.begin_view(torch.zeros(3), 0)
-        found = exposure.exposed(image, photo, 0)
+        found, present = exposed(exposure, lambda color: image, photo, torch.zeros(3))  # noqa: B023
         assert torch.equal(found, torch.where(bright, 1.0, image))
         (found * weights).sum().backward()
         assert torch.equal(image.grad, weights * ~bright)
         expected = (image.detach() * weights * ~bright).sum((0, 1))
-        assert torch.allclose(exposure._present[0].grad, expected, atol=1e-5)
+        assert torch.allclose(present.grad, expected, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -227,9 +245,10 @@ def test_the_training_learns_the_gains(degraded, gains):
     """They stay near the true gains, and the colours of the scene are neutral."""
     trainer = Trainer(degraded, replace(CONFIG, iterations=300, exposure="on"))
     trainer.run()
-    found = trainer.exposure.log_gains
+    exposure = trainer.part(Exposure)
+    found = exposure.log_gains
     assert found.mean(0).abs().max() < 1e-6
-    assert 0.0 < (found - trainer.exposure.start).abs().mean() < 0.03
+    assert 0.0 < (found - exposure.start).abs().mean() < 0.03
     assert np.corrcoef(found.flatten(), gains.flatten())[0, 1] > 0.98
     without = Trainer(degraded, replace(CONFIG, iterations=300, exposure="off"))
     without.run()
@@ -244,9 +263,9 @@ def test_a_resumed_run_has_the_same_bits(degraded, tmp_path, batch):
     first.run(until=15)
     path = checkpoint.save(tmp_path, 15, first.state_tensors(), {})
     second = Trainer(degraded, config, state=checkpoint.load(path).tensors)
-    assert second.exposure.active
+    assert second.part(Exposure).active
     second.run()
-    assert torch.equal(second.exposure.log_gains, whole.exposure.log_gains)
+    assert torch.equal(second.part(Exposure).log_gains, whole.part(Exposure).log_gains)
     for name, tensor in whole.gaussians.parameters().items():
         assert torch.equal(tensor, second.gaussians.parameters()[name]), name
 

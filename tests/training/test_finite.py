@@ -21,6 +21,7 @@ from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import McmcDensity
+from snowsplat.training.parts.densification import Densification
 from snowsplat.util.errors import UserError
 
 from ..ops.engines import launcher
@@ -76,13 +77,13 @@ def test_a_nonfinite_gradient_is_skipped(begun) -> None:
     trainer = begun(HUGE_GRADIENTS)
     trainer.gaussians.log_scales[3, 1] = 60.0
     trainer.gaussians.log_scales[7] = 90.0
-    before, moments = trainer.gaussians.clone(), trainer._optimizer.exp_avg["log_scales"].clone()
+    before, moments = trainer.gaussians.clone(), trainer.optimizer.exp_avg["log_scales"].clone()
     trainer.step_once()
     after = trainer.gaussians
     assert trainer.step == 3
     assert_finite(trainer)
     assert torch.equal(after.log_scales[7], before.log_scales[7])
-    assert torch.equal(trainer._optimizer.exp_avg["log_scales"][7], moments[7])
+    assert torch.equal(trainer.optimizer.exp_avg["log_scales"][7], moments[7])
     assert after.log_scales[3, 1] == 60.0
     assert (after.log_scales[8:] != before.log_scales[8:]).any(dim=1).all()
 
@@ -155,7 +156,7 @@ def test_noise_is_finite_for_any_scale(dataset: Dataset) -> None:
     trainer.gaussians.log_scales[:] = 80.0
     trainer.gaussians.opacity_logits[:] = -9.0
     optimizer = Adam(trainer.gaussians, BUSY.learning_rates, schedule=Schedule(60), extent=1.0)
-    trainer._density.after_step(1, trainer.gaussians, optimizer)
+    trainer.part(Densification).control.after_step(1, trainer.gaussians, optimizer)
     assert trainer.gaussians.means.isfinite().all()
 
 

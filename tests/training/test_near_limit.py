@@ -13,10 +13,11 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.recipes import recipe
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.near_limit import INTERVAL, NearLimit, nearest_depth, unseen_cameras
 from snowsplat.util.errors import SettingError
+
+from .stage import stage
 
 
 def camera(x: float) -> Camera:
@@ -39,7 +40,9 @@ def removed(cameras: list[Camera], points: Tensor | None, means: list[list[float
     gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
     gaussians.means = torch.tensor(means)
     before = gaussians.clone()
-    NearLimit(0.5, cameras, points, Schedule(1000)).after_step(INTERVAL, gaussians)
+    limit, run = NearLimit(0.5), stage(gaussians, INTERVAL, cameras=cameras, points=points)
+    limit.begin(run)
+    limit.between(run)
     for name, tensor in gaussians.parameters().items():
         if name != "opacity_logits":
             assert torch.equal(tensor, before.parameters()[name])
@@ -75,19 +78,22 @@ def test_views_with_few_points_have_no_limit():
     assert removed([camera(0.0)], wall()[::10], [[0.0, 0.0, 4.0]]) == [False]
 
 
-def test_nothing_is_removed_without_points_or_without_a_limit():
+def test_nothing_is_removed_without_points_and_between_the_steps_of_the_limit():
     assert removed([camera(0.0)], None, [[0.0, 0.0, 4.0]]) == [False]
     gaussians = Gaussians.random_in_bounds(
         torch.tensor([[-1.0, -1.0, 1.0], [1.0, 1.0, 2.0]]), 9, torch.Generator().manual_seed(5)
     )
     before = gaussians.clone()
-    NearLimit(0.0, [camera(0.0)], wall(), Schedule(1000)).after_step(INTERVAL, gaussians)
-    NearLimit(0.5, [camera(0.0)], wall(), Schedule(1000)).after_step(INTERVAL + 1, gaussians)
+    run = stage(gaussians, INTERVAL + 1, cameras=[camera(0.0)], points=wall())
+    limit = NearLimit(0.5)
+    limit.begin(run)
+    limit.between(run)
     assert torch.equal(gaussians.opacity_logits, before.opacity_logits)
 
 
 def test_many_cameras_are_sampled():
-    limit = NearLimit(0.5, [camera(0.001 * i) for i in range(500)], wall(), Schedule(1000))
+    limit = NearLimit(0.5)
+    limit.begin(stage(cameras=[camera(0.001 * i) for i in range(500)], points=wall()))
     assert limit._views is not None
     assert len(limit._views) <= 64 * 5
 

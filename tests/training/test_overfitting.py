@@ -26,6 +26,8 @@ from snowsplat.training.parts.overfitting import (
 )
 from snowsplat.util.errors import UserError
 
+from .stage import stage
+
 BLACK = torch.zeros(3)
 CONFIG = recipe("default", iterations=200, stop_overfitting=True)
 
@@ -138,12 +140,12 @@ def check_with(monkeypatch, estimates: list[float], iterations: int = 1000) -> O
     given = iter(estimates)
     monkeypatch.setattr(overfitting, "unseen_views", lambda *args: [None])
     monkeypatch.setattr(overfitting, "estimated_psnr", lambda *args: next(given))
-    schedule = Schedule(iterations)
-    check = OverfittingCheck(Dataset([], [], None, 1.0), None, schedule, BLACK)  # type: ignore[arg-type]
-    step = 0
-    while step < schedule.iterations:
-        check.after_step(step, None, 0, ())  # type: ignore[arg-type]
-        step += 1
+    run = stage(views=0, iterations=iterations, photos=None)
+    check = OverfittingCheck()
+    check.begin(run)
+    while run.step < run.schedule.iterations:
+        check.between(run)
+        run.step += 1
     return check
 
 
@@ -159,9 +161,10 @@ def test_three_lower_estimates_in_a_row_end_the_training(monkeypatch, estimates,
     check = check_with(monkeypatch, estimates)
     assert check.found == Overfitting(step, 1000)
     # The rest of the schedule is completed in a quarter of the steps.
-    assert check._schedule.iterations == step + -(-(1000 - step) // 4)
-    assert check._schedule.share(check._schedule.iterations) == 1.0
-    assert check._schedule.share(step) == pytest.approx(step / 1000)
+    schedule = check._run.schedule
+    assert schedule.iterations == step + -(-(1000 - step) // 4)
+    assert schedule.share(schedule.iterations) == 1.0
+    assert schedule.share(step) == pytest.approx(step / 1000)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +180,7 @@ def test_other_estimates_do_not_end_the_training(monkeypatch, estimates):
     check = check_with(monkeypatch, estimates)
     assert check.found is None
     assert check._estimates == len(estimates) == 9
-    assert check._schedule == Schedule(1000)
+    assert check._run.schedule == Schedule(1000)
 
 
 def test_at_most_12_unseen_views(dataset):
@@ -189,17 +192,17 @@ def test_at_most_12_unseen_views(dataset):
 def test_a_training_of_few_epochs_is_not_checked(dataset, monkeypatch):
     """5% of the steps are less than the 10 steps of an epoch."""
     monkeypatch.setattr(overfitting, "unseen_views", None)
-    with ImageLoader(dataset.train) as images:
-        check = OverfittingCheck(dataset, images, Schedule(199), BLACK)
-        check.after_step(150, None, 0, ())  # type: ignore[arg-type]
+    check = OverfittingCheck()
+    check.between(stage(step=150, iterations=199, dataset=dataset))
     assert check._estimates == 0
 
 
 def test_without_points_nothing_is_estimated(dataset, monkeypatch):
     monkeypatch.setattr(overfitting, "estimated_psnr", None)
     with ImageLoader(dataset.train) as images:
-        check = OverfittingCheck(replace(dataset, points=None), images, Schedule(200), BLACK)
-        check.after_step(100, None, 0, ())  # type: ignore[arg-type]
+        without = replace(dataset, points=None)
+        check = OverfittingCheck()
+        check.between(stage(step=100, iterations=200, dataset=without, photos=images))
     assert check._estimates == 1
 
 
@@ -222,9 +225,11 @@ def test_the_check_changes_no_bit_if_the_scene_does_not_overfit(dataset):
     checked, unchecked = (
         run(dataset, replace(CONFIG, stop_overfitting=on)) for on in (True, False)
     )
-    assert checked.overfitting is None
-    assert checked._overfitting._estimates == 9
-    assert checked._overfitting._best > 15.0
+    check = checked.part(OverfittingCheck)
+    assert check.found is None
+    assert check._estimates == 9
+    assert check._best > 15.0
+    assert unchecked.part(OverfittingCheck) is None
     assert_identical(checked.gaussians, unchecked.gaussians)
 
 
@@ -235,7 +240,7 @@ def test_a_resumed_run_ends_at_the_same_step_with_the_same_scene(
 ):
     monkeypatch.setattr(overfitting, "_DIFFERENCE", -100.0)  # every estimate is worse
     uninterrupted = run(dataset, CONFIG)
-    assert uninterrupted.overfitting == Overfitting(110, 200)
+    assert uninterrupted.part(OverfittingCheck).found == Overfitting(110, 200)
     assert uninterrupted.step == 110 + 23
     first = Trainer(dataset, CONFIG)
     first.run(until=stop)
@@ -243,17 +248,18 @@ def test_a_resumed_run_ends_at_the_same_step_with_the_same_scene(
     state = checkpoint.load(path).tensors
     second = Trainer(dataset, CONFIG, replace(first.schedule), state=state)
     second.run()
-    assert (second.step, second.overfitting) == (133, Overfitting(110, 200))
+    assert second.step == 133
+    assert second.part(OverfittingCheck).found == Overfitting(110, 200)
     assert_identical(second.gaussians, uninterrupted.gaussians)
 
 
 def test_the_state_is_complete(dataset):
-    with ImageLoader(dataset.train) as images:
-        checks = [OverfittingCheck(dataset, images, Schedule(200), BLACK) for _ in range(2)]
+    checks = [OverfittingCheck(), OverfittingCheck()]
+    checks[1].begin(stage(iterations=133))
     checks[0]._estimates, checks[0]._best, checks[0]._worse = 4, 20.5, 2
     for found in (None, Overfitting(110, 200)):
         checks[0].found = found
-        checks[1].load_state(checks[0].state_tensors())
+        checks[1].load(checks[0].state())
         assert (checks[1]._estimates, checks[1]._best, checks[1]._worse) == (4, 20.5, 2)
         assert checks[1].found == found
 

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.image_loader import ImageLoader
 from snowsplat.data.load import load_dataset
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import Similarity, compose_rigid, invert_rigid, look_at
@@ -20,7 +19,6 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.config import TrainConfig, config_from_json, config_to_json
 from snowsplat.training.core.recipes import recipe
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.parts import pose_refinement
@@ -134,23 +132,24 @@ def test_the_gauge_is_that_of_similarity_transforms(dataset: Dataset) -> None:
 @pytest.mark.isa
 def test_the_gradient_of_a_motion(dataset: Dataset) -> None:
     """By finite differences of a function of the splats, in float64."""
-    cameras = [view.camera for view in dataset.train]
-    images = ImageLoader(dataset.train, budget_bytes=0)
-    poses = PoseRefinement(True, dataset, cameras, images, Schedule(10), torch.zeros(3))
-    poses.state_tensors()["motions"][0] = 0.01 * noise(3, 6)
-    scene = Trainer(dataset, TrainConfig(iterations=1)).gaussians.to(dtype=torch.float64)
+    trainer = Trainer(dataset, TrainConfig(iterations=1, refine_poses=True))
+    poses = trainer.part(PoseRefinement)
+    assert poses is not None
+    poses.state()["motions"][0] = 0.01 * noise(3, 6)
+    scene = trainer.gaussians.to(dtype=torch.float64)
     scene = replace(scene, **{n: p[:50].clone() for n, p in scene.parameters().items()})
+    trainer.gaussians = scene
     splats = project(scene, poses.camera(0), 0)
     assert splats.ids is not None
     cotangent = noise(4, *splats.packed.shape)
     cotangent[:, 7] = 0.0  # radii have no gradient
     splats.packed.grad = cotangent
     gradient = ViewGradient(splats, poses.camera(0), 0)
-    d_motion, d_focal = poses._gradient(0, scene, gradient)
+    d_motion, d_focal = poses._gradient(trainer, 0, gradient)
 
     def value(numbers: Tensor) -> float:
         shown = poses.camera(0)
-        motion = poses._units[0] @ poses.state_tensors()["motions"][0] + numbers[:6]
+        motion = poses._units[0] @ poses.state()["motions"][0] + numbers[:6]
         pose = moved(dataset.train[0].camera.cam_from_world, motion)
         factor = float(numbers[6].exp())
         other = replace(shown, cam_from_world=pose, fx=factor * shown.fx, fy=factor * shown.fy)
@@ -202,10 +201,10 @@ def test_perturbed_poses_come_back(dataset: Dataset) -> None:
         trainer = Trainer(wrong, replace(settings, refine_poses=on))
         trainer.run()
         psnr[on] = trainer.evaluate().psnr
-        pixels[on] = pixels_off(trainer.poses.views(), dataset.train, dataset)
+        pixels[on] = pixels_off(trainer.cameras.views(), dataset.train, dataset)
     assert pixels[True] < 0.75 * pixels[False]
     assert psnr[True] > psnr[False] + 0.5
-    drift = trainer.poses.drift()
+    drift = trainer.part(PoseRefinement).drift()
     assert 0.1 < float(drift.rotations.median()) < 1.0
     assert 0.001 < float(drift.translations.median()) < 0.03
     assert "camera poses refined: rotation by 0." in str(drift)
@@ -218,7 +217,7 @@ def test_exact_poses_are_left_unchanged(dataset: Dataset, monkeypatch) -> None:
     trainer = Trainer(dataset, recipe("default", **SHORT, refine_poses=True))
     for each in (without, trainer):
         each.run()
-    drift = trainer.poses.drift()
+    drift = trainer.part(PoseRefinement).drift()
     assert drift.exact
     assert "left unchanged" in str(drift)
     assert not drift.rotations.any()
@@ -230,8 +229,8 @@ def test_without_refinement_the_cameras_are_those_of_the_dataset(dataset: Datase
     trainer = Trainer(dataset, recipe("default", **SHORT))
     trainer.run(until=5)
     assert not any(name.startswith("poses.") for name in trainer.state_tensors())
-    assert trainer.poses.views() is dataset.train
-    assert trainer.poses.test_views() is dataset.test
+    assert trainer.cameras.views() is dataset.train
+    assert trainer.cameras.test_views() is dataset.test
 
 
 @pytest.mark.parametrize("batch", [1, 4])
@@ -251,7 +250,7 @@ def test_resuming_is_bit_identical(
     assert expected["poses.motions"].abs().min(1).values.max() > 0.0
     for name, tensor in second.state_tensors().items():
         assert torch.equal(tensor, expected[name]), name
-    assert second.poses.test_views()[0].camera.fx == whole.poses.test_views()[0].camera.fx
+    assert second.cameras.test_views()[0].camera.fx == whole.cameras.test_views()[0].camera.fx
 
 
 @pytest.mark.isa
@@ -279,7 +278,7 @@ def test_one_camera_does_not_move(dataset: Dataset) -> None:
     single = replace(dataset, train=dataset.train[:1])
     trainer = Trainer(single, recipe("default", **SHORT, refine_poses=True))
     trainer.run(until=30)
-    assert float(trainer.poses.drift().rotations.max()) < 1e-6
+    assert float(trainer.part(PoseRefinement).drift().rotations.max()) < 1e-6
 
 
 def test_the_setting_is_stored() -> None:

@@ -10,10 +10,11 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.training.core.recipes import recipe
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts import scale_limit
-from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit
+from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit, distances_to_cameras
 from snowsplat.util.errors import SettingError
+
+from .stage import stage
 
 
 def camera(x: float) -> Camera:
@@ -39,7 +40,7 @@ def scene() -> Gaussians:
 def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monkeypatch):
     monkeypatch.setattr(scale_limit, "_ROWS", 3)  # several parts
     before, after = scene(), scene()
-    ScaleLimit(0.5, CAMERAS, Schedule(1000)).after_step(INTERVAL, after)
+    ScaleLimit(0.5).between(stage(after, INTERVAL, cameras=CAMERAS))
     limits = torch.tensor([1.0, 4.0, 2.5])
     torch.testing.assert_close(after.scales[:3], torch.minimum(before.scales[:3], limits[:, None]))
     assert after.log_scales.isfinite().all()
@@ -48,19 +49,20 @@ def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monk
         assert torch.equal(after.parameters()[name], before.parameters()[name])
 
 
-@pytest.mark.parametrize(("ratio", "step"), [(0.0, INTERVAL), (0.5, INTERVAL + 1)])
-def test_nothing_changes_without_a_limit_and_between_its_steps(ratio, step):
+def test_nothing_changes_between_the_steps_of_the_limit():
     before, after = scene(), scene()
-    ScaleLimit(ratio, CAMERAS, Schedule(1000)).after_step(step, after)
+    ScaleLimit(0.5).between(stage(after, INTERVAL + 1, cameras=CAMERAS))
     assert torch.equal(after.log_scales, before.log_scales)
 
 
 def test_many_cameras_are_sampled():
     many = [camera(0.01 * i) for i in range(1000)]
-    limit = ScaleLimit(0.5, many, Schedule(1000))
-    assert len(limit._centres) <= 64
+    between = torch.tensor([[0.01, 0.0, 0.0], [0.16, 0.0, 0.0]])  # at the second and 17th camera
+    distances = distances_to_cameras(between, many)
+    assert torch.allclose(distances[:1], torch.tensor([0.01]))  # every 16th camera is used
+    assert float(distances[1]) < 1e-30
     gaussians = scene()
-    limit.after_step(INTERVAL, gaussians)
+    ScaleLimit(0.5).between(stage(gaussians, INTERVAL, cameras=many))
     assert math.isclose(float(gaussians.scales[1].max()), 3.0, rel_tol=1e-6)  # below the limit, 4
 
 

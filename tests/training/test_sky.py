@@ -19,7 +19,6 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.training.core.config import changed
 from snowsplat.training.core.recipes import recipe
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.direction_cells import (
     ANGLE,
@@ -29,9 +28,11 @@ from snowsplat.training.parts.direction_cells import (
     median_of,
     spread_of,
 )
-from snowsplat.training.parts.sky import find_sky, sky_distance
-from snowsplat.training.parts.sky_limit import INTERVAL, SkyLimit
+from snowsplat.training.parts.found_sky import find_sky, sky_distance
+from snowsplat.training.parts.sky import INTERVAL, SkyPart
 from snowsplat.training.starts.init import initial_count
+
+from .stage import stage
 
 SIZE = 96
 GROUND = 1.5  # y of the ground, below the cameras; y points down
@@ -181,13 +182,14 @@ def test_the_limit_removes_gaussians_before_the_sky(outdoors):
     gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
     gaussians.means = means
     before = gaussians.opacities.clone()
-    limit = SkyLimit(sky, torch.device("cpu"), Schedule(1000))
-    limit.after_step(INTERVAL - 1, gaussians)
+    limit = SkyPart()
+    limit.prepare(stage(dataset=outdoors, photos=images(outdoors)))
+    assert limit.sky.share == sky.share
+    limit.between(stage(gaussians, INTERVAL - 1))
     assert torch.equal(gaussians.opacities, before)
-    limit.after_step(INTERVAL, gaussians)
+    limit.between(stage(gaussians, INTERVAL))
     assert float(gaussians.opacities[:3].max()) < 1 / 255
     assert torch.equal(gaussians.opacities[3:], before[3:])
-    SkyLimit(None, torch.device("cpu"), Schedule(1000)).after_step(INTERVAL, gaussians)
 
 
 def test_a_sky_of_the_colour_of_the_background_needs_no_points(tmp_path):
@@ -224,8 +226,8 @@ def test_the_default_recipe_starts_with_the_sky(outdoors):
     assert len(trainer.gaussians) <= initial_count(outdoors, config) == 2000
     trainer.run()
     resumed = Trainer(outdoors, config, state=trainer.state_tensors())
-    assert resumed.sky is not None
+    assert resumed.part(SkyPart).sky is not None
     refined = Trainer(outdoors, config, initial=trainer.gaussians)
-    assert refined.sky is None  # other programs may have placed their sky nearer
+    assert refined.part(SkyPart).sky is None  # other programs may have placed their sky nearer
     without = Trainer(outdoors, changed(config, sky=False))
     assert not (without.gaussians.means.norm(dim=1) > 100.0).any()

@@ -7,8 +7,9 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
+
+from .stage import stage
 
 POSE = torch.eye(3, 4, dtype=torch.float64)
 NEAR = Camera(40, 30, 30.0, 30.0, 20.0, 15.0, POSE)
@@ -42,7 +43,7 @@ def scene() -> Gaussians:
 
 def test_all_scales_but_the_smallest_are_at_least_the_filter():
     before, after = scene(), scene()
-    SmoothingFilter(True, [NEAR, FAR], Schedule(1000)).after_step(INTERVAL, after)
+    SmoothingFilter().between(stage(after, INTERVAL, cameras=[NEAR, FAR]))
     limits = math.sqrt(VARIANCE) / torch.tensor([30.0, 30.0, 300 / 7])
     torch.testing.assert_close(after.scales[0], torch.tensor([limits[0], 1e-4, 0.5]))
     for row in (1, 2):  # from needles to discs
@@ -53,8 +54,7 @@ def test_all_scales_but_the_smallest_are_at_least_the_filter():
         assert torch.equal(after.parameters()[name], before.parameters()[name])
 
 
-def test_nothing_changes_without_the_filter_and_between_its_steps():
+def test_nothing_changes_between_the_steps_of_the_filter():
     gaussians = scene()
-    SmoothingFilter(False, [NEAR], Schedule(1000)).after_step(INTERVAL, gaussians)
-    SmoothingFilter(True, [NEAR], Schedule(1000)).after_step(INTERVAL + 1, gaussians)
+    SmoothingFilter().between(stage(gaussians, INTERVAL + 1, cameras=[NEAR]))
     assert torch.equal(gaussians.log_scales, scene().log_scales)

@@ -156,7 +156,7 @@ def test_the_absolute_gradient_is_computed_on_request(abs_grad: bool) -> None:
     splats = splats_with_gradient_one()
     splats.packed[:, :2] = torch.tensor([3.0, 2.0])
     with torch.enable_grad():
-        loss = runner.rasterize(splats, CAMERA, torch.zeros(3))[0, 0, 0]
+        loss = runner.rasterize(splats, CAMERA, torch.zeros(3)).image[0, 0, 0]
     runner.backward(loss)
     gradient = runner.gradient(splats, CAMERA, 0)
     if not abs_grad:

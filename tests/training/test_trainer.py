@@ -29,6 +29,7 @@ from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.parts.decay import DecayRates
+from snowsplat.training.parts.densification import Densification
 from snowsplat.training.starts import STARTS
 from snowsplat.util.errors import UserError
 
@@ -140,7 +141,7 @@ def test_training_learns_and_has_the_same_losses_in_float64(dataset, monkeypatch
 
     exact = Trainer(dataset, config)
     exact.gaussians = exact.gaussians.to(dtype=torch.float64)
-    for moments in (exact._optimizer.exp_avg, exact._optimizer.exp_avg_sq):
+    for moments in (exact.optimizer.exp_avg, exact.optimizer.exp_avg_sq):
         moments.update({name: moment.double() for name, moment in moments.items()})
     for name in ("project", "rasterize", "photometric_loss", "adam_step"):
         monkeypatch.setattr(ops, name, getattr(reference, name))
@@ -249,7 +250,7 @@ def test_a_stretched_run_completes_its_schedule_and_resumes_bitwise(dataset, con
     first.run(stretch)
     assert [report.iterations for report in reports] == 20 * [60] + 20 * [90] + 5 * [45]
     assert [report.downscale for report in reports] == 12 * [4] + 26 * [2] + 7 * [1]
-    assert first._optimizer.rates_at(45) == Trainer(dataset, config)._optimizer.rates_at(60)
+    assert first.optimizer.rates_at(45) == Trainer(dataset, config).optimizer.rates_at(60)
     saved = checkpoint.latest(tmp_path)
     assert saved is not None
     second = Trainer(dataset, config, Schedule(**saved.meta))
@@ -300,7 +301,9 @@ def test_density_control_gets_the_absolute_gradients(dataset):
         trainer = Trainer(dataset, replace(config, coarse_to_fine=(0, 0)))
         trainer.step_once()
         trainers.append(trainer)
-    signed, absolute = (trainer._density.state_tensors()["grad_sum"] for trainer in trainers)
+    signed, absolute = (
+        trainer.part(Densification).control.state_tensors()["grad_sum"] for trainer in trainers
+    )
     assert (absolute >= 0.999 * signed).all()
     assert absolute.sum() > 1.05 * signed.sum()
     assert_identical(*(trainer.gaussians for trainer in trainers))
@@ -316,13 +319,13 @@ def test_refinement_waits_for_the_next_step(dataset):
 
 def test_every_step_is_followed_by_density_control(dataset, monkeypatch):
     trainer = Trainer(dataset, BUSY)
-    after_step, steps = trainer._density.after_step, []
+    after_step, steps = trainer.part(Densification).control.after_step, []
 
     def recorded(step, gaussians, optimizer):
         steps.append(step)
         return after_step(step, gaussians, optimizer)
 
-    monkeypatch.setattr(trainer._density, "after_step", recorded)
+    monkeypatch.setattr(trainer.part(Densification).control, "after_step", recorded)
     trainer.run(until=5)
     assert steps == [1, 2, 3, 4]
 
@@ -347,7 +350,7 @@ def test_a_dataset_without_points_starts_from_random_points(dataset):
 
 def test_every_view_once_an_epoch(dataset, monkeypatch):
     trainer = Trainer(dataset, CALM)
-    seen = [trainer._queue.take(0, 1)[0].camera.position for _ in range(1, 15)]
+    seen = [trainer.queue.take(0, 1)[0].camera.position for _ in range(1, 15)]
     positions = torch.stack(seen)
     for epoch in (positions[:7], positions[7:]):
         assert len(epoch.unique(dim=0)) == 7
@@ -357,7 +360,7 @@ def test_every_view_once_an_epoch(dataset, monkeypatch):
 def test_photos_are_decoded_ahead_in_order_at_the_resolution_of_their_step(dataset, monkeypatch):
     """The order is extended before steps 1, 6 and 13; the resolution changes at 4 and 9."""
     trainer = Trainer(dataset, replace(CALM, coarse_to_fine=(3, 8)))
-    prefetch, get = trainer._images.prefetch, trainer._images.get
+    prefetch, get = trainer.images.prefetch, trainer.images.get
     expected: list[tuple[View, int]] = []  # the photos that were announced and not yet requested
     calls = []
 
@@ -370,10 +373,10 @@ def test_photos_are_decoded_ahead_in_order_at_the_resolution_of_their_step(datas
         assert expected.pop(0) == (view, downscale)
         return get(view, downscale)
 
-    monkeypatch.setattr(trainer._images, "prefetch", recorded_prefetch)
-    monkeypatch.setattr(trainer._images, "get", recorded_get)
+    monkeypatch.setattr(trainer.images, "prefetch", recorded_prefetch)
+    monkeypatch.setattr(trainer.images, "get", recorded_get)
     for step in range(1, 15):
-        trainer._queue.take(step - 1, step)
+        trainer.queue.take(step - 1, step)
     assert calls == [1, 4, 6, 9, 13]
 
 
@@ -384,7 +387,7 @@ def test_the_loss_of_a_step(dataset):
     trainer.gaussians.sh_rest[:] = 0.2  # of degree 1 to 3, not in use before step 100
     [view], white = alone.train, torch.ones(3)
     image = render(trainer.gaussians, view.camera, white, sh_degree=0).image
-    expected = view_loss(image, trainer._images.get(view), white, 0.3)
+    expected = view_loss(image, trainer.images.get(view), white, 0.3)
     assert trainer.step_once() == pytest.approx(float(expected), rel=1e-6)
 
 
@@ -400,11 +403,11 @@ def test_a_fixed_background_is_put_behind_transparent_photos_once(dataset, tmp_p
     Image.new("RGBA", (WIDTH, HEIGHT), (200, 100, 0, 0)).save(tmp_path / "a.png")
     source = ImageSource(tmp_path / "a.png", WIDTH, HEIGHT)
     alone = replace(dataset, train=[replace(dataset.train[0], image=source)])
-    photo = Trainer(alone, replace(CALM, background="white"))._queue.take(0, 1)[0].photo
+    photo = Trainer(alone, replace(CALM, background="white")).queue.take(0, 1)[0].photo
     assert photo.alpha is None
     assert (photo.rgb == 255).all()
     random = Trainer(alone, replace(CALM, background="random"))
-    assert random._queue.take(0, 1)[0].photo.alpha is not None
+    assert random.queue.take(0, 1)[0].photo.alpha is not None
 
 
 def test_the_cap_by_the_size_of_the_photos_uses_their_median(dataset):
@@ -417,14 +420,14 @@ def test_the_cap_by_the_size_of_the_photos_uses_their_median(dataset):
 
 
 def test_the_memory_for_images(dataset):
-    assert Trainer(dataset, replace(CALM, image_memory=12345))._images.budget_bytes == 12345
-    assert Trainer(dataset, CALM)._images.budget_bytes > 1_000_000
+    assert Trainer(dataset, replace(CALM, image_memory=12345)).images.budget_bytes == 12345
+    assert Trainer(dataset, CALM).images.budget_bytes > 1_000_000
 
 
 def test_the_generators_of_a_seed(dataset):
     """If a generator changes, the same seed produces another scene."""
     seeds = {
-        n: g.initial_seed() for n, g in Trainer(dataset, replace(CALM, seed=5))._generators.items()
+        n: g.initial_seed() for n, g in Trainer(dataset, replace(CALM, seed=5)).generators.items()
     }
     assert seeds == {"start": 20, "views": 21, "background": 22, "density": 23}
 
@@ -490,7 +493,7 @@ def test_divergence_in_the_last_step_names_it(dataset):
     trainer = Trainer(dataset, CALM)
     assert trainer.within_step is False
     trainer.run(until=2)
-    trainer._runner._nonfinite_rows[0] = 5  # what `adam_step` does
+    trainer.runner._nonfinite_rows[0] = 5  # what `adam_step` does
     with pytest.raises(UserError, match=r"^step 2: .*means \(5 rows\), skipped; use lower"):
         trainer.run(until=2)
 

@@ -19,6 +19,7 @@ from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.densification import Densification
 from snowsplat.util.native_layout import Params, layout_of
 
 from ..ops.engines import launcher
@@ -34,7 +35,7 @@ def losses(trainer: Trainer, steps: int = STEPS) -> Tensor:
 
 
 def with_capacity(trainer: Trainer, instances: int) -> Trainer:
-    trainer._runner.capacity.instances = instances
+    trainer.runner.capacity.instances = instances
     return trainer
 
 
@@ -51,7 +52,7 @@ def test_the_kernels_of_a_gpu_train_as_those_of_the_cpu(
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=0)
     narrow = with_capacity(Trainer(dataset, config), 3)
     assert torch.equal(losses(narrow), found)
-    assert narrow._runner.capacity.instances > 3
+    assert narrow.runner.capacity.instances > 3
     monkeypatch.undo()
     expected_state = ample.state_tensors()
     for name, tensor in narrow.state_tensors().items():  # moments and statistics too
@@ -65,7 +66,7 @@ def test_a_loss_that_is_not_finite_changes_nothing(
     monkeypatch.setitem(LAUNCHERS, "cpu", launcher("emulated"))
     trainer = with_capacity(Trainer(dataset, BUSY), 100_000)
     trainer.step_once()
-    monkeypatch.setattr(trainer._background, "draw", lambda: torch.full((3,), torch.nan))
+    monkeypatch.setattr(trainer.background, "draw", lambda: torch.full((3,), torch.nan))
     before = {name: tensor.clone() for name, tensor in trainer.state_tensors().items()}
     with pytest.raises(Diverged, match="step 2, photo .*: the loss is nan"):
         trainer.step_once()
@@ -112,7 +113,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         return launch_by(record, name, params)
 
     trainer = Trainer(dataset, replace(config, batch=batch))
-    view = trainer._queue.take(0, 1)[0]
+    view = trainer.queue.take(0, 1)[0]
     assert view.photo is not None
     monkeypatch.setitem(LAUNCHERS, "cuda", launch)
     monkeypatch.setattr(Tensor, "backward", backward_by_hand)
@@ -122,11 +123,11 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
             return mode.from_tensor(value).to("cuda") if isinstance(value, Tensor) else value
 
         trainer.gaussians = trainer.gaussians.map(on_device)
-        for moments in (trainer._optimizer.exp_avg, trainer._optimizer.exp_avg_sq):
+        for moments in (trainer.optimizer.exp_avg, trainer.optimizer.exp_avg_sq):
             moments.update({name: on_device(moment) for name, moment in moments.items()})
-        for name, statistic in trainer._density.state_tensors().items():
-            setattr(trainer._density, name, on_device(statistic))
-        runner = trainer._runner
+        for name, statistic in trainer.part(Densification).control.state_tensors().items():
+            setattr(trainer.part(Densification).control, name, on_device(statistic))
+        runner = trainer.runner
         runner.capacity = ops.Capacity(5000, on_device(torch.zeros(1, dtype=torch.int64)))
         runner._required = runner.capacity.required
         runner._nonfinite_rows = on_device(runner._nonfinite_rows)

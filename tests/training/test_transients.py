@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.parts.transients import MOMENTS, delayed, moving
+from snowsplat.training.parts.densification import delayed
+from snowsplat.training.parts.transients import MOMENTS, Transients, cells_that_move
 from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.util.errors import SettingError, UserError
@@ -49,6 +51,12 @@ def busy(tmp_path_factory) -> Dataset:
     for i, box in BOXES.items():
         painted(dataset.train[i].image.path, box)
     return dataset
+
+
+def indexed(trainer: Trainer) -> dict[int, float]:
+    """The masked share of each photo in which something moves."""
+    shares = trainer.part(Transients).shares()
+    return {i: shares[v.name] for i, v in enumerate(trainer.dataset.train) if v.name in shares}
 
 
 def run(dataset: Dataset, config: TrainConfig, until: int | None = None) -> Trainer:
@@ -87,7 +95,7 @@ def view(residual: torch.Tensor, correlation: float = 0.0) -> CellMap:
 def test_a_large_residual_in_one_view_only():
     residual, elsewhere, others = cells(0.02), cells(0.02), cells(6.0)
     residual[4:8, 5:9] = 0.3
-    found = moving(view(residual), elsewhere, others, *RULE)
+    found = cells_that_move(view(residual), elsewhere, others, *RULE)
     expected = torch.zeros(12, 16, dtype=torch.bool)
     expected[3:9, 4:10] = True  # and the cells around
     assert torch.equal(found, expected)
@@ -109,7 +117,7 @@ def test_what_does_not_move(reason):
     elif reason == "small":
         residual[4:8, 5:9] = 0.08
     seen = view(residual, 0.8 if reason == "in another light" else 0.0)
-    assert not moving(seen, elsewhere, others, *RULE).any()
+    assert not cells_that_move(seen, elsewhere, others, *RULE).any()
 
 
 @pytest.mark.parametrize("first", [12, 15])
@@ -122,18 +130,18 @@ def test_a_place_in_no_other_view_is_judged_by_its_own(first, reason):
     seen = view(residual)
     if reason == "nothing is shown there":
         seen.places.inverse_depth[rows, first:] = 0.0
-    found = moving(seen, elsewhere, others, *RULE[:2], True)
+    found = cells_that_move(seen, elsewhere, others, *RULE[:2], True)
     expected = torch.zeros(12, 16, dtype=torch.bool)
     expected[3:9, first - 1 :] = reason == "found"
     assert torch.equal(found, expected)
-    assert not moving(seen, elsewhere, others, *RULE).any()
+    assert not cells_that_move(seen, elsewhere, others, *RULE).any()
 
 
 @pytest.mark.parametrize(("elsewhere", "alone"), [(0.02, True), (0.02, False), (0.15, True)])
 def test_one_other_view_judges_if_something_moves_in_several_photos(elsewhere, alone):
     residual, others = cells(0.02), cells(1.0)
     residual[4:8, 5:9] = 0.3
-    found = moving(view(residual), cells(elsewhere), others, *RULE[:2], alone)
+    found = cells_that_move(view(residual), cells(elsewhere), others, *RULE[:2], alone)
     assert found.any() == (alone and elsewhere == 0.02)
 
 
@@ -141,16 +149,16 @@ def test_the_edges_of_a_thing_may_have_a_smaller_residual():
     residual, elsewhere, others = cells(0.01), cells(0.01), cells(6.0)
     residual[4:8, 2:12] = 0.07
     residual[4:8, 5:9] = 0.3
-    assert moving(view(residual), elsewhere, others, *RULE)[4:8, 2:12].all()
+    assert cells_that_move(view(residual), elsewhere, others, *RULE)[4:8, 2:12].all()
 
 
 def test_a_thing_remains_masked_while_its_residual_is_notable():
     residual, elsewhere, others = cells(0.02), cells(0.02), cells(1.0)
     residual[4:8, 5:9] = 0.12
     before = torch.zeros(12, 16, dtype=torch.bool)
-    assert not moving(view(residual), elsewhere, others, 0.1, before, False).any()
+    assert not cells_that_move(view(residual), elsewhere, others, 0.1, before, False).any()
     before[5, 6] = True
-    assert moving(view(residual), elsewhere, others, 0.1, before, False)[4:8, 5:9].all()
+    assert cells_that_move(view(residual), elsewhere, others, 0.1, before, False)[4:8, 5:9].all()
 
 
 def test_residuals_of_the_same_places_in_other_views():
@@ -179,7 +187,8 @@ def test_residuals_of_the_same_places_in_other_views():
 
 
 def test_what_moves_is_found(trained):
-    found = trained.transients.found
+    transients = trained.part(Transients)
+    found = indexed(trained)
     assert set(found) >= set(BOXES)
     # Small parts of a few others, where at most one other photo shows the place.
     others = [share for i, share in found.items() if i not in BOXES]
@@ -187,7 +196,7 @@ def test_what_moves_is_found(trained):
     assert max(others, default=0.0) < 0.2
     assert sum(others) < 0.75
     for i, (left, upper, right, lower) in BOXES.items():
-        mask = trained.transients.masks[i]
+        mask = transients.masks[i]
         inside = torch.zeros_like(mask)
         inside[-(-upper // 8) : lower // 8, -(-left // 8) : right // 8] = True
         assert (~mask & inside).sum() >= 0.9 * inside.sum(), i
@@ -213,42 +222,53 @@ def test_the_scene_behind_what_moves(busy, still, trained):
 
 def test_a_static_scene_changes_no_bit(still):
     masked, unmasked = (run(still, replace(CONFIG, transients=t)) for t in ("auto", "off"))
-    assert masked.transients.found == {}
+    assert masked.part(Transients).shares() == {}
+    assert unmasked.part(Transients) is None
     assert_identical(masked.gaussians, unmasked.gaussians)
 
 
 @pytest.mark.parametrize(("moving", "compared"), [(True, 4), (False, 2)])
-def test_if_nothing_moves_the_photos_are_not_compared_again(busy, still, moving, compared):
+def test_if_nothing_moves_the_photos_are_not_compared_again(
+    busy, still, moving, compared, monkeypatch
+):
     trainer = Trainer(busy if moving else still, CONFIG)
     steps = [round(moment * CONFIG.iterations) for moment in MOMENTS]
-    found = []
-    for _ in range(steps[-1]):
-        trainer.step_once()
-        if trainer.step in steps:
-            state = trainer.gaussians, 0, 1, ()
-            found.append(trainer.transients.after_step(trainer.step, *state))
-    assert found == [True] * compared + [False] * (4 - compared)
+    part = trainer.part(Transients)
+    compute, found = part._compute, []
+
+    def recorded(run):
+        found.append(run.step)
+        compute(run)
+
+    monkeypatch.setattr(part, "_compute", recorded)
+    trainer.run(until=steps[-1] + 1)
+    assert found == steps[:compared]
 
 
 def test_the_mask_of_the_user_remains(trained):
-    transients, size = trained.transients, (HEIGHT, WIDTH)
+    size = (HEIGHT, WIDTH)
+
+    def masked(index, photo):
+        view = SimpleNamespace(index=index)
+        return trained.part(Transients).target(trained, view, photo)
+
     planes = torch.zeros(3, *size, dtype=torch.uint8)
     users = torch.ones(size, dtype=torch.bool)
     users[:, :20] = False
-    found = transients.masked(3, LoadedImage(planes)).mask
-    both = transients.masked(3, LoadedImage(planes, users)).mask
+    found = masked(3, LoadedImage(planes)).mask
+    both = masked(3, LoadedImage(planes, users)).mask
     assert found is not None
     assert both is not None
     assert torch.equal(both, found & users)
-    assert transients.masked(0, LoadedImage(planes, users)).mask is users
-    assert transients.masked(0, LoadedImage(planes)).mask is None
-    half = transients.masked(3, LoadedImage(planes[:, ::2, ::2])).mask
+    assert masked(0, LoadedImage(planes, users)).mask is users
+    assert masked(0, LoadedImage(planes)).mask is None
+    half = masked(3, LoadedImage(planes[:, ::2, ::2])).mask
     assert torch.equal(half, found[::2, ::2])
 
 
 def test_masks_as_pictures(busy, trained):
-    pictures = trained.transients.pictures()
-    assert set(pictures) == {busy.train[i].name for i in trained.transients.found}
+    pictures = trained.part(Transients).pictures()
+    assert set(pictures) == set(trained.part(Transients).shares())
     for i, (left, upper, right, lower) in BOXES.items():
         mask = np.asarray(pictures[busy.train[i].name])
         assert mask.shape == (HEIGHT, WIDTH)
@@ -267,7 +287,7 @@ def test_a_resumed_run_has_the_same_masks(busy, trained, tmp_path, stop):
     second = Trainer(busy, CONFIG)
     second.load_state(checkpoint.load(path).tensors)
     second.run()
-    assert second.transients.found == trained.transients.found
+    assert second.part(Transients).shares() == trained.part(Transients).shares()
     assert_identical(second.gaussians, trained.gaussians)
 
 
@@ -301,9 +321,10 @@ def test_a_checkpoint_without_the_setting_is_as_before(busy):
 def test_with_few_photos_or_steps_nothing_is_masked(busy, mode, views, steps):
     few = replace(busy, train=busy.train[:views])
     config = replace(CONFIG, iterations=steps, transients=mode)
-    trainer = run(few, config, until=steps // 2)
-    assert trainer.transients.complete(trainer.step)
-    assert trainer.transients.found == {}
+    trainer = Trainer(few, config)
+    trainer.part(Transients)._compute = None  # is not called
+    trainer.run(until=steps // 2)
+    assert trainer.part(Transients).shares() == {}
 
 
 def test_growth_waits_for_the_masks():

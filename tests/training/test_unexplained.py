@@ -15,7 +15,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.unexplained import fitted, standing_out
+from snowsplat.training.parts.unexplained import Unexplained, fitted, standing_out
 from snowsplat.util.errors import UserError
 
 COUNT = 24
@@ -219,7 +219,7 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
 @pytest.mark.slow
 def test_the_check_changes_no_bit_if_all_poses_are_right(right):
     checked, unchecked = (run(right, replace(CONFIG, leave_out_after=w)) for w in (0.5, 0))
-    assert checked._checked
+    assert checked.part(Unexplained)._decided
     assert checked.left_out == ()
     assert_identical(checked.gaussians, unchecked.gaussians)
 
@@ -227,14 +227,14 @@ def test_the_check_changes_no_bit_if_all_poses_are_right(right):
 @pytest.mark.slow
 def test_a_view_with_a_wrong_pose_is_not_used_after_the_check(wrong, monkeypatch):
     trainer, used = Trainer(wrong, CONFIG), []
-    take = trainer._queue.take
+    take = trainer.queue.take
 
     def recorded(after, step):
         chosen = take(after, step)
         used.append((step, chosen[0].view.name))
         return chosen
 
-    monkeypatch.setattr(trainer._queue, "take", recorded)
+    monkeypatch.setattr(trainer.queue, "take", recorded)
     trainer.run(until=100)
     assert trainer.left_out == ()  # it is decided before step 101
     trainer.run()
@@ -264,7 +264,7 @@ def test_the_decision_is_made_once(wrong):
     trainer = Trainer(wrong, CONFIG)
     trainer.run(until=101)
     assert trainer.left_out == (WRONG,)
-    trainer._queue.left_out = ()
+    trainer.queue.left_out = ()
     trainer.run(until=110)
     assert trainer.left_out == ()
 

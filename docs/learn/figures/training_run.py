@@ -18,6 +18,7 @@ from snowsplat.pipeline.demo import demo
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.densification import Densification
 
 STEPS = 4000
 SNAPSHOTS = (0, 200, 500, 600, 1000, 1010, 1500, 2500, 4000)
@@ -56,7 +57,7 @@ def record() -> dict[str, Any]:
             if progress.step in SNAPSHOTS:
                 parameters = trainer.gaussians.parameters().items()
                 found["scenes"][progress.step] = {k: v.clone() for k, v in parameters}
-            density: Any = trainer._density
+            density: Any = trainer.part(Densification).control
             settings = density.settings
             densifies = density.first <= progress.step <= density.last
             if densifies and progress.step % settings.densify_interval == 0:

@@ -27,10 +27,10 @@ _PART, _LOSS = "part.", "loss."
 
 def state_tensors(run: Run) -> dict[str, Tensor]:
     """See `Run.state_tensors`."""
-    return run.shards.collected(_row_tensors(run)) | _common_tensors(run)
+    return run.shards.collected(row_tensors(run)) | _common_tensors(run)
 
 
-def _row_tensors(run: Run) -> dict[str, Tensor]:
+def row_tensors(run: Run) -> dict[str, Tensor]:
     """The part of the state with one row for each Gaussian of this process."""
     groups = {
         "gaussians": run.gaussians.parameters(),
@@ -66,7 +66,7 @@ def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
     tensors = {_FORMER_NAMES.get(name, name): tensor for name, tensor in tensors.items()}
     own = set(_own(run))
     _check_own(own, {name for name in tensors if name.startswith((_PART, _LOSS))})
-    rows, unchecked = _row_tensors(run), tuple(name.removeprefix(_PART) + "." for name in own)
+    rows, unchecked = row_tensors(run), tuple(name.removeprefix(_PART) + "." for name in own)
     common, given = (
         {name: tensor for name, tensor in state.items() if not name.startswith(unchecked)}
         for state in (_common_tensors(run), tensors)
