@@ -52,9 +52,10 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.videos import VideoOptions, render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.core.config import TrainConfig, parts_of
     from snowsplat.training.core.recipes import recipe
     from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.parts.part import Part
     from snowsplat.util.errors import UserError
 
 
@@ -71,6 +72,7 @@ _MODULES = {
     "LiftResult": "extras.lift.lift_photo",
     "MakeOptions": "pipeline.make",
     "Observer": "pipeline.observer",
+    "Part": "training.parts.part",
     "Points": "data",
     "TrainConfig": "training.core.config",
     "TrainOptions": "pipeline.train",
@@ -96,6 +98,7 @@ _MODULES = {
     "PlanOptions": "pipeline.blocks.plan",
     "PublishOptions": "pipeline.publish",
     "merge_blocks": "pipeline.blocks.merge",
+    "parts_of": "training.core.config",
     "plan_blocks": "pipeline.blocks.plan",
     "train_blocks": "pipeline.blocks.train",
     "publish": "pipeline.publish",
@@ -123,6 +126,7 @@ __all__ = [
     "LiftResult",
     "MakeOptions",
     "Observer",
+    "Part",
     "PlanOptions",
     "Points",
     "PublishOptions",
@@ -148,6 +152,7 @@ __all__ = [
     "make",
     "make_globe",
     "merge_blocks",
+    "parts_of",
     "plan_blocks",
     "publish",
     "read_gaussians",

@@ -44,6 +44,18 @@ class ViewGradient:
         assert self.splats.packed.grad is not None
         return self.splats.packed.grad
 
+    def ignore(self, rows: Tensor) -> None:
+        """Set the gradient of some Gaussians to zero, in place, also in ``splats.abs_grad``.
+
+        Args:
+            rows: (N,) bool, the Gaussians of this process.
+        """
+        assert self.splats.ids is not None
+        ignored = rows[self.splats.ids.long(), None]
+        self.packed_grad.masked_fill_(ignored, 0.0)
+        if self.splats.abs_grad is not None:
+            self.splats.abs_grad.masked_fill_(ignored, 0.0)
+
     def add_to(self, gaussians: Gaussians, grads: Mapping[str, Tensor]) -> None:
         """Add the gradient with respect to the parameters of the Gaussians to ``grads``."""
         assert self.splats.ids is not None
