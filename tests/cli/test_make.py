@@ -16,6 +16,7 @@ from snowsplat.pipeline import make_plan
 from snowsplat.pipeline.make import RECORD, STAGES
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm import cost
+from snowsplat.sfm.ingest import sources
 from snowsplat.util.stages import Stages
 
 from ..fork_server import popen
@@ -217,6 +218,22 @@ def test_two_photos_are_too_few_and_leave_no_files(refused, dataset, tmp_path):
         shutil.copy(dataset / "images" / name, two)
     refused("make", two, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("minutes", [[], ["--minutes", "5"]])
+def test_the_inputs_are_searched_once(refused, dataset, tmp_path, monkeypatch, minutes):
+    """In the plan, the check of the folder, the estimate of the time, and the copies of photos."""
+    few = tmp_path / "few"
+    few.mkdir()
+    for name in ("view_00.png", "view_01.png"):
+        shutil.copyfile(dataset / "images" / name, few / name)
+    searched = []
+    search = sources._files_below
+    monkeypatch.setattr(
+        sources, "_files_below", lambda root, *a: searched.append(root) or search(root, *a)
+    )
+    assert "2 usable images" in refused("make", few, "-o", tmp_path / "out", *minutes)
+    assert searched == [few]
 
 
 def test_an_error_before_the_cameras_keeps_the_record(refused, dataset, tmp_path):

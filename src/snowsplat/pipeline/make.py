@@ -185,7 +185,7 @@ class _Job:
         from snowsplat.sfm.ingest.sources import find_sources
         from snowsplat.util.stages import Stages
 
-        find_sources(self.inputs)  # raises an error before the folder is created
+        self.sources = find_sources(self.inputs)  # an error before the folder is created
         existed = self.out.exists()
         self.out.mkdir(parents=True, exist_ok=True)
         self.stages = Stages(self.out / RECORD, STAGES)
@@ -220,7 +220,7 @@ class _Job:
         from snowsplat.sfm.cost import measure_speed
         from snowsplat.sfm.survey import survey
 
-        photos = survey(self.inputs)
+        photos = survey(self.sources)
         about = {"minutes": minutes, "quality": quality, "photos": asdict(photos)}
         before = self.stages.about.get("plan", {})
         if {key: before.get(key) for key in about} != about:
@@ -247,7 +247,12 @@ class _Job:
             ),
         )
         make_dataset(
-            *(self.inputs, self.dataset, options, self.observer, self.overwrite), self._later()
+            self.sources,
+            self.dataset,
+            options,
+            self.observer,
+            overwrite=self.overwrite,
+            later=self._later(),
         )
 
     def _later(self) -> Later:

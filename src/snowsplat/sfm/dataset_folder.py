@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import thread_count
-from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, find_inputs, gather
+from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.sources import Sources, find_sources
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.util.errors import UserError
@@ -77,7 +78,7 @@ class Watcher(Protocol):
 
 
 def make_dataset(
-    inputs: Sequence[Path],
+    inputs: Sequence[Path] | Sources,
     folder: Path,
     options: DatasetOptions,
     watcher: Watcher,
@@ -90,6 +91,7 @@ def make_dataset(
     ``folder / "input"`` itself is the input, it is not changed.
 
     Args:
+        inputs: what to make the dataset from, or what `find_sources` has found there.
         overwrite: replace a dataset in ``folder`` that was made from other inputs.
         later: the rest of the job, which the time left includes.
 
@@ -108,20 +110,20 @@ def make_dataset(
             "pycolmap is not installed, and PyPI may have no package for this computer; build it "
             "from the sources of COLMAP 4.2, or make the dataset on another computer"
         )
-    sources = find_inputs(inputs)
-    in_place = any(path.resolve() == (folder / "input").resolve() for path in inputs)
-    _check_free(folder, in_place, inputs, options, overwrite)
+    sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
+    in_place = sources.contain(folder / "input")
+    _check_free(folder, in_place, sources.inputs, options, overwrite)
     with _remove_on_failure(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stages = Stages(folder / RECORD, STAGES)
-        stages.about = {"inputs": [str(path.absolute()) for path in inputs]}
+        stages.about = {"inputs": [str(path.absolute()) for path in sources.inputs]}
         stages.save()  # from here on the folder is recognised as a dataset
-        left = _time_left(inputs, options, later or Later())
-        return _run(stages, inputs, sources, folder, options, watcher, in_place, left)
+        left = _time_left(sources, options, later or Later())
+        return _run(stages, sources, folder, options, watcher, in_place, left)
 
 
-def _time_left(inputs: Sequence[Path], options: DatasetOptions, later: Later) -> SfmTimeLeft:
-    photos = survey(inputs, options.gather)
+def _time_left(sources: Sources, options: DatasetOptions, later: Later) -> SfmTimeLeft:
+    photos = survey(sources, options.gather)
     sfm = options.sfm
     threads = thread_count(sfm.threads)
     return SfmTimeLeft(photos, options.gather.size, sfm.effort, threads, later)
@@ -129,8 +131,7 @@ def _time_left(inputs: Sequence[Path], options: DatasetOptions, later: Later) ->
 
 def _run(
     stages: Stages,
-    inputs: Sequence[Path],
-    sources: Sequence[Path],
+    sources: Sources,
     folder: Path,
     options: DatasetOptions,
     watcher: Watcher,
@@ -153,14 +154,14 @@ def _run(
             left.finished_before(name)
 
     def gather_photos(report: Report) -> dict[str, Any]:
-        return _gather(inputs, folder, options.gather, report, in_place)
+        return _gather(sources, folder, options.gather, report, in_place)
 
     chosen = asdict(options.gather)
     if chosen["photos"] is None:  # earlier versions did not have this setting
         del chosen["photos"]
     stage(
         "photos",
-        {"input": _fingerprint(sources), **chosen},
+        {"input": _fingerprint(sources.paths), **chosen},
         ["input", "distorted/masks"],
         gather_photos,
     )
@@ -208,7 +209,7 @@ def _run(
 
 
 def _gather(
-    inputs: Sequence[Path], folder: Path, options: GatherOptions, report: Report, in_place: bool
+    sources: Sources, folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
     """Gather the photos into a temporary folder, then replace `input/` and the masks by them.
 
@@ -217,12 +218,12 @@ def _gather(
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)
-        return asdict(gather(inputs, folder, options, report))
+        return asdict(gather(sources, folder, options, report))
     new = folder / ".new"
     shutil.rmtree(new, ignore_errors=True)
     new.mkdir()
     try:
-        gathered = gather(inputs, new, options, report)
+        gathered = gather(sources, new, options, report)
         for part in (Path("input"), masks):
             shutil.rmtree(folder / part, ignore_errors=True)
             if (new / part).exists():

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 from snowsplat.sfm.ingest.clip import max_frame_count, read_clip
 from snowsplat.sfm.ingest.inputs import GatherOptions
 from snowsplat.sfm.ingest.photo_files import Unusable, read_header
-from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.ingest.sources import Sources
 
 #: The sizes of about this number of photos are read.
 _HEADERS = 10
@@ -43,16 +41,15 @@ class Photos:
         return self.stills + self.frames
 
 
-def survey(inputs: Sequence[Path], options: GatherOptions | None = None) -> Photos:
+def survey(sources: Sources, options: GatherOptions | None = None) -> Photos:
     """The photos and frames that `gather` will use, if none of them is unusable.
 
     Raises:
-        UserError: an input does not exist, or is neither a photo nor a readable video.
+        UserError: a video is not readable.
     """
     options = options or GatherOptions()
-    sources = find_sources(inputs).sources
-    photos = [source.path for source in sources if source.kind == "photo"]
-    clips = [read_clip(source.path) for source in sources if source.kind == "video"]
+    photos = [source.path for source in sources.photos]
+    clips = [read_clip(source.path) for source in sources.videos]
     longest = []
     for path in photos[:: max(1, len(photos) // _HEADERS)]:
         with suppress(Unusable):

@@ -11,7 +11,7 @@ from ..pictures import pan, photo, write_photos, write_video
 
 
 def names(*inputs):
-    return [source.name for source in find_sources(inputs).sources]
+    return [source.name for source in find_sources(inputs).files]
 
 
 def test_a_folder_is_searched_recursively(tmp_path):
@@ -37,7 +37,7 @@ def test_symbolic_links_and_cycles(tmp_path):
     (root / "broken.jpg").symlink_to(root / "nothing.jpg")
     found = find_sources([root])
     expected = ["0.jpg", "1.jpg", "2.jpg", "linked/0.jpg", "linked/1.jpg", "linked/2.jpg"]
-    assert [s.name for s in found.sources] == expected
+    assert [s.name for s in found.files] == expected
     assert found.left_out == [(str(root / "one more.jpg"), f"is the same file as {root / '0.jpg'}")]
 
 
@@ -55,7 +55,7 @@ def test_videos_beside_photos_are_skipped_and_named(tmp_path):
     root = write_photos(tmp_path / "p", 2)
     write_video(root / "0.MOV", pan(3))
     found = find_sources([root])
-    assert [s.name for s in found.sources] == ["0.jpg", "1.jpg"]
+    assert [s.name for s in found.files] == ["0.jpg", "1.jpg"]
     assert found.left_out[0][0].endswith("0.MOV")
     os.remove(root / "0.jpg"), os.remove(root / "1.jpg")
     assert names(root) == [""]
@@ -73,7 +73,7 @@ def test_masks_are_found_by_both_names_and_in_both_folders(tmp_path):
         (root / mask).parent.mkdir(exist_ok=True)
         photo().save(root / mask)
     found = find_sources([root])
-    masks = [s.mask and s.mask.relative_to(root).as_posix() for s in found.sources]
+    masks = [s.mask and s.mask.relative_to(root).as_posix() for s in found.files]
     assert masks == [
         "masks/0.jpg.png",
         "masks/1.PNG",
@@ -83,7 +83,7 @@ def test_masks_are_found_by_both_names_and_in_both_folders(tmp_path):
         "sub/masks/1.jpg.png",
     ]
     assert found.unused_masks == [root / "masks" / "9.png"]
-    assert find_sources([root / "0.jpg"]).sources[0].mask == root / "masks" / "0.jpg.png"
+    assert find_sources([root / "0.jpg"]).files[0].mask == root / "masks" / "0.jpg.png"
 
 
 def test_the_kind_of_a_file_is_determined_by_its_content(tmp_path):

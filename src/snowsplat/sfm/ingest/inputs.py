@@ -24,7 +24,7 @@ from snowsplat.sfm.ingest.gather_photos import (
 )
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
-from snowsplat.sfm.ingest.sources import Source, find_sources
+from snowsplat.sfm.ingest.sources import Source, Sources, find_sources
 from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
@@ -61,12 +61,11 @@ def find_inputs(inputs: Sequence[Path]) -> list[Path]:
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
     """
-    sources = find_sources(inputs).sources
-    return [p for source in sources for p in (source.path, source.mask) if p is not None]
+    return find_sources(inputs).paths
 
 
 def gather(
-    inputs: Sequence[Path], dataset: Path, options: GatherOptions, report: Report
+    inputs: Sequence[Path] | Sources, dataset: Path, options: GatherOptions, report: Report
 ) -> Gathered:
     """Fill ``input/`` of a dataset and, for masks and transparency, ``distorted/masks``.
 
@@ -78,22 +77,25 @@ def gather(
     and focal length in EXIF. Portrait and landscape photos of one phone are in different groups:
     when upright, their width and height differ. Each video is a group.
 
+    Args:
+        inputs: photos, folders and videos, or what `find_sources` has found in them.
+
     Raises:
         UserError: fewer than three usable photos, a mask whose size differs from its photo, not
             enough disk space, or photos used in place that would have to be changed.
         OSError: the dataset cannot be written.
     """
     _check(options)
-    found = find_sources(inputs)
+    sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     folder = dataset / "input"
-    skipped = list(found.left_out)
-    in_place = any(path.resolve() == folder.resolve() for path in inputs)
-    planned = plan_photos([s for s in found.sources if s.kind == "photo"], options.size, skipped)
+    skipped = list(sources.left_out)
+    in_place = sources.contain(folder)
+    planned = plan_photos(sources.photos, options.size, skipped)
     if options.photos is not None:
         planned = evenly_spread(planned, options.photos)
-    clips = [(s, read_clip(s.path)) for s in found.sources if s.kind == "video"]
+    clips = [(video, read_clip(video.path)) for video in sources.videos]
     if in_place:
-        _refuse_changes(planned, [s for s, _ in clips], options)
+        _refuse_changes(planned, sources.videos, options)
     folder.mkdir(parents=True, exist_ok=True)
     _check_disk_space(dataset, planned, clips, options)
     try:
@@ -106,7 +108,7 @@ def gather(
                 "disk: full; free some space, or set a smaller size, e.g. 1600"
             ) from None
         raise
-    for mask in found.unused_masks:
+    for mask in sources.unused_masks:
         logger.warning(
             "%s: mask not used, there is no such photo; masks are named IMG.jpg.png", shown(mask)
         )

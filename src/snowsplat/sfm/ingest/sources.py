@@ -39,15 +39,41 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Found:
-    """All files in the inputs, in the order of the inputs; files of a folder are sorted by name."""
+class Sources:
+    """The photos and videos in the inputs, as `find_sources` has found them.
 
-    sources: list[Source]
-    left_out: list[tuple[str, str]]  # path, reason
+    Attributes:
+        inputs: the files and folders that were searched.
+        files: in the order of the inputs; files of a folder are sorted by name.
+        left_out: path and reason of each photo or video that is not used.
+        unused_masks: masks without a photo.
+    """
+
+    inputs: tuple[Path, ...]
+    files: list[Source]
+    left_out: list[tuple[str, str]]
     unused_masks: list[Path]
 
+    @property
+    def photos(self) -> list[Source]:
+        return [source for source in self.files if source.kind == "photo"]
 
-def find_sources(inputs: Sequence[Path]) -> Found:
+    @property
+    def videos(self) -> list[Source]:
+        return [source for source in self.files if source.kind == "video"]
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that structure from motion reads, including masks."""
+        paths = (path for source in self.files for path in (source.path, source.mask))
+        return [path for path in paths if path is not None]
+
+    def contain(self, folder: Path) -> bool:
+        """Whether ``folder`` itself is one of the inputs."""
+        return any(path.resolve() == folder.resolve() for path in self.inputs)
+
+
+def find_sources(inputs: Sequence[Path]) -> Sources:
     """Find photos and videos in files and folders; folders are searched recursively.
 
     Hidden files, ``masks`` folders, datasets and output folders are skipped. Videos in a folder
@@ -60,7 +86,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
     """
     if not inputs:
         raise UserError("inputs: none given; add a folder of photos, photos or a video")
-    found: list[Source] = []
+    files: list[Source] = []
     left_out: list[tuple[str, str]] = []
     unused: list[Path] = []
     seen: dict[Path, Path] = {}
@@ -72,7 +98,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
             left_out.append((shown(source.path), f"is the same file as {shown(seen[real])}"))
         else:
             seen[real] = source.path
-            found.append(source)
+            files.append(source)
 
     for path in inputs:
         if not path.exists():
@@ -80,7 +106,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         if not path.is_dir():
             kind = kind_of_file(path)
             if kind == "photo":
-                add(Source(path, kind, shown(path.name), Masks(path.parent).of(path.name)))
+                add(Source(path, kind, shown(path.name), Masks(path.parent).mask_of(path.name)))
             else:
                 add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
             continue
@@ -89,7 +115,7 @@ def find_sources(inputs: Sequence[Path]) -> Found:
         masks = Masks(path)
         for relative in photos:
             name = str(PurePosixPath(prefix) / shown(relative))
-            add(Source(path / relative, "photo", name, masks.of(relative)))
+            add(Source(path / relative, "photo", name, masks.mask_of(relative)))
         unused += masks.unused
         for relative in videos:
             if photos:
@@ -99,9 +125,9 @@ def find_sources(inputs: Sequence[Path]) -> Found:
                 stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
                 only = len(videos) == 1
                 add(Source(path / relative, "video", prefix if only else _free(stem, folders)))
-    if not found:
+    if not files:
         raise _nothing_in(inputs)
-    return Found(found, left_out, unused)
+    return Sources(tuple(inputs), files, left_out, unused)
 
 
 def _scan(root: Path) -> tuple[list[str], list[str]]:
@@ -158,7 +184,7 @@ class Masks:
         self._by_folder: dict[Path, dict[str, Path]] = {}
         self._used: set[Path] = set()
 
-    def of(self, relative: str) -> Path | None:
+    def mask_of(self, relative: str) -> Path | None:
         """The mask of a photo whose path is relative to the root, or None."""
         name = PurePosixPath(relative)
         for folder, key in (
