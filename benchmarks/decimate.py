@@ -28,7 +28,8 @@ from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.decimate import Decimation
 from snowsplat.pipeline.output.image_files import write_png
-from snowsplat.pipeline.output.scene_source import cameras_of, folder_around, scene_file
+from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
+from snowsplat.pipeline.output.scene_source import cameras_of
 from snowsplat.pipeline.refine import photos_of, refine
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render

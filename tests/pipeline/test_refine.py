@@ -8,7 +8,8 @@ from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.convert import Edits, convert
-from snowsplat.pipeline.output.scene_source import cameras_of, training_folder
+from snowsplat.pipeline.output.scene_paths import training_folder
+from snowsplat.pipeline.output.scene_source import cameras_of
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene import edit
 from snowsplat.scene.render import render

@@ -9,7 +9,6 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.pipeline.compute import Compute
 from snowsplat.util.errors import UserError
 
 
@@ -47,9 +46,11 @@ class Clean:
         if self.scene is None or self.target is None:
             raise UserError("clean needs a scene and the name of a file to write")
         from snowsplat.pipeline.clean import clean
+        from snowsplat.pipeline.compute import Compute
 
         done = clean(
-            *(self.scene, self.target),
+            self.scene,
+            self.target,
             dataset=self.dataset,
             overwrite=self.overwrite,
             compute=Compute(self.device, self.threads),

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.make import print_summary
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.pipeline.demo import MAX_DEGREES, MAX_SHARE, demo
-from snowsplat.pipeline.run.train_result import TrainingStopped
+from snowsplat.cli.view import View
 
 if TYPE_CHECKING:
     from snowsplat.synthetic.compare_poses import PoseErrors
@@ -41,6 +40,9 @@ class Demo:
 
     def run(self) -> int:
         """Returns the exit code: 0; 1 if the poses are wrong; 130 after Ctrl-C."""
+        from snowsplat.pipeline.demo import demo
+        from snowsplat.pipeline.run.train_result import TrainingStopped
+
         try:
             with TerminalObserver() as observer:
                 result = demo(self.output, observer=observer)
@@ -64,8 +66,6 @@ class Demo:
             look = shlex.join(["snowsplat", "view", str(scene)])
             print(f"\nTo see the scene: {look}; with your own photos: snowsplat make PHOTOS")
             return 0
-        from snowsplat.cli.view import View
-
         return View(scene).run()
 
     def _stopped(self) -> int:
@@ -75,6 +75,8 @@ class Demo:
 
 
 def _print_errors(errors: PoseErrors) -> None:
+    from snowsplat.pipeline.demo import MAX_DEGREES, MAX_SHARE
+
     degrees, shares = errors.rotations, errors.centres
     found, total = len(errors.names), len(errors.names) + len(errors.missing)
     print(

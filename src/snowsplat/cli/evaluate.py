@@ -43,10 +43,10 @@ class Evaluate(SceneFlags):
 
     def run(self) -> int:
         """Returns the exit code, 0."""
-        scene = self.load()
         from snowsplat.evaluation.lpips import Lpips
         from snowsplat.pipeline.evaluate import evaluate, views_of
 
+        scene = self.load()
         views = views_of(scene, self.split)
         network = None if self.lpips is None else Lpips.load(self.lpips)
         width = max(4, *(len(view.name) for view in views))

@@ -13,9 +13,6 @@ import tyro
 from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import PageFlags
-from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.make import MakeOptions, make
-from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
@@ -77,6 +74,10 @@ class Make:
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""
+        from snowsplat.pipeline.compute import Compute
+        from snowsplat.pipeline.make import MakeOptions, make
+        from snowsplat.pipeline.run.train_result import TrainingStopped
+
         options = MakeOptions(
             quality=self.quality,
             minutes=self.minutes,
@@ -87,7 +88,9 @@ class Make:
         try:
             with TerminalObserver() as observer, page or nullcontext():
                 result = make(
-                    *(self.inputs, self.output, options),
+                    self.inputs,
+                    self.output,
+                    options,
                     overwrite=self.overwrite,
                     observer=observer,
                     page=page,
@@ -113,6 +116,7 @@ class Make:
         return 130
 
     def _watch(self, made: MakeResult, page: LivePage) -> None:
+        from snowsplat.pipeline.compute import Compute
         from snowsplat.pipeline.watch import watch
 
         with WatchObserver() as observer, page:

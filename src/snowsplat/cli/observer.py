@@ -9,8 +9,8 @@ from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.run.live_page import LOCAL_HOST
 from snowsplat.util.duration import duration
+from snowsplat.viewer.hosts import LOCAL_HOST
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.run.train_result import TrainResult

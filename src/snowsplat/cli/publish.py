@@ -58,7 +58,9 @@ class Publish:
 
         with TerminalObserver() as observer:
             result = publish(
-                *(self.scene, self.output, PublishOptions(self.title, self.licence, self.url)),
+                self.scene,
+                self.output,
+                PublishOptions(self.title, self.licence, self.url),
                 iteration=self.iteration,
                 overwrite=self.overwrite,
                 threads=self.threads,

@@ -100,8 +100,6 @@ class Render(SceneFlags):
         return None if self.antialias is None else self.antialias == "on"
 
     def _render_video(self, path: str) -> None:
-        from snowsplat.pipeline.videos import VideoOptions, render_video
-
         if self.depth == "16bit":
             raise UserError("--depth 16bit is for images; a video takes --depth color")
         scene, target = self.output or self.model_path, self.video
@@ -111,6 +109,8 @@ class Render(SceneFlags):
             scene = None
         if scene is None:
             raise UserError("render needs one output folder of a training run, or one scene file")
+        from snowsplat.pipeline.videos import VideoOptions, render_video
+
         options = VideoOptions(
             path=path,
             seconds=10.0 if self.seconds is None else self.seconds,
@@ -122,7 +122,8 @@ class Render(SceneFlags):
         )
         with TerminalObserver() as observer:
             render_video(
-                *(scene, options),
+                scene,
+                options,
                 target=target,
                 iteration=self.iteration,
                 compute=self.compute(),

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from snowsplat.cli.flags import flag
-from snowsplat.pipeline.compute import Compute
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
+    from snowsplat.pipeline.compute import Compute
     from snowsplat.pipeline.output.scene_source import TrainedScene
 
 
@@ -46,6 +46,8 @@ class SceneFlags:
 
     def compute(self) -> Compute:
         """The device and threads. Raises: UserError: fewer than 1 thread."""
+        from snowsplat.pipeline.compute import Compute
+
         return Compute(self.device, self.threads)
 
     def load(self) -> TrainedScene:

@@ -10,7 +10,6 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.pipeline.compute import Compute
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -79,9 +78,9 @@ class Sfm:
 
     def run(self) -> int:
         """Returns the exit code, 0."""
+        inputs, folder = self._inputs_and_folder()
         from snowsplat.sfm.dataset_folder import make_dataset
 
-        inputs, folder = self._inputs_and_folder()
         options = self._options()
         with TerminalObserver(self.quiet) as observer:
             outcomes = make_dataset(inputs, folder, options, observer, self.overwrite)
@@ -114,6 +113,7 @@ class Sfm:
         return self.inputs, self.output
 
     def _options(self) -> DatasetOptions:
+        from snowsplat.pipeline.compute import Compute
         from snowsplat.sfm.colmap import SfmOptions
         from snowsplat.sfm.dataset_folder import DatasetOptions
         from snowsplat.sfm.ingest.inputs import GatherOptions

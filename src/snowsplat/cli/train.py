@@ -10,10 +10,6 @@ from snowsplat.cli.flags import with_flags
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.cli.train_flags import TrainFlags
-from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.pipeline.run import processes
-from snowsplat.pipeline.run.train_result import TrainingStopped
-from snowsplat.pipeline.train import follow_training, resume, train
 from snowsplat.util.errors import UserError
 
 
@@ -42,9 +38,15 @@ class Train(TrainFlags):
         """Returns the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
         if self.output is None:
             raise UserError("train needs a folder for the result; add -o OUT")
+        from snowsplat.pipeline.output.output_folder import OutputFolder
+        from snowsplat.pipeline.run import processes
+        from snowsplat.pipeline.run.train_result import TrainingStopped
+
         if self.processes is not None and self.processes != 1 and processes.count() == 1:
             return processes.launch(self.processes, sys.argv[1:])
         if not processes.is_first():
+            from snowsplat.pipeline.train import follow_training
+
             follow_training(self.options().compute)
             return 0
         if self.resume and self.overwrite:
@@ -53,6 +55,8 @@ class Train(TrainFlags):
         OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
+        from snowsplat.pipeline.train import resume, train
+
         page = PageFlags(self.port, self.host).page(self.view)
         with TerminalObserver(self.quiet) as observer, page or nullcontext():
             try:
@@ -61,7 +65,9 @@ class Train(TrainFlags):
                 else:
                     assert dataset is not None
                     train(
-                        *(dataset, self.output, options),
+                        dataset,
+                        self.output,
+                        options,
                         overwrite=self.overwrite,
                         observer=observer,
                         page=page,

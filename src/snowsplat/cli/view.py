@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import getpass
 import os
 import signal
 import socket
 import sys
 import threading
+import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -85,8 +87,6 @@ def over_ssh() -> bool:
 
 def forwarding(port: int) -> str:
     """The command that forwards a port of this machine to the computer of the user."""
-    import getpass
-
     return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{socket.gethostname()}"
 
 
@@ -99,8 +99,6 @@ def has_screen() -> bool:
 
 def open_browser(url: str) -> None:
     """In the background: some browsers block the program that opens them."""
-    import webbrowser
-
     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 

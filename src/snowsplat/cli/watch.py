@@ -40,7 +40,8 @@ class Watch(SceneFlags):
         assert page is not None
         with WatchObserver() as observer, page:
             watch(
-                *(path, page),
+                path,
+                page,
                 iteration=self.iteration,
                 dataset=self.dataset,
                 resolution=self.resolution,

@@ -6,19 +6,24 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
+import torch
+from torch import Tensor
+
+from snowsplat.data import Dataset
+from snowsplat.evaluation.floaters import clean as without_floaters
+from snowsplat.evaluation.metrics import compare, evaluate_views
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
-from snowsplat.pipeline.output.scene_source import Color, folder_around, load_viewable
+from snowsplat.pipeline.output.scene_paths import folder_around
+from snowsplat.pipeline.output.scene_source import Color, load_viewable
+from snowsplat.pipeline.refine import photos_of
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from snowsplat.data import Dataset
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.process import single_threaded
 
 #: At most this number of photos is compared, evenly chosen.
 _VIEWS = 24
@@ -87,11 +92,6 @@ def clean(
         raise UserError(
             f"{scene}: the cameras are unknown, because it is in no output folder; set `dataset`"
         )
-    import torch
-
-    from snowsplat.evaluation.floaters import clean as without_floaters
-    from snowsplat.util.process import single_threaded
-
     gaussians = source.gaussians.to(device)
     cameras = [camera.to(device) for camera in cameras]
     with single_threaded():
@@ -117,8 +117,6 @@ def _judge(
 ) -> _Judge:
     if photos is None:
         return _judge_of_renderings(gaussians, cameras, background)
-    from snowsplat.evaluation.metrics import evaluate_views
-
     held_out = bool(photos.test)
     views = _evenly(photos.test or photos.train)
 
@@ -133,11 +131,6 @@ def _judge(
 def _judge_of_renderings(
     gaussians: Gaussians, cameras: Sequence[Camera], background: Color
 ) -> _Judge:
-    import torch
-
-    from snowsplat.evaluation.metrics import compare
-    from snowsplat.scene.render import render
-
     color = torch.tensor(background, device=gaussians.means.device)
     chosen = _evenly(cameras)
 
@@ -159,8 +152,6 @@ def _photos(scene: Path, dataset: Path | None) -> Dataset | None:
     Raises:
         UserError: ``dataset`` is not a dataset.
     """
-    from snowsplat.pipeline.refine import photos_of
-
     if dataset is None:
         folder = folder_around(scene)
         if not folder.scenes():

@@ -22,16 +22,16 @@ from snowsplat.pipeline.output.scene_files import (
     read_gaussians,
     write_gaussians,
 )
-from snowsplat.pipeline.output.scene_source import (
-    background_of,
-    cameras_of,
-    folder_around,
-    scene_file,
-)
+from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
+from snowsplat.pipeline.output.scene_source import background_of, cameras_of
+from snowsplat.pipeline.refine import photos_of, refine
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.viewer.web.html import write_html
+from snowsplat.viewer.web.panel import Description, made_on
+from snowsplat.viewer.web.scene import ready
 
 logger = logging.getLogger(__name__)
 
@@ -201,8 +201,6 @@ def _decimation(
         raise SettingError("refine", "is for decimated scenes; set `decimate` as well")
     if edits.crop:
         raise SettingError("refine", "the photos show the whole scene; crop it later")
-    from snowsplat.pipeline.refine import photos_of, refine
-
     photos, background = photos_of(scenes[0], Path(dataset))
     refined = partial(refine, dataset=photos, background=background, observer=observer)
     return Decimation([view.camera for view in photos.train], refined=refined)
@@ -214,9 +212,5 @@ def _write_spz(target: Path, scene: Gaussians, version: int) -> None:
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
     """Write an HTML page, with the cameras and the background of its training if they are known."""
-    from snowsplat.viewer.web.html import write_html
-    from snowsplat.viewer.web.panel import Description, made_on
-    from snowsplat.viewer.web.scene import ready
-
     folder, about = folder_around(source), Description(target.stem, made=made_on(source))
     write_html(target, ready(scene, cameras_of(folder), background_of(folder)), about)

@@ -7,10 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.simplify import simplify
+from snowsplat.training.core.distillation import distill
+from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import SettingError
 from snowsplat.util.files import atomic_path
 
@@ -74,11 +78,6 @@ class Decimation:
         return self._distilled(smaller, scene) if self.cameras else smaller
 
     def _distilled(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
-        import torch
-
-        from snowsplat.training.core.distillation import distill
-        from snowsplat.training.core.progress import Progress
-
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))
 

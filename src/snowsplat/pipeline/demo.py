@@ -6,17 +6,16 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from torch import Tensor
+
+from snowsplat.data.colmap import posed_camera, read_model
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.synthetic import Truth, write_synthetic_photos
+from snowsplat.synthetic.compare_poses import PoseErrors, compare_poses
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from snowsplat.synthetic import Truth
-    from snowsplat.synthetic.compare_poses import PoseErrors
+from snowsplat.util.stages import Outcome
 
 PHOTOS, TRUTH, MADE = "photos", "truth", "made"
 MAX_DEGREES = 0.1  # largest accepted rotation error of a photo
@@ -82,9 +81,6 @@ def _check_free(out: Path) -> None:
 
 
 def _take_photos(folder: Path, observer: Observer) -> Truth:
-    from snowsplat.synthetic import write_synthetic_photos
-    from snowsplat.util.stages import Outcome
-
     before = len(list(folder.glob("*.jpg")))
     started = time.monotonic()
     truth = write_synthetic_photos(folder, report=observer.begin("demo"))
@@ -100,9 +96,6 @@ def compare_with_truth(dataset: Path, poses: Mapping[str, Tensor]) -> PoseErrors
     Raises:
         ValueError: fewer than three photos have poses.
     """
-    from snowsplat.data.colmap import posed_camera, read_model
-    from snowsplat.synthetic.compare_poses import compare_poses
-
     model = read_model(dataset / "sparse" / "0")
     found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}
     return compare_poses(found, poses)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from snowsplat.formats.lod import INDEX, LEVELS
+import numpy as np
+
+from snowsplat.data.points_ply import read_points
+from snowsplat.formats import Format, GaussianArrays, ply
+from snowsplat.formats.lod import INDEX, LEVELS, read_index
 from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.pipeline.output.scene_source import training_folder
+from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
+from snowsplat.pipeline.output.scene_paths import training_folder
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
+from snowsplat.training.core import checkpoint_file
 from snowsplat.util.errors import UserError
+from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import read_json
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from snowsplat.formats import Format, GaussianArrays
 
 _PERCENTILES = (1, 50, 99)
 
@@ -46,8 +50,6 @@ def describe(path: Path | str) -> dict[str, Any]:
     if (path / INDEX).is_file():
         path = path / INDEX
     if path.is_file():
-        from snowsplat.pipeline.output.scene_files import format_for_reading
-
         try:
             format = format_for_reading(path)
         except UserError as error:
@@ -62,11 +64,6 @@ def describe(path: Path | str) -> dict[str, Any]:
 
 
 def _scene(path: Path, format: Format) -> dict[str, Any]:
-    from snowsplat.formats import ply
-    from snowsplat.formats.lod import read_index
-    from snowsplat.pipeline.output.scene_files import read_arrays
-    from snowsplat.util.ply import open_table
-
     facts: dict[str, Any] = {"file": str(path), "bytes": format.size(path)}
     if format.name == LEVELS:
         facts["gaussians_per_level"] = read_index(path).counts()
@@ -74,8 +71,6 @@ def _scene(path: Path, format: Format) -> dict[str, Any]:
         table = open_table(path)
         facts["encoding"] = table.format
         if not ply.is_scene(table):
-            from snowsplat.data.points_ply import read_points
-
             xyz, _ = read_points(path)
             return {"kind": "point cloud", **facts, "points": len(xyz), **_bounds(xyz)}
     gaussians = read_arrays(path)
@@ -85,10 +80,6 @@ def _scene(path: Path, format: Format) -> dict[str, Any]:
 
 
 def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
-    import numpy as np
-
-    from snowsplat.scene.sh_constants import SH_REST_COUNTS
-
     finite = gaussians.select(gaussians.finite_rows())
     count, finite_count = len(gaussians.means), len(finite.means)
     facts: dict[str, Any] = {
@@ -112,8 +103,6 @@ def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
 
 
 def _bounds(xyz: np.ndarray) -> dict[str, Any]:
-    import numpy as np
-
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
         return {}
@@ -125,8 +114,6 @@ def _bounds(xyz: np.ndarray) -> dict[str, Any]:
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float]:
-    import numpy as np
-
     found = np.percentile(values, _PERCENTILES)
     return {f"p{p}": float(f"{v:.4g}") for p, v in zip(_PERCENTILES, found, strict=True)}
 
@@ -137,8 +124,6 @@ def _rounded(values: Any) -> list[float]:
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
-    from snowsplat.training.core import checkpoint_file
-
     try:
         content = checkpoint_file.read(path)
     except OSError as error:
@@ -175,9 +160,7 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
 
 
 def _dataset(path: Path) -> dict[str, Any]:
-    from collections import Counter
-
-    from snowsplat.data import load_dataset
+    from snowsplat.data import load_dataset  # torch; the other kinds do not need it
 
     dataset = load_dataset(path)
     views = [*dataset.train, *dataset.test]

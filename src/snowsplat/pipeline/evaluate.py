@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+from snowsplat.data import View
+from snowsplat.evaluation.lpips import Lpips
+from snowsplat.evaluation.metrics import Evaluation, ViewMetrics, evaluate_views
+from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.data import View
-    from snowsplat.evaluation.lpips import Lpips
-    from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
-    from snowsplat.pipeline.output.scene_source import TrainedScene
+from snowsplat.util.process import single_threaded
 
 Split = Literal["test", "train"]
 
@@ -40,10 +39,6 @@ def evaluate(
         UserError: there are no photos in this split, or a photo or the weights file is damaged.
         OSError: metrics.json cannot be written.
     """
-    from snowsplat.evaluation.lpips import Lpips
-    from snowsplat.evaluation.metrics import evaluate_views
-    from snowsplat.util.process import single_threaded
-
     views = views_of(scene, split)
     if isinstance(lpips, Path | str):
         lpips = Lpips.load(Path(lpips))

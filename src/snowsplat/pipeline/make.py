@@ -10,23 +10,31 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from snowsplat import ops
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
+from snowsplat.pipeline.render import render_images
+from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.time_budget import check_minutes
+from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.sfm.colmap import SfmOptions
+from snowsplat.sfm.cost import measure_speed
+from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
+from snowsplat.sfm.ingest.inputs import GatherOptions
+from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.survey import survey
+from snowsplat.sfm.time_left import Later
+from snowsplat.training.core import checkpoint
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
-
-if TYPE_CHECKING:
-    from snowsplat.pipeline.run.live_page import LivePage
-    from snowsplat.pipeline.train import TrainOptions
-    from snowsplat.sfm.time_left import Later
-    from snowsplat.util.stages import Outcome
+from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
 RECORD = "make.json"
@@ -182,9 +190,6 @@ class _Job:
     started: float  # by `time.monotonic`
 
     def run(self) -> MakeResult:
-        from snowsplat.sfm.ingest.sources import find_sources
-        from snowsplat.util.stages import Stages
-
         self.sources = find_sources(self.inputs)  # an error before the folder is created
         existed = self.out.exists()
         self.out.mkdir(parents=True, exist_ok=True)
@@ -216,10 +221,6 @@ class _Job:
         if minutes is None:
             quality = quality or "normal"
             return MakePlan(quality, PRESETS[quality].photos)
-        from snowsplat import ops
-        from snowsplat.sfm.cost import measure_speed
-        from snowsplat.sfm.survey import survey
-
         photos = survey(self.sources)
         about = {"minutes": minutes, "quality": quality, "photos": asdict(photos)}
         before = self.stages.about.get("plan", {})
@@ -233,10 +234,6 @@ class _Job:
         return MakePlan(**self.stages.about["plan"]["chosen"])
 
     def _make_dataset(self) -> None:
-        from snowsplat.sfm.colmap import SfmOptions
-        from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
-        from snowsplat.sfm.ingest.inputs import GatherOptions
-
         plan = self.plan
         options = DatasetOptions(
             gather=GatherOptions(size=plan.size, photos=plan.photos, frames=plan.frames),
@@ -257,9 +254,6 @@ class _Job:
 
     def _later(self) -> Later:
         """The work after the dataset is made, for the estimate of the time left."""
-        from snowsplat import ops
-        from snowsplat.sfm.time_left import Later
-
         if self.options.minutes is not None:
             return Later(deadline=self.started + 60.0 * self.options.minutes)
         if ops.resolve_device(self.options.compute.device).type != "cpu":
@@ -320,9 +314,6 @@ class _Job:
 
     def _train(self, settings: dict[str, Any]) -> dict[str, Any]:
         """Start or resume the training; copy its scene into the output folder of `make`."""
-        from snowsplat.pipeline.train import TrainOptions, resume, train
-        from snowsplat.training.core import checkpoint
-
         folder = OutputFolder(self.out / SCENE)
         options = TrainOptions(
             memory=self.options.memory,
@@ -371,9 +362,6 @@ class _Job:
         return max(left, shortest) / 60.0
 
     def _render(self) -> dict[str, Any]:
-        from snowsplat.pipeline.output.scene_source import load_trained
-        from snowsplat.pipeline.render import render_images
-
         scene = load_trained(self.out / SCENE, compute=self.options.compute)
         render_images(scene, splits=("test",))
         return {}

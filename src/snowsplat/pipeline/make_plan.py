@@ -22,14 +22,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.quality import PRESETS, Quality
+from snowsplat.sfm.colmap.options import EFFORTS
+from snowsplat.sfm.cost import Speed, steps_of
+from snowsplat.sfm.survey import Photos
 from snowsplat.util.duration import duration
-
-if TYPE_CHECKING:
-    from snowsplat.sfm.cost import Speed
-    from snowsplat.sfm.survey import Photos
 
 #: The share of the time that everything before the training may take.
 _SHARE = 0.45
@@ -65,7 +63,6 @@ def choose_plan(
         photos: all photos and frames that would be used without a time budget.
         quality: the requested quality; None: any.
     """
-    from snowsplat.sfm.cost import steps_of
 
     def fits(photos: Photos, quality: Quality, size: int) -> bool:
         steps = steps_of(photos, size, quality).values()
@@ -90,8 +87,6 @@ def choose_plan(
 
 def _sizes(quality: Quality | None) -> Iterator[tuple[Quality, int]]:
     """Qualities and sizes of the photos, in the order in which they are tried."""
-    from snowsplat.sfm.colmap.options import EFFORTS
-
     every: tuple[Quality, ...] = ("best", "normal", "draft")
     for each in every if quality is None else (quality,):
         yield each, PRESETS[each].photos

@@ -11,9 +11,12 @@ from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
-from snowsplat.pipeline.output.scene_source import load_viewable, scene_name
+from snowsplat.pipeline.output.scene_paths import scene_name
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.viewer.web.panel import Description, made_on
+from snowsplat.viewer.web.publication import write_site
 
 #: Larger scenes are written in levels of detail. Phones show at most that many Gaussians at a time.
 _LARGE = 2_000_000
@@ -90,9 +93,6 @@ def publish(
     source = load_viewable(scene, iteration)
     if not len(source.gaussians):
         raise UserError(f"{source.file}: contains no Gaussians; there is nothing to see")
-
-    from snowsplat.viewer.web.panel import Description, made_on
-    from snowsplat.viewer.web.publication import write_site
 
     url = options.url and options.url.rstrip("/") + "/"
     about = Description(options.title or scene_name(scene), options.licence, made_on(source.file))

@@ -8,7 +8,7 @@ from pathlib import Path
 from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings
-from snowsplat.pipeline.output.scene_source import folder_around
+from snowsplat.pipeline.output.scene_paths import folder_around
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.distillation import MERGED_RATES
 from snowsplat.training.core.recipes import recipe

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import numpy as np
+import torch
+
+from snowsplat.data import ImageLoader, View
 from snowsplat.pipeline.evaluate import Split
+from snowsplat.pipeline.output import image_files
+from snowsplat.pipeline.output.scene_source import TrainedScene
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from snowsplat.data import View
-    from snowsplat.pipeline.output.scene_source import TrainedScene
-    from snowsplat.scene.camera import Camera
+from snowsplat.util.files import write_json
 
 Depth = Literal["none", "16bit", "color"]
 
@@ -63,13 +65,6 @@ def render_images(
 
 
 def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Depth) -> None:
-    import torch
-
-    from snowsplat.data import ImageLoader
-    from snowsplat.pipeline.output import image_files
-    from snowsplat.scene.render import render
-    from snowsplat.util.files import write_json
-
     gaussians = scene.gaussians
     device = gaussians.means.device
     color = torch.tensor(scene.background, device=device)

@@ -8,17 +8,24 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+
+from snowsplat import trajectory
+from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output import image_files
+from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
+from snowsplat.trajectory.video import video_writer
 from snowsplat.util.errors import SettingError, UserError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
+from snowsplat.util.files import remove_temporaries
+from snowsplat.util.stages import Outcome
 
 #: The camera paths that are computed from the cameras of a training run.
 CAMERA_PATHS = ("training", "ellipse", "spiral")
@@ -186,10 +193,6 @@ class _Source:
 
 
 def _load(scene: Path, iteration: int | None, name: str) -> _Source:
-    from snowsplat.formats import read_gaussians
-    from snowsplat.pipeline.output.scene_source import existing_folder, folder_around
-    from snowsplat.scene.camera_json import read_cameras
-
     if scene.is_file():
         file = scene.with_name(f"{scene.stem}_{name}.mp4")
         folder, gaussians = folder_around(scene), read_gaussians(scene)
@@ -219,9 +222,6 @@ def cameras_along(
     Raises:
         UserError: no such path or file, or one that needs the cameras of a training run.
     """
-    from snowsplat import trajectory
-    from snowsplat.scene.camera_json import read_cameras
-
     if path not in CAMERA_PATHS:
         if Path(path).suffix.lower() != ".json":
             known = ", ".join(CAMERA_PATHS)
@@ -278,12 +278,6 @@ class Video:
             UserError: a file cannot be written.
             KeyboardInterrupt: Ctrl-C; no file is left.
         """
-        import torch
-
-        from snowsplat.trajectory.video import video_writer
-        from snowsplat.util.files import remove_temporaries
-        from snowsplat.util.stages import Outcome
-
         first = self.cameras[0]
         width, height = first.width, first.height
         files = self._files()
@@ -317,10 +311,6 @@ class Video:
         return [(self.file, 1), (depth, 1)] if self.depth else [(self.file, 1)]
 
     def _frame(self, camera: Camera, near: float, far: float) -> list[np.ndarray]:
-        import numpy as np
-
-        from snowsplat.pipeline.output import image_files
-
         color, depth = self._render(camera)
         if depth is None:
             return [color]
@@ -329,8 +319,6 @@ class Video:
 
     def _depth_range(self) -> tuple[float, float]:
         """One range of depths for the whole video, so that its colours do not flicker."""
-        from snowsplat.pipeline.output import image_files
-
         if not (self.depth or self.side_by_side):
             return 1.0, 2.0
         sample = self.cameras[:: -(-len(self.cameras) // _RANGE_FRAMES)]
@@ -338,11 +326,6 @@ class Video:
         return image_files.depth_range([depth for depth in depths if depth is not None])
 
     def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
-        import torch
-
-        from snowsplat.pipeline.output import image_files
-        from snowsplat.scene.render import render
-
         with_depth = self.depth or self.side_by_side
         background = torch.tensor(self.background)
         output = render(self.gaussians, camera, background, with_depth=with_depth)

@@ -7,18 +7,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.viewer.web.served_file import Served
+from snowsplat.viewer.web.panel import Description, made_on
+from snowsplat.viewer.web.scene import site
+from snowsplat.viewer.web.served_file import Served
 
 #: Larger scenes are shown in levels of detail. The viewer never draws more Gaussians at a time.
 _LARGE = 4_000_000
@@ -54,9 +53,6 @@ def viewed_scene(
     Raises:
         UserError: the scene is missing or damaged, or has no Gaussians.
     """
-    from snowsplat.viewer.web.panel import Description, made_on
-    from snowsplat.viewer.web.scene import site
-
     path = Path(path)
     title = path.resolve().name
     index = _levels_in(path)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import torch
+
+from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
-from snowsplat.pipeline.output.scene_source import existing_folder, load_dataset_of
+from snowsplat.pipeline.output.scene_paths import existing_folder
+from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.run.live_page import LivePage
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    import torch
-
-    from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.viewer.live.viewer import Scene
+from snowsplat.viewer.live.viewer import Scene
 
 _NOTHING = [
     "Nothing is saved yet.",
@@ -82,8 +82,6 @@ class NewestScene:
         Raises:
             UserError: the first scene or checkpoint cannot be read.
         """
-        from snowsplat.viewer.live.viewer import Scene
-
         try:
             step, path = self._newest()
             if path is None:
@@ -103,8 +101,6 @@ class NewestScene:
         return self._scene
 
     def _newest(self) -> tuple[int, Path | None]:
-        from snowsplat.training.core import checkpoint
-
         if self._iteration is not None:
             if self._iteration not in self._folder.scenes():
                 self._folder.read_scene(self._iteration)  # raises an error that lists the scenes
@@ -114,10 +110,6 @@ class NewestScene:
         return max(found, key=lambda each: each[0], default=(0, None))
 
     def _gaussians(self, path: Path) -> Gaussians:
-        from snowsplat.formats import read_gaussians
-        from snowsplat.scene.gaussians import Gaussians
-        from snowsplat.training.core import checkpoint
-
         if path.parent != self._folder.checkpoints:
             return read_gaussians(path)
         saved = checkpoint.load(path)

@@ -23,22 +23,23 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sources import Sources, find_sources
+from snowsplat.sfm.orient import orientation
+from snowsplat.sfm.progress import Report
+from snowsplat.sfm.report import write_report
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
+from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import remove_temporaries
 from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
-
-if TYPE_CHECKING:
-    from snowsplat.sfm.progress import Report
 
 STAGES = ("photos", "poses", "images", "report")
 RECORD, REPORT = "capture.json", "capture_report.html"
@@ -189,8 +190,6 @@ def _run(
     stage("images", {"resize": options.resize}, _IMAGE_FOLDERS, make_images)
 
     def write(report: Report) -> dict[str, Any]:
-        from snowsplat.sfm.report import write_report
-
         facts = {
             "inputs": stages.about["inputs"],
             "settings": _settings_as_json(options),
@@ -238,9 +237,6 @@ def _undistort(
     folder: Path, photos: list[Photo], options: DatasetOptions, report: Report
 ) -> dict[str, Any]:
     import pycolmap
-
-    from snowsplat.sfm.orient import orientation
-    from snowsplat.sfm.undistort import undistort
 
     for name in _IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)

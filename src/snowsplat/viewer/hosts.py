@@ -11,6 +11,8 @@ import ipaddress
 import re
 import socket
 
+#: The address at which only this machine can connect.
+LOCAL_HOST = "127.0.0.1"
 #: Hosts that stand for all addresses of this machine.
 ANY_HOST = ("", "0.0.0.0", "::")
 

@@ -62,7 +62,9 @@ class Globe:
         options = GlobeOptions(self.gaussians, self.name, self.size, self.fps)
         with TerminalObserver() as observer:
             result = make_globe(
-                *(self.scene, self.output, options),
+                self.scene,
+                self.output,
+                options,
                 video=self.video,
                 iteration=self.iteration,
                 threads=self.threads,

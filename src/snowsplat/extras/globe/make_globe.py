@@ -5,16 +5,19 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from snowsplat.extras.globe.globe_page import write_page
+from snowsplat.extras.globe.globe_video import GlobeVideo
+from snowsplat.extras.globe.layout import arrange
+from snowsplat.extras.globe.plate import engraving
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.scene_source import load_viewable, scene_name
+from snowsplat.pipeline.output.scene_paths import scene_name
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.videos import VideoSize
+from snowsplat.trajectory.video import video_writer
 from snowsplat.util.errors import SettingError, UserError
-
-if TYPE_CHECKING:
-    from snowsplat.extras.globe.globe_video import GlobeVideo
+from snowsplat.util.stages import Outcome
 
 _LARGEST = 1_000_000  # Gaussians: the page has 26 bytes for each
 _LONGEST_NAME = 60
@@ -115,11 +118,6 @@ def make_globe(
     Compute("cpu", threads).apply()
     source = load_viewable(scene, iteration)
 
-    from snowsplat.extras.globe.globe_page import write_page
-    from snowsplat.extras.globe.globe_video import GlobeVideo
-    from snowsplat.extras.globe.layout import arrange
-    from snowsplat.extras.globe.plate import engraving
-
     arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
     name = options.name or scene_name(scene)[:_LONGEST_NAME]
     write_page(target, arrangement, name)
@@ -132,9 +130,6 @@ def make_globe(
 
 
 def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
-    from snowsplat.trajectory.video import video_writer
-    from snowsplat.util.stages import Outcome
-
     started = time.monotonic()
     report = observer.begin("video")
     with video_writer(file, video.width, video.height, video.fps) as add:

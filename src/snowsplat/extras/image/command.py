@@ -72,7 +72,9 @@ class Image:
         )
         with TerminalObserver(self.quiet) as observer:
             result = fit_image(
-                *(self.photo, self.output, options),
+                self.photo,
+                self.output,
+                options,
                 size=512 if self.size is None else self.size,
                 threads=self.threads,
                 overwrite=self.overwrite,
@@ -91,12 +93,12 @@ class Image:
         return 0
 
     def _decode(self, compact: Path, target: Path) -> int:
-        from snowsplat.extras.image.fit_image import decode_image
-
         if target.suffix.lower() != ".png":
             raise UserError(
                 f"{target}: the image of a compact file is written as PNG; use -o FILE.png"
             )
+        from snowsplat.extras.image.fit_image import decode_image
+
         width, height = decode_image(compact, target, self.size)
         print(f"{target}: {width} × {height} pixels")
         return 0

@@ -6,20 +6,27 @@ import math
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from torch import Tensor
+
+from snowsplat.data.decode import ImageSource, load_image, read_header
+from snowsplat.evaluation.metrics import compare
+from snowsplat.extras.image.compact_file import read_compact, write_compact
+from snowsplat.extras.image.fit import FitOptions, Fitter
+from snowsplat.extras.image.history import Moment, recorded_steps
+from snowsplat.extras.image.image_report import Fitted, write_image_report
+from snowsplat.extras.image.model import ImageGaussians
+from snowsplat.extras.image.svg import write_svg
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output.image_files import to_8bit, write_png
+from snowsplat.training.core.progress import Progress
+from snowsplat.trajectory.video import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
-
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-
-    from snowsplat.extras.image.fit import FitOptions, Fitter
-    from snowsplat.extras.image.history import Moment
-    from snowsplat.extras.image.model import ImageGaussians
+from snowsplat.util.process import single_threaded
 
 #: The files that `fit_image` writes to the output folder, and what they contain.
 FILES = {
@@ -85,8 +92,6 @@ def fit_image(
             contains an earlier fit or is a file.
         OSError: a file cannot be written.
     """
-    from snowsplat.extras.image.fit import FitOptions, Fitter
-
     options, photo, output = options or FitOptions(), Path(photo), Path(output)
     _check_size(size)
     if output.exists() and not output.is_dir():
@@ -96,13 +101,6 @@ def fit_image(
     target = load_photo(photo, size)
     Compute("cpu", threads).apply()
     output.mkdir(parents=True, exist_ok=True)
-
-    from snowsplat.evaluation.metrics import compare
-    from snowsplat.extras.image.compact_file import write_compact
-    from snowsplat.extras.image.image_report import Fitted, write_image_report
-    from snowsplat.extras.image.svg import write_svg
-    from snowsplat.pipeline.output.image_files import to_8bit, write_png
-    from snowsplat.util.process import single_threaded
 
     with single_threaded():
         fitter = Fitter(target, options)
@@ -155,9 +153,6 @@ def decode_image(
         UserError: the file is missing or damaged, or ``size`` is out of range.
         OSError: ``target`` cannot be written.
     """
-    from snowsplat.extras.image.compact_file import read_compact
-    from snowsplat.pipeline.output.image_files import to_8bit, write_png
-
     gaussians = read_compact(Path(compact))
     scale = 1.0
     if size is not None:
@@ -182,8 +177,6 @@ def load_photo(photo: Path, size: int) -> Tensor:
     Raises:
         UserError: the file is missing or damaged.
     """
-    from snowsplat.data.decode import ImageSource, load_image, read_header
-
     header = read_header(photo)
     width, height = header.width, header.height
     if header.sideways:
@@ -196,11 +189,6 @@ def load_photo(photo: Path, size: int) -> Tensor:
 
 def _run(fitter: Fitter, target: Tensor, video: Path, observer: Observer) -> list[Moment]:
     """Take all steps; record the moments and the video."""
-    from snowsplat.evaluation.metrics import compare
-    from snowsplat.extras.image.history import Moment, recorded_steps
-    from snowsplat.training.core.progress import Progress
-    from snowsplat.trajectory.video import video_writer
-
     steps = fitter.options.steps
     recorded = set(recorded_steps(steps, _VIDEO_SECONDS * _VIDEO_FPS))
     height, width = target.shape[:2]
@@ -232,10 +220,6 @@ def _run(fitter: Fitter, target: Tensor, video: Path, observer: Observer) -> lis
 
 def _frame(gaussians: ImageGaussians, scale: int, width: int, height: int) -> np.ndarray:
     """(height, width, 3) uint8: the image, `scale` times as large, cut to an even size."""
-    import numpy as np
-
-    from snowsplat.pipeline.output.image_files import to_8bit
-
     pixels = to_8bit(gaussians.render(scale))[:height, :width]
     missing = height - pixels.shape[0], width - pixels.shape[1]  # of an image of 1 pixel
     return np.pad(pixels, ((0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")

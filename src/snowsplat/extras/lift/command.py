@@ -122,7 +122,10 @@ class Lift:
         from snowsplat.extras.lift.lift_photo import lift_photo
 
         return lift_photo(
-            *(photo, output, source, LiftOptions(self.edge, self.max_gaussians)),
+            photo,
+            output,
+            source,
+            LiftOptions(self.edge, self.max_gaussians),
             size=640 if self.size is None else self.size,
             focal=self.focal,
             swing=self.swing,
@@ -136,7 +139,11 @@ class Lift:
 
         with TerminalObserver(self.quiet) as observer:
             return refine_photo(
-                *(photo, output, source, dataset, LiftOptions(self.edge, self.max_gaussians)),
+                photo,
+                output,
+                source,
+                dataset,
+                LiftOptions(self.edge, self.max_gaussians),
                 iterations=1000 if self.iterations is None else self.iterations,
                 hold_out=8 if self.eval else None,
                 swing=self.swing,

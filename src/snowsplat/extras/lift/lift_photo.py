@@ -6,22 +6,31 @@ import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from snowsplat.data.depth_alignment import Alignment
+from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
+from snowsplat.evaluation.metrics import Evaluation, compare
+from snowsplat.extras.lift.depth_model import estimate_depth
+from snowsplat.extras.lift.edges import resize_depth
+from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.output import image_files
+from snowsplat.pipeline.output.image_files import to_8bit, write_png
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import render
+from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.trajectory.swing import swing_path
+from snowsplat.trajectory.video import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from snowsplat.data.depth_alignment import Alignment
-    from snowsplat.data.depth_file import DepthKind
-    from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.extras.lift.lift import LiftOptions
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
 
 #: The folder of the dataset that `lift_photo` writes: the photo and its camera.
 PHOTO = "photo"
@@ -70,10 +79,6 @@ class DepthSource:
         Raises:
             UserError: an unusable file, model or range; another aspect ratio than the photo.
         """
-        from snowsplat.data.depth_file import read_depth_file, to_z
-        from snowsplat.extras.lift.depth_model import estimate_depth
-        from snowsplat.extras.lift.edges import resize_depth
-
         if self.map is not None:
             values = read_depth_file(self.map)
             height, width = values.shape
@@ -150,8 +155,6 @@ def lift_photo(
             range; ``output`` contains other files.
         OSError: a file cannot be written.
     """
-    from snowsplat.extras.lift.lift import LiftOptions, lift
-
     options, started = options or LiftOptions(), time.monotonic()
     out = OutputFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
@@ -171,13 +174,6 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     Raises:
         UserError: see `lift_photo`.
     """
-    import numpy as np
-    import torch
-    from PIL import Image
-
-    from snowsplat.scene.camera import Camera
-    from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
-
     least, most = _SIDES
     if not least <= size <= most:
         raise SettingError("size", f"{size} is out of range; use {least} to {most} pixels")
@@ -208,11 +204,6 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
 
 def _begin(out: OutputFolder, name: str, pixels: Tensor, camera: Camera) -> None:
     """Write the photo as a dataset of one view, and what `train` writes before its first step."""
-    import torch
-
-    from snowsplat.pipeline.output.image_files import to_8bit, write_png
-    from snowsplat.training.core.config import TrainConfig
-
     folder = out.path / PHOTO
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for earlier in (folder / "images").iterdir():
@@ -239,13 +230,6 @@ def finish(
     started: float,
 ) -> LiftResult:
     """Write the scene, its pictures and metrics."""
-    import numpy as np
-    import torch
-
-    from snowsplat.evaluation.metrics import Evaluation, compare
-    from snowsplat.pipeline.output import image_files
-    from snowsplat.scene.render import render
-
     scene = out.write_scene(step, gaussians)
     with torch.no_grad():
         image = render(gaussians, camera).image
@@ -275,13 +259,6 @@ def finish(
 
 def _write_swing(target: Path, gaussians: Gaussians, camera: Camera, distance: float) -> None:
     """A video of the scene on `swing_path`; its size is even."""
-    import torch
-
-    from snowsplat.pipeline.output.image_files import to_8bit
-    from snowsplat.scene.render import render
-    from snowsplat.trajectory.swing import swing_path
-    from snowsplat.trajectory.video import video_writer
-
     width, height = (side // 2 * 2 for side in (camera.width, camera.height))
     cameras = swing_path(camera, distance, _SWING_SECONDS * _SWING_FPS)
     with torch.no_grad(), video_writer(target, width, height, _SWING_FPS) as add_frame:

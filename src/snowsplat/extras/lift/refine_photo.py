@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from snowsplat.data import Dataset, ImageLoader, Points, View
+from snowsplat.data.depth_alignment import align
+from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, finish
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
+from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.core.trainer import Trainer
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.data import Dataset, Points, View
-    from snowsplat.extras.lift.lift import LiftOptions
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.core.config import TrainConfig
-    from snowsplat.training.core.trainer import Trainer
 
 # Share of the largest number of Gaussians that the lifted photo may use. Densification needs the
 # others for what the photo does not show.
@@ -57,12 +57,6 @@ def refine_photo(
             training photos; the depth map contradicts the points.
         KeyboardInterrupt: Ctrl-C; the folder then contains the scene after 0 steps.
     """
-    from snowsplat.data import ImageLoader
-    from snowsplat.data.depth_alignment import align
-    from snowsplat.extras.lift.lift import LiftOptions, lift
-    from snowsplat.training.core.recipes import recipe
-    from snowsplat.training.core.trainer import Trainer
-
     options, started = options or LiftOptions(), time.monotonic()
     out = OutputFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
@@ -130,9 +124,6 @@ def _with_unseen_points(
     lifted: Gaussians, points: Points, camera: Camera, opacity: float
 ) -> Gaussians:
     """The Gaussians, and one for each point that is outside of the image of the camera."""
-    from snowsplat.data import Points
-    from snowsplat.scene.gaussians import Gaussians
-
     pixels, z = camera.project(points.xyz.double())
     inside = (pixels >= 0).all(1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     unseen = ~(inside & (z > 0))
@@ -144,7 +135,5 @@ def _with_unseen_points(
 
 def _with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """The same Gaussians with coefficients of 0 up to an SH degree."""
-    from snowsplat.scene.sh_constants import SH_REST_COUNTS
-
     rest = gaussians.means.new_zeros(len(gaussians), SH_REST_COUNTS[degree], 3)
     return replace(gaussians, sh_rest=rest)

@@ -13,17 +13,28 @@ import threading
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+from PIL import Image
+
+from snowsplat.data import ImageLoader
+from snowsplat.evaluation.lpips import Lpips
+from snowsplat.evaluation.metrics import Evaluation
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.evaluate import evaluate
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.run.checkpoint_meta import Recipe
+from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.scene.render import render
 from snowsplat.util.claims import claimed
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import write_json
+from snowsplat.util.files import atomic_path, write_json
+from snowsplat.util.machine import processor_name
+from snowsplat.util.process_memory import peak_bytes
 from snowsplat.util.safe_json import from_json, read_json
-
-if TYPE_CHECKING:
-    from snowsplat.evaluation.metrics import Evaluation
-    from snowsplat.pipeline.output.scene_source import TrainedScene
 
 #: A file in the output folder of a scene.
 RESULT = "benchmark.json"
@@ -126,15 +137,6 @@ def run(job: Job, device: str | None, threads: int | None) -> bool:
 
 def work(job: Job, device: str | None, threads: int | None) -> None:
     """Train and evaluate in this process, and write the result."""
-    from snowsplat.evaluation.lpips import Lpips
-    from snowsplat.pipeline.compute import Compute
-    from snowsplat.pipeline.evaluate import evaluate
-    from snowsplat.pipeline.output.output_folder import OutputFolder
-    from snowsplat.pipeline.output.scene_source import load_trained
-    from snowsplat.pipeline.train import TrainOptions, resume, train
-    from snowsplat.util.machine import processor_name
-    from snowsplat.util.process_memory import peak_bytes
-
     lpips = None if job.lpips is None else Lpips.load(Path(job.lpips))
     compute = Compute(device, threads)
     options = TrainOptions(
@@ -181,14 +183,6 @@ def _seconds_of_steps(output: Path) -> float:
 
 def _write_worst(trained: TrainedScene, evaluation: Evaluation, file: Path) -> str:
     """Write the picture `WORST`; returns the name of the view."""
-    import numpy as np
-    import torch
-    from PIL import Image
-
-    from snowsplat.data import ImageLoader
-    from snowsplat.scene.render import render
-    from snowsplat.util.files import atomic_path
-
     worst = min(evaluation.views, key=lambda view: view.psnr)
     [view] = [view for view in trained.dataset.test if view.name == worst.name]
     device = trained.gaussians.means.device

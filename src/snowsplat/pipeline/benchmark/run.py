@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from snowsplat.data.transforms_json import find_transforms
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
@@ -99,7 +102,6 @@ def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
     Raises:
         UserError: there are none, or one of ``only`` is missing.
     """
-    from snowsplat.data.transforms_json import find_transforms
 
     def is_dataset(path: Path) -> bool:
         return (path / "sparse").is_dir() or bool(find_transforms(path))
@@ -173,8 +175,6 @@ def _run_all(
 
 def _devices(options: BenchmarkOptions) -> list[str | None]:
     """The device of each job."""
-    import torch
-
     count = torch.cuda.device_count() if options.device in (None, "cuda") else 0
     if count == 0:
         return [options.device] * options.jobs

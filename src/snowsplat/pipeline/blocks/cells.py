@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+#: The two axes of the ground plane, unit vectors in the world frame.
+Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
 # The size of a cell in a direction is that of the part of its content between these quantiles.
 # Distant points, such as those of the sky, would make it too large.
 _INNER = (0.05, 0.95)

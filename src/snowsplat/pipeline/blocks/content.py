@@ -14,8 +14,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.ops import neighbours
-from snowsplat.pipeline.blocks.cells import Cell, cut, extent, ground_axes
-from snowsplat.pipeline.blocks.plan import Axes
+from snowsplat.pipeline.blocks.cells import Axes, Cell, cut, extent, ground_axes
 from snowsplat.scene.geometry import transform_points
 
 # A photo belongs to a block if at least this share of what it shows is in the cell.

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.ply import read_ply, write_ply_parts
-from snowsplat.pipeline.blocks.cells import Cell
-from snowsplat.pipeline.blocks.plan import Axes, Plan
+from snowsplat.pipeline.blocks.cells import Axes, Cell
+from snowsplat.pipeline.blocks.plan import Plan
 from snowsplat.pipeline.blocks.train import is_finished, scene_folder
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.gaussians import Gaussians

@@ -11,22 +11,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
+from torch import Tensor
 
 from snowsplat._version import __version__
-from snowsplat.pipeline.blocks.cells import Cell
+from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
+from snowsplat.pipeline.blocks.cells import Axes, Cell
+from snowsplat.pipeline.blocks.content import block_content
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run.checkpoint_meta import Recipe
+from snowsplat.pipeline.train import TrainOptions
+from snowsplat.training.core.recipes import recipe
+from snowsplat.training.parts.found_sky import sky_distance
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, read_json
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
 PLAN = "plan.json"
-#: The two axes of the ground plane, unit vectors in the world frame.
-Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
 #: More blocks than this are a mistake.
 MOST_BLOCKS = 10_000
 
@@ -94,8 +97,6 @@ class Plan:
 
     def ground(self, positions: Tensor) -> Tensor:
         """Positions (N, 3) in the world frame -> (N, 2) float64 in the ground plane."""
-        import torch
-
         axes = torch.tensor(self.axes, dtype=torch.float64)
         return positions.to(torch.float64) @ axes.T
 
@@ -148,12 +149,6 @@ def plan_blocks(
             plan or other files.
         OSError: a file cannot be written.
     """
-    from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
-    from snowsplat.pipeline.blocks.content import block_content
-    from snowsplat.pipeline.train import TrainOptions
-    from snowsplat.training.core.recipes import recipe
-    from snowsplat.training.parts.found_sky import sky_distance
-
     options, folder = options or PlanOptions(), Path(folder)
     _check_free(folder)
     config = recipe(options.recipe, **options.settings)

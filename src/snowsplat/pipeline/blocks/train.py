@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.blocks.plan import Block, Plan
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.run.train_result import TrainResult
+from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.util.claims import claimed
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import read_json
-
-if TYPE_CHECKING:
-    from snowsplat.pipeline.run.train_result import TrainResult
 
 _CHECKPOINT_SECONDS = 60.0
 
@@ -98,8 +96,6 @@ def _train(
     memory: int | str | None,
     observer: Observer,
 ) -> TrainResult:
-    from snowsplat.pipeline.train import TrainOptions, resume, train
-
     dataset, out = folder / block.name / "dataset", scene_folder(folder, block)
     options = TrainOptions(
         recipe=plan.recipe,

@@ -15,6 +15,8 @@
     OUT/videos/                                    *rendered videos (films/ in earlier versions)
 
 The reference implementation does not write the entries marked *. Its folders are read too.
+`snowsplat info` and the flags of `train` use this module: torch is imported in the methods that
+need it.
 """
 
 from __future__ import annotations

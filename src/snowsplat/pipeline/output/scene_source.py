@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import filecmp
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from snowsplat.data import Dataset
+from snowsplat.formats import read_gaussians
 from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, training_folder
 from snowsplat.pipeline.run.refined_cameras import with_refined
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.data import Dataset
-    from snowsplat.scene.camera import Camera
-    from snowsplat.scene.gaussians import Gaussians
 
 Color = tuple[float, float, float]
 
@@ -80,62 +79,12 @@ def load_dataset_of(
     return with_refined(folder.path, settings.load()), background
 
 
-def existing_folder(path: Path) -> OutputFolder:
-    """The same as `training_folder`. Raises: UserError: ``path`` is not a folder."""
-    if not path.is_dir():
-        raise UserError(f"{path}: no such folder; give the output folder of a training run")
-    return training_folder(path)
-
-
-def training_folder(path: Path) -> OutputFolder:
-    """The output folder of training: ``path`` or, if `make` created ``path``, a folder in it."""
-    folder, made = OutputFolder(path), OutputFolder(path / SCENE)
-    return made if made.scenes() and not folder.scenes() else folder
-
-
-def scene_file(path: Path) -> Path:
-    """``path`` itself if it is a file, or the scene in the folder ``path``.
-
-    That is its levels of detail if it has a `lod-meta.json`, else the last scene of the training.
-
-    Raises:
-        UserError: a folder without a scene.
-    """
-    if not path.is_dir():
-        return path
-    if (path / INDEX).is_file():
-        return path / INDEX
-    folder = training_folder(path)
-    scenes = folder.scenes()
-    if not scenes:
-        raise UserError(f"{path}: contains no scene (no point_cloud/iteration_N in it)")
-    return folder.scene_path(scenes[-1])
-
-
-def folder_around(scene: Path) -> OutputFolder:
-    """The output folder of the training run that wrote a scene file.
-
-    This is OUT for the file OUT/point_cloud/iteration_N/point_cloud.ply, and OUT/scene for the file
-    OUT/NAME.ply, the copy that `make` writes. For other files, it is an `OutputFolder` without
-    scenes.
-    """
-    scene = scene.resolve()
-    made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
-    if scene in map(trained.scene_path, trained.scenes()):
-        return trained
-    if any(filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]):
-        return made
-    return OutputFolder(scene)
-
-
 def cameras_of(folder: OutputFolder) -> list[Camera]:
     """The cameras of the photos of the training in ``folder``; empty if they are not stored.
 
     Raises:
         UserError: the file is damaged.
     """
-    from snowsplat.scene.camera_json import read_cameras
-
     file = folder.path / "cameras.json"
     return read_cameras(file)[1] if file.is_file() else []
 
@@ -169,8 +118,6 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
     Raises:
         UserError: the scene is missing or damaged, or ``iteration`` is set and ``path`` is a file.
     """
-    from snowsplat.formats import read_gaussians
-
     path = Path(path)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
@@ -186,9 +133,3 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
         file, gaussians = path, read_gaussians(path)
         folder = folder_around(path)
     return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
-
-
-def scene_name(scene: Path) -> str:
-    """The name of a scene: that of its folder, or of its file without suffixes."""
-    scene = scene.resolve()
-    return scene.name.split(".")[0] or scene.name

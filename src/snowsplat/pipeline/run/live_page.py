@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
+from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from snowsplat.data import Dataset
-    from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.core.trainer import Trainer
-    from snowsplat.viewer.live.training import TrainingViewer
-    from snowsplat.viewer.live.viewer import NetworkViewer, Scene
-
-LOCAL_HOST = "127.0.0.1"
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.viewer.hosts import LOCAL_HOST
+from snowsplat.viewer.live.curves import SampledPsnr
+from snowsplat.viewer.live.server import free_port
+from snowsplat.viewer.live.training import TrainingViewer
+from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 
 class LivePage:
@@ -36,8 +33,6 @@ class LivePage:
         Raises:
             UserError: the port is in use, or this machine cannot listen at ``host``.
         """
-        from snowsplat.viewer.live.server import free_port
-
         self.port, self.host = port, host or LOCAL_HOST
         self._viewer: NetworkViewer | None = None
         self._training: TrainingViewer | None = None
@@ -67,8 +62,6 @@ class LivePage:
         Raises:
             UserError: another process has opened the port since the constructor checked it.
         """
-        from snowsplat.viewer.live.viewer import NetworkViewer
-
         viewer = NetworkViewer(dataset, background, host=self.host, port=self.port, label=label)
         self._viewer = viewer
         observer.page_opened(viewer)
@@ -81,9 +74,6 @@ class LivePage:
             trainer: the training run to show.
             label: the title of the page.
         """
-        from snowsplat.viewer.live.curves import SampledPsnr
-        from snowsplat.viewer.live.training import TrainingViewer
-
         white = trainer.config.background == "white"
         background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
         viewer = self.open(trainer.dataset, background, label, observer)

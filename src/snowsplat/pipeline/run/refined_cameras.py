@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from snowsplat.data import Dataset, View
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, posed_camera, read_model, write_model
+from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.data import Dataset, View
 
 #: The folder of the model in an output folder, beside which a link to the photos makes a dataset.
 FOLDER = "refined"
@@ -31,11 +32,6 @@ def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
     Raises:
         OSError: the folder is not writable, or the disk is full.
     """
-    import numpy as np
-
-    from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
-    from snowsplat.scene.geometry import quat_from_rotation
-
     sizes = {v.name: (v.camera.width, v.camera.height) for v in [*full.train, *full.test]}
     numbers: dict[ColmapCamera, int] = {}
     images = []
@@ -61,8 +57,6 @@ def with_refined(output: Path, dataset: Dataset) -> Dataset:
     Raises:
         UserError: the model is damaged, or a photo is not in it.
     """
-    from snowsplat.data.colmap import posed_camera, read_model
-
     folder = output.joinpath(FOLDER, *_SPARSE)
     if not folder.is_dir():
         return dataset

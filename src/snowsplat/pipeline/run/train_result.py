@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from snowsplat.evaluation.metrics import Evaluation
+from snowsplat.evaluation.metrics import Evaluation
 
 
 @dataclass(frozen=True)

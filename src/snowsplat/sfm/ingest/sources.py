@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+from snowsplat.sfm.ingest.clip import is_video
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
@@ -222,8 +223,6 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
     Raises:
         UserError: neither photo nor video, or the file cannot be read.
     """
-    from snowsplat.sfm.ingest.clip import is_video
-
     try:
         with open(path, "rb") as file:
             head = file.read(32)
