@@ -167,7 +167,10 @@ def render_video(
     if options.antialias is not None:
         gaussians.antialiased = options.antialias
     cameras = cameras_along(
-        *(options.path, source.gaussians, source.cameras, options.frames),
+        options.path,
+        source.gaussians,
+        source.cameras,
+        options.frames,
         VideoSize.parse(options.size),
     )
     video = Video(

@@ -77,13 +77,21 @@ def refine_photo(
     lifted = lift(pixels, z, view.camera, options)
     out.begin(posed, settings, config)
     source = "of the dataset"
-    finish(out, 0, lifted, pixels, z, view.camera, source, False, started)
+    finish(out, 0, lifted, pixels, z, view.camera, source, swing=False, started=started)
     seconds = time.monotonic() - started
     initial = _with_unseen_points(lifted, posed.points, view.camera, config.initial_opacity)
     trainer = Trainer(posed, config, initial=_with_degree(initial, config.sh_degree))
     _train(trainer, observer)
     result = finish(
-        *(out, trainer.step, trainer.gaussians, pixels, z, view.camera, source, swing, started)
+        out,
+        trainer.step,
+        trainer.gaussians,
+        pixels,
+        z,
+        view.camera,
+        source,
+        swing=swing,
+        started=started,
     )
     evaluation = trainer.evaluate() if posed.test else None
     if evaluation is not None:
