@@ -111,7 +111,7 @@ def main(demo: Path) -> None:
         click(page, ".sse-controlsHintClose")  # the list of keys
         shoot(page, PICTURES / "web.webp")
         page.close()
-        with training(made / "capture") as url:
+        with training(made / "dataset") as url:
             page = browser.open(url)
             page.wait_for("/Step 1,[5-9]/.test(document.body.innerText)", 600)
             click(page, ".mantine-Notification-closeButton")  # the browser has no GPU

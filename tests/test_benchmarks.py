@@ -174,14 +174,14 @@ def test_a_street_in_blocks(tmp_path):
 
 
 def test_formats(tmp_path):
-    write_toy_dataset(tmp_path / "capture", "colmap-bin", 9, 32, 24, n_points=60)
-    points = load_dataset(tmp_path / "capture").points
+    write_toy_dataset(tmp_path / "dataset", "colmap-bin", 9, 32, 24, n_points=60)
+    points = load_dataset(tmp_path / "dataset").points
     assert points is not None
     write_gaussians(tmp_path / "a.ply", Gaussians.from_points(points))
     text = benchmark(
         "formats.py",
         tmp_path / "a.ply",
-        *("--dataset", tmp_path / "capture", "--gaussians", 200, "--repeats", 1),
+        *("--dataset", tmp_path / "dataset", "--gaussians", 200, "--repeats", 1),
     )
     assert "times of 200; 2 views" in text
     assert row(text, "PLY")[2:4] == [pytest.approx(248, abs=30), float("inf")]
@@ -192,7 +192,7 @@ def test_formats(tmp_path):
 
 
 def test_scales(tmp_path):
-    dataset = write_toy_dataset(tmp_path / "capture", "colmap-bin", 9, 192, 144, n_points=60)
+    dataset = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 9, 192, 144, n_points=60)
     flags = ["-r", "96", "--eval", "--iterations", "20", "--quiet"]
     assert main(["train", str(dataset), "-o", str(tmp_path / "out"), *flags]) == 0
     cells = benchmark("scales.py", tmp_path / "out").splitlines()[-1].split("|")[1:-1]

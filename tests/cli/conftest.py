@@ -25,7 +25,7 @@ class Result:
 def dataset(tmp_path_factory) -> Path:
     """9 views, 48×36; read-only for the tests."""
     root = tmp_path_factory.mktemp("cli")
-    return write_toy_dataset(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture

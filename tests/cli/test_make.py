@@ -53,7 +53,7 @@ def files(folder: Path) -> set[str]:
 
 def state(out: Path) -> dict[str, int]:
     """Modification time of each file except the records of finished stages."""
-    made = (name for name in files(out) if Path(name).name not in ("make.json", "capture.json"))
+    made = (name for name in files(out) if Path(name).name not in ("make.json", "sfm.json"))
     return {name: (out / name).stat().st_mtime_ns for name in made}
 
 
@@ -72,10 +72,10 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     assert metrics["psnr"] > 12
     made = files(out / "scene/test/ours_60")
     assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(2)}
-    assert (out / "capture/capture_report.html").is_file()
+    assert (out / "dataset/dataset_report.html").is_file()
     assert not (out / "scene/checkpoints").exists()
     summary = result.out[result.out.index("\nThe scene") :]
-    for part in (scene.name, "capture_report.html", "renders", f"PSNR {metrics['psnr']:.2f} dB"):
+    for part in (scene.name, "dataset_report.html", "renders", f"PSNR {metrics['psnr']:.2f} dB"):
         assert part in summary
 
     facts = json.loads(run("info", out, "--json").out)
@@ -116,6 +116,21 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     assert state(out) == before
 
 
+@pytest.mark.sfm
+def test_a_folder_of_version_0_1_is_continued(run, photos, tmp_path, monkeypatch):
+    """There, the dataset was in the folder "capture", whose name is also a key in make.json."""
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=20))
+    out, command = tmp_path / "out", ("make", photos, "--quality", "draft", "--threads", 1, "-o")
+    with monkeypatch.context() as former:
+        former.setattr(make_module, "DATASET", "capture")
+        assert run(*command, out).code == 0
+    (out / "capture/sfm.json").rename(out / "capture/capture.json")
+    again = run(*command, out)
+    assert again.code == 0, again.err
+    assert again.out.count("done before") == 6
+    assert not (out / "dataset").exists()
+
+
 @pytest.fixture
 def killed(photos, tmp_path) -> Callable[..., str]:
     """Run the command as a process, kill it when a condition holds; returns its output."""
@@ -141,10 +156,10 @@ def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
     out = tmp_path / "out"
 
     def recorded(stage: str) -> bool:
-        record = out / "capture/capture.json"
+        record = out / "dataset/sfm.json"
         return record.is_file() and f'"{stage}"' in record.read_text()
 
-    killed(out, (out / "capture/distorted/database.db").exists, signal.SIGKILL)
+    killed(out, (out / "dataset/distorted/database.db").exists, signal.SIGKILL)
     killed(out, lambda: recorded("poses"), signal.SIGKILL)
     killed(out, (out / "scene/config.json").exists, signal.SIGKILL)
     text = killed(out, lambda: any(out.glob("scene/checkpoints/step*")), signal.SIGKILL)
@@ -176,7 +191,7 @@ def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
     result = run(*command)
     assert result.code == 0, result.err
     assert "6.0 s: 6 of 12 photos, 256 pixels, draft effort" in result.out
-    assert len(list((tmp_path / "out/capture/input").iterdir())) == 6
+    assert len(list((tmp_path / "out/dataset/input").iterdir())) == 6
     assert (tmp_path / "out/many.ply").is_file()
     again = run(*command)
     assert again.code == 0, again.err

@@ -135,7 +135,7 @@ def test_a_dataset_that_has_moved(run, refused, trained, dataset, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(trained, moved)
     config = json.loads((moved / "config.json").read_text())
-    config["capture"]["path"] = "/nowhere"
+    config["dataset"]["path"] = "/nowhere"
     (moved / "config.json").write_text(json.dumps(config))
     assert "/nowhere" in refused("evaluate", moved)
     assert run("evaluate", moved, "-s", dataset).code == 0
@@ -152,7 +152,7 @@ def test_errors(refused, trained, tmp_path):
     scene = damaged / "point_cloud/iteration_60/point_cloud.ply"
     scene.write_bytes(scene.read_bytes()[:-1])
     assert "ends before its last row" in refused("evaluate", damaged)
-    for content in ("{", "[]", '{"capture": 1}', '{"capture": {"path": 1, "x": 2}}'):
+    for content in ("{", "[]", '{"dataset": 1}', '{"dataset": {"path": 1, "x": 2}}'):
         (damaged / "config.json").write_text(content)
         assert "config.json: damaged" in refused("evaluate", damaged)
     shutil.rmtree(damaged / "point_cloud")
@@ -175,7 +175,7 @@ def test_info(run, refused, trained, dataset, tmp_path):
     assert facts(trained / "input.ply")["points"] == 300
     out = facts(trained)
     assert out["scenes"] == [30, 60]
-    assert out["capture"] == str(dataset)
+    assert out["dataset"] == str(dataset)
     assert out["metrics"]["psnr"] > 10
     assert out["last_scene"]["gaussians"] == len(gaussians)
     photos = facts(dataset)

@@ -26,40 +26,40 @@ pytestmark = pytest.mark.sfm
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory) -> Path:
     """6 photos, 256×192; read-only for the tests."""
-    return scenes.write_photos(tmp_path_factory.mktemp("capture") / "photos", 6)
+    return scenes.write_photos(tmp_path_factory.mktemp("dataset") / "photos", 6)
 
 
 @pytest.fixture(scope="module")
-def captured(photos, tmp_path_factory) -> Path:
+def garden(photos, tmp_path_factory) -> Path:
     """Their dataset, with smaller copies; read-only for the tests."""
-    out = tmp_path_factory.mktemp("captured") / "garden"
+    out = tmp_path_factory.mktemp("made") / "garden"
     assert main(["sfm", str(photos), "-o", str(out), *QUICK, "--resize"]) == 0
     return out
 
 
 def times(folder: Path) -> dict[str, int]:
     """Modification time of each file except the record."""
-    found = (p for p in folder.rglob("*") if p.is_file() and p.name != "capture.json")
+    found = (p for p in folder.rglob("*") if p.is_file() and p.name != "sfm.json")
     return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in found}
 
 
-def test_layout_is_that_of_convert_py(captured, photos):
+def test_layout_is_that_of_convert_py(garden, photos):
     names = {path.name for path in photos.iterdir()}
-    placed = {path.name: Image.open(path).size for path in (captured / "images").iterdir()}
+    placed = {path.name: Image.open(path).size for path in (garden / "images").iterdir()}
     assert placed.keys() <= names
     for divisor in (2, 4, 8):
-        copies = {p.name: Image.open(p).size for p in (captured / f"images_{divisor}").iterdir()}
+        copies = {p.name: Image.open(p).size for p in (garden / f"images_{divisor}").iterdir()}
         assert copies == {
             name: (round(width / divisor), round(height / divisor))
             for name, (width, height) in placed.items()
         }
-    assert {path.name for path in (captured / "input").iterdir()} == names
-    assert (captured / "distorted" / "database.db").is_file()
-    distorted = pycolmap.Reconstruction(captured / "distorted" / "sparse" / "0")
-    model = pycolmap.Reconstruction(captured / "sparse" / "0")
+    assert {path.name for path in (garden / "input").iterdir()} == names
+    assert (garden / "distorted" / "database.db").is_file()
+    distorted = pycolmap.Reconstruction(garden / "distorted" / "sparse" / "0")
+    model = pycolmap.Reconstruction(garden / "sparse" / "0")
     assert model.num_reg_images() == distorted.num_reg_images() == 6
     assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
-    record = json.loads((captured / "capture.json").read_text())
+    record = json.loads((garden / "sfm.json").read_text())
     assert list(record["stages"]) == list(STAGES)
     # The alignment can be inverted: the record has the similarity transform.
     scale = record["stages"]["images"]["result"]["scene_from_sfm"]["scale"]
@@ -69,14 +69,12 @@ def test_layout_is_that_of_convert_py(captured, photos):
     )
     assert ours != theirs
     assert scale > 0
-    dataset = load_dataset(captured, resolution=2, hold_out=8)
+    dataset = load_dataset(garden, resolution=2, hold_out=8)
     assert len(dataset.train) + len(dataset.test) == model.num_reg_images()
     assert len(dataset.points) == model.num_points3D()
 
 
-def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(
-    captured, photos, run, tmp_path
-):
+def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(garden, photos, run, tmp_path):
     out, mine = tmp_path / "garden", tmp_path / "mine"
     shutil.copytree(photos, mine)
     assert run("sfm", mine, "-o", out, *QUICK).code == 0
@@ -98,7 +96,23 @@ def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(
     assert not (out / "images" / last.name).exists()
 
 
-def test_photos_in_place(captured, photos, run, refused, tmp_path):
+def test_a_dataset_of_version_0_1_is_continued(garden, photos, run, refused, tmp_path):
+    """Its record and its report had other names."""
+    old = tmp_path / "garden"
+    shutil.copytree(garden, old)
+    (old / "sfm.json").rename(old / "capture.json")
+    (old / "dataset_report.html").rename(old / "capture_report.html")
+    assert "contains a dataset made from" in refused(
+        "sfm", *sorted(photos.iterdir())[:3], "-o", old, *QUICK
+    )
+    assert (old / "capture.json").is_file()
+    again = run("sfm", photos, "-o", old, *QUICK)
+    assert again.code == 0, again.err
+    assert again.out.count("done before") == len(STAGES) - 1
+    assert {path.name for path in old.iterdir()} == {path.name for path in garden.iterdir()}
+
+
+def test_photos_in_place(garden, photos, run, refused, tmp_path):
     place = tmp_path / "place"
     shutil.copytree(photos, place / "input")
     before = times(place / "input")
@@ -115,25 +129,25 @@ def test_photos_in_place(captured, photos, run, refused, tmp_path):
     # An existing model is only undistorted.
     given = tmp_path / "given"
     shutil.copytree(photos, given / "input")
-    shutil.copytree(captured / "distorted" / "sparse", given / "distorted" / "sparse")
+    shutil.copytree(garden / "distorted" / "sparse", given / "distorted" / "sparse")
     model = (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes()
     assert "distorted" in refused("sfm", "-s", given)  # not created by snowsplat: stays unchanged
     result = run("sfm", "-s", given, "--skip-matching")
     assert result.code == 0, result.err
     assert (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes() == model
-    assert len(load_dataset(given).train) == len(load_dataset(captured).train)
+    assert len(load_dataset(given).train) == len(load_dataset(garden).train)
 
 
-def test_a_folder_with_other_files_stays_unchanged(captured, refused, photos, tmp_path):
+def test_a_folder_with_other_files_stays_unchanged(garden, refused, photos, tmp_path):
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("mine")
     assert "contains other files (mine.txt)" in refused("sfm", photos, "-o", taken)
     assert "is a file" in refused("sfm", photos, "-o", taken / "mine.txt")
-    before = times(captured)
-    line = refused("sfm", *sorted(photos.iterdir())[:3], "-o", captured)
+    before = times(garden)
+    line = refused("sfm", *sorted(photos.iterdir())[:3], "-o", garden)
     assert "contains a dataset made from" in line
-    assert times(captured) == before
+    assert times(garden) == before
     assert [path.name for path in taken.iterdir()] == ["mine.txt"]
 
 
@@ -154,7 +168,7 @@ def test_a_failure_leaves_no_files(refused, photos, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) in (["new", "two"], ["two"])
 
 
-def test_a_full_disk_keeps_finished_stages(captured, photos, run, tmp_path, monkeypatch):
+def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkeypatch):
     out = tmp_path / "garden"
 
     def full(*_, **__):

@@ -77,7 +77,7 @@ def test_the_reference_spelling_of_flags(run, dataset, tmp_path):
     )
     assert result.code == 0, result.err
     config = json.loads((out / "config.json").read_text())
-    assert config["capture"] == {
+    assert config["dataset"] == {
         "path": str(dataset),
         "images": "images",
         "resolution": 2,
@@ -260,7 +260,7 @@ def test_resume_without_a_checkpoint(refused, run, dataset, tmp_path):
 
 def test_resume_with_less_memory_than_its_gaussians_take(refused, run, tmp_path):
     """Resuming cannot reduce the number of Gaussians, so the budget must suffice for all."""
-    dataset, out = tmp_path / "capture", tmp_path / "out"
+    dataset, out = tmp_path / "dataset", tmp_path / "out"
     write_toy_dataset(dataset, "blender", 3, 48, 36)
     flags = ("--recipe", "paper", "--initial-points", 5000, "--checkpoint-every", 2)
     assert run("train", dataset, "-o", out, *flags, "--iterations", 2).code == 0

@@ -392,10 +392,10 @@ def _video(name: str, file: str, **options: Any) -> Reader:
 
 
 def _output(folder: Path) -> OutputFolder:
-    write_toy_dataset(folder / "capture", "colmap-bin", 5, 32, 24, n_points=20)
-    dataset = load_dataset(folder / "capture")
+    write_toy_dataset(folder / "dataset", "colmap-bin", 5, 32, 24, n_points=20)
+    dataset = load_dataset(folder / "dataset")
     out = OutputFolder(folder / "out")
-    out.begin(dataset, DatasetSettings(str(folder / "capture")), TrainConfig())
+    out.begin(dataset, DatasetSettings(str(folder / "dataset")), TrainConfig())
     out.write_scene(7, make_scene(5, 0))
     figures = {"iteration": 7, "split": "test", "psnr": 20.5, "ssim": 0.9, "views": {"a": 1.0}}
     (out.path / "metrics.json").write_text(json.dumps(figures))
@@ -422,7 +422,7 @@ def _make_checkpoint(folder: Path) -> None:
 
     tensors = {"means": torch.rand(7, 3), "order": torch.arange(5), "none": torch.zeros(0, 3)}
     meta = {
-        "capture": asdict(DatasetSettings("x")),
+        "dataset": asdict(DatasetSettings("x")),
         "recipe": "default",
         "training": config_to_json(TrainConfig()),
         "time": {"seconds": 60.0, "spent": 3.0},
@@ -450,14 +450,14 @@ _PHOTO = Photo("a.jpg", "a.jpg", 80, 60, "g", None, 70.5, (1.0, 2.0, 3.0), False
 
 
 def _make_stages(folder: Path) -> None:
-    stages = Stages(folder / "capture.json", dataset_folder.STAGES)
+    stages = Stages(folder / "sfm.json", dataset_folder.STAGES)
     stages.about = {"inputs": ["x"]}
     gathered = asdict(Gathered([_PHOTO], [("b.jpg", "is black")]))
     stages.run("photos", {"size": None}, [folder], lambda: gathered)
 
 
 def _read_stages(folder: Path) -> Any:
-    stages = Stages(folder / "capture.json", dataset_folder.STAGES)
+    stages = Stages(folder / "sfm.json", dataset_folder.STAGES)
     done = stages.run(
         "photos", {"size": None}, [folder], lambda: asdict(Gathered([_PHOTO], [])), lambda _: None
     )
@@ -533,7 +533,7 @@ READERS: tuple[Reader, ...] = (
         json=True,
     ),
     Reader("history.json", "out/history.json", _output, _read_history, json=True),
-    Reader("capture.json", "capture.json", _make_stages, _read_stages, json=True),
+    Reader("sfm.json", "sfm.json", _make_stages, _read_stages, json=True),
     Reader(
         "LPIPS weights",
         "a.safetensors",

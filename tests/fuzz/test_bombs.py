@@ -606,7 +606,7 @@ def test_history_with_invalid_values(tmp_path):
 
 def test_a_record_of_stages_that_was_edited(tmp_path, caplog):
     """A stage whose recorded result was changed is repeated."""
-    path, done = tmp_path / "capture.json", []
+    path, done = tmp_path / "sfm.json", []
 
     def run() -> dict:
         stages = Stages(path, ["one"])

@@ -20,7 +20,7 @@ if sys.platform != "linux":
 def dataset(tmp_path_factory) -> Path:
     """9 views, 48×36; read-only for the tests."""
     root = tmp_path_factory.mktemp("kill")
-    return write_toy_dataset(root / "capture", "colmap-bin", 9, 48, 36, n_points=300)
+    return write_toy_dataset(root / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
 
 
 @pytest.fixture(scope="session")

@@ -526,7 +526,7 @@ def make_jobs(photos: Path) -> list[Job]:
     def check_done(output: Path, whole: Path) -> None:
         if names_in(output) != names_in(whole):
             raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
-        _check_dataset(output / "capture", whole / "capture")
+        _check_dataset(output / "dataset", whole / "dataset")
         record = json.loads((output / "make.json").read_text())
         if list(record["stages"]) != ["scene", "pictures"]:
             raise Defect("stages are not finished")
@@ -542,7 +542,7 @@ def _check_dataset(output: Path, whole: Path) -> None:
     """Check that the files are the same, and the cameras are the same except for rounding."""
     if names_in(output) != names_in(whole):
         raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
-    record = json.loads((output / "capture.json").read_text())
+    record = json.loads((output / "sfm.json").read_text())
     if list(record["stages"]) != ["photos", "poses", "images", "report"]:
         raise Defect("stages are not finished")
     centres = []

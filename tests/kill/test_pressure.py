@@ -171,7 +171,7 @@ def test_a_disk_that_becomes_full_during_sfm(zygote, place, photos):
         refused(
             zygote.run(command), rf"{out}: the disk is full; free some space, then run the same"
         )
-        assert list(json.loads((out / "capture.json").read_text())["stages"]) == ["photos"]
+        assert list(json.loads((out / "sfm.json").read_text())["stages"]) == ["photos"]
         subprocess.run(["mount", "-o", "remount,size=50m", place], check=True)
         again = zygote.run(command)
         assert again.code == 0, again.text
@@ -219,7 +219,7 @@ def test_a_training_run_whose_folder_is_moved_continues(zygote, place, dataset):
 
 def test_a_training_run_whose_photos_are_removed(zygote, place, dataset):
     """The photos are removed at the start or before the run resumes. Saved files are kept."""
-    mine, out = place / "capture", place / "out"
+    mine, out = place / "dataset", place / "out"
     shutil.copytree(dataset, mine)
     command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
     assert zygote.run(command).code == 0
@@ -245,7 +245,7 @@ def test_photos_or_the_folder_are_removed_during_sfm(subcommand, zygote, place, 
     mine, out = place / "photos", place / "out"
     shutil.copytree(photos, mine)
     command = [subcommand, mine, "-o", out, "--quality", "draft", "--threads", 1]
-    inner = out / "capture" if subcommand == "make" else out
+    inner = out / "dataset" if subcommand == "make" else out
     begun = (inner / "distorted" / "database.db").exists
     # The photos have been copied already, so it may succeed.
     ended = zygote.run(command, while_it_runs=when(begun, lambda: shutil.rmtree(inner / "input")))

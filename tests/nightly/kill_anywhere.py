@@ -49,8 +49,8 @@ def jobs(folder: Path, subcommands: list[str]) -> list[Job]:
         write_gaussians(folder / "other.ply", some_gaussians(100, 2))
         found += convert_jobs(folder / "in.ply", folder / "other.ply")
     if "train" in subcommands:
-        write_toy_dataset(folder / "capture", "colmap-bin", 9, 48, 36, n_points=300)
-        found += train_jobs(folder / "capture")
+        write_toy_dataset(folder / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
+        found += train_jobs(folder / "dataset")
     if "sfm" in subcommands or "make" in subcommands:
         write_synthetic_photos(folder / "photos", n_views=16, width=320, height=240)
         found += sfm_jobs(folder / "photos") if "sfm" in subcommands else []

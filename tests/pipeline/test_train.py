@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from snowsplat.data import load
+from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.scene_source import load_trained
@@ -15,6 +16,7 @@ from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.core import checkpoint
 from snowsplat.training.parts import overfitting, unexplained
 from snowsplat.training.parts.unexplained import left_out_line
 from snowsplat.util.errors import SettingError, UserError
@@ -99,6 +101,24 @@ def test_ctrl_c_and_resume_give_the_same_scene(dataset, tmp_path):
     assert result.scene.read_bytes() == whole.scene.read_bytes()
     with pytest.raises(UserError, match="other settings"):
         resume(tmp_path / "out", TrainOptions(settings={"seed": 3}))
+
+
+def test_a_run_of_version_0_1_is_opened_and_resumed(dataset, tmp_path):
+    """There, the key "dataset" of the settings and of the checkpoints was "capture"."""
+    whole = train(dataset, tmp_path / "whole", options(12))
+    with pytest.raises(TrainingStopped):
+        train(dataset, tmp_path / "out", options(12), observer=Recorder(interrupt_at=7))
+    config = json.loads((tmp_path / "out/config.json").read_text())
+    config["capture"] = config.pop("dataset")
+    (tmp_path / "out/config.json").write_text(json.dumps(config))
+    folder = tmp_path / "out/checkpoints"
+    saved = checkpoint.load(folder / "step_000007.safetensors")
+    saved.meta["capture"] = saved.meta.pop("dataset")
+    checkpoint.save(folder, 7, saved.tensors, saved.meta)
+    assert describe(tmp_path / "out")["dataset"] == str(dataset)
+    assert len(load_trained(tmp_path / "out").dataset.train) == 9
+    assert resume(tmp_path / "out").scene.read_bytes() == whole.scene.read_bytes()
+    assert "capture" not in json.loads((tmp_path / "out/config.json").read_text())
 
 
 def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_path, monkeypatch):
@@ -264,5 +284,5 @@ def test_a_time_budget_reads_the_dataset_once(tmp_path, monkeypatch):
     assert len(calls) == 1
     assert result.time is not None
     assert result.time[1] == pytest.approx(1.2)
-    settings = json.loads((tmp_path / "out/config.json").read_text())["capture"]
+    settings = json.loads((tmp_path / "out/config.json").read_text())["dataset"]
     assert settings["resolution"] == 400

@@ -1,4 +1,4 @@
-"""capture_report.html is complete, self-contained and well-formed, for any file names."""
+"""dataset_report.html is complete, self-contained and well-formed, for any file names."""
 
 import base64
 import io
@@ -86,7 +86,7 @@ def visible_text(page: Path) -> str:
 
 def test_page_is_well_formed_and_self_contained(dataset):
     page = write_report(dataset, facts())
-    assert page == dataset / "capture_report.html"
+    assert page == dataset / "dataset_report.html"
     text = page.read_text(encoding="utf-8")
     ET.fromstring(text)  # strict: the page is XML, too
     HTMLParser().feed(text)
@@ -140,7 +140,7 @@ def test_thumbnails_are_small_images(dataset):
         with Image.open(io.BytesIO(base64.b64decode(image.attrib["src"].split(",")[1]))) as decoded:
             assert decoded.format == "JPEG"
             assert decoded.height == 110
-    assert (dataset / "capture_report.html").stat().st_size < 600_000
+    assert (dataset / "dataset_report.html").stat().st_size < 600_000
 
 
 def test_photos_with_problems_are_shown(dataset):

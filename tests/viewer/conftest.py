@@ -29,7 +29,7 @@ def trained(tmp_path_factory) -> Trained:
     overlap, so the recipe is one without a decay of the opacity.
     """
     root = tmp_path_factory.mktemp("trained")
-    dataset = write_toy_dataset(root / "capture", "colmap-bin", 12, 96, 72, n_points=2000)
+    dataset = write_toy_dataset(root / "dataset", "colmap-bin", 12, 96, 72, n_points=2000)
     flags = ["--recipe", "classic", "--iterations", "200", "--quiet"]
     assert main(["train", str(dataset), "-o", str(root / "out"), *flags]) == 0
     scene = root / "out/point_cloud/iteration_200/point_cloud.ply"

@@ -34,7 +34,7 @@ class Make:
       snowsplat make photos/ --minutes 5       finish within 5 minutes
 
     Notes:
-      OUT/capture contains the photos, their cameras and a report. OUT/scene is
+      OUT/dataset contains the photos, their cameras and a report. OUT/scene is
       the output folder of the training. OUT/scene/test/ours_N contains the
       held-out photos and renders of the same views; N is the number of steps.
       If the command is interrupted, run it again to resume. Finished stages are

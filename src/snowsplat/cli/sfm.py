@@ -32,7 +32,7 @@ class Sfm:
       The mask of PHOTOS/IMG.jpg is PHOTOS/masks/IMG.jpg.png or
       PHOTOS/masks/IMG.png (black pixels are ignored), or the transparency of the
       photo.
-      DATASET/capture_report.html shows the cameras and lists unused photos.
+      DATASET/dataset_report.html shows the cameras and lists unused photos.
       If the command is interrupted, run it again to resume.
     """
 

@@ -78,7 +78,7 @@ def _levels(written: dict[str, Any]) -> list[str]:
 
 def _listed(lines: list[str]) -> list[str]:
     more = len(lines) - _NAMED
-    return lines[:_NAMED] + ([f"and {more} more, see capture_report.html"] if more > 0 else [])
+    return lines[:_NAMED] + ([f"and {more} more, see dataset_report.html"] if more > 0 else [])
 
 
 _LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {

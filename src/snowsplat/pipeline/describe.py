@@ -142,7 +142,7 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
     facts: dict[str, Any] = {"kind": "output folder", "path": str(folder.path)}
     if folder.is_output_folder():
         settings, background = folder.settings()
-        facts["capture"] = settings.path
+        facts["dataset"] = settings.path
         facts["background"] = list(background)
     facts["scenes"] = folder.scenes()
     if folder.checkpoints.is_dir():

@@ -16,7 +16,13 @@ from snowsplat import ops
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.output_folder import (
+    DATASET,
+    FORMER_DATASET,
+    SCENE,
+    DatasetSettings,
+    OutputFolder,
+)
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
 from snowsplat.pipeline.render import render_images
@@ -28,6 +34,7 @@ from snowsplat.sfm.cost import measure_speed
 from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
 from snowsplat.sfm.ingest.inputs import GatherOptions
 from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.report import REPORT
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
@@ -142,7 +149,7 @@ def make(
     Args:
         inputs: one or more photos, folders of photos, or videos.
         output: the output folder; default: NAME_scene in the current folder, where NAME is the name
-            of the first input without its suffix. It contains capture/ (the dataset), scene/ (the
+            of the first input without its suffix. It contains dataset/, scene/ (the
             output folder of the training) and NAME.ply (the scene).
         overwrite: replace an existing scene in ``output`` that was made from other photos.
         page: shows the training in the browser.
@@ -261,7 +268,8 @@ class _Job:
         return Later(work=PRESETS[self.plan.quality].training)
 
     def _make_scene(self) -> MakeResult:
-        settings: dict[str, Any] = {"capture": _fingerprint(self.dataset)}
+        # The key is the name of the folder, also if version 0.1.0 has recorded it.
+        settings: dict[str, Any] = {self.dataset.name: _fingerprint(self.dataset)}
         if self.options.minutes is None:
             preset = PRESETS[self.plan.quality]
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
@@ -276,7 +284,7 @@ class _Job:
         return MakeResult(
             scene=self.file,
             folder=folder,
-            dataset_report=self.dataset / "capture_report.html",
+            dataset_report=self.dataset / REPORT,
             renders=target / "renders",
             photos=target / "gt",
             psnr=scene["psnr"],
@@ -287,7 +295,9 @@ class _Job:
 
     @property
     def dataset(self) -> Path:
-        return self.out / CAPTURE
+        """The folder of the dataset; a folder with the former name is kept."""
+        former = self.out / FORMER_DATASET
+        return former if former.is_dir() else self.out / DATASET
 
     @property
     def file(self) -> Path:

@@ -375,8 +375,8 @@ def _resumed_dataset(
         tests = settings.test_list and Path(settings.test_list).name
         return settings.images, resolution, settings.hold_out, tests
 
-    settings = options.dataset_settings(path, meta.capture)
-    if relevant(settings) != relevant(meta.capture):
+    settings = options.dataset_settings(path, meta.dataset)
+    if relevant(settings) != relevant(meta.dataset):
         raise _other_settings(start)
     return settings
 

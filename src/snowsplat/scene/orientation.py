@@ -97,7 +97,7 @@ def up_of_surfaces(
 def _stands_on_z(normals: np.ndarray, areas: np.ndarray, positions: np.ndarray) -> bool:
     """Whether a scene stands on ground at its lowest z, as in files whose up direction is z.
 
-    In a capture whose up direction is −y, the photographer stands there and looks along z, so there
+    In a dataset whose up direction is −y, the photographer stands there and looks along z, so there
     is no surface.
     """
     low, high = np.quantile(positions[:, 2], [0.01, 0.99])

@@ -5,11 +5,12 @@
     DATASET/images/, sparse/0/    the input of training: undistorted images and their cameras
     DATASET/masks/                masks, if there are any
     DATASET/images_2/, _4, _8     smaller copies, if requested
-    DATASET/capture.json          settings and results of each stage
-    DATASET/capture_report.html   the same as a page, with a map of cameras and points
+    DATASET/sfm.json              settings and results of each stage
+    DATASET/dataset_report.html   the same as a page, with a map of cameras and points
 
 The layout is that of the reference implementation's convert.py. An interrupted run resumes where
-it stopped; see `snowsplat.util.stages`.
+it stopped; see `snowsplat.util.stages`. In version 0.1.0, the two last files were called
+capture.json and capture_report.html.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.sources import Sources, find_sources
+from snowsplat.sfm.ingest.sources import RECORDS, Sources, find_sources
 from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.progress import Report
-from snowsplat.sfm.report import write_report
+from snowsplat.sfm.report import REPORT, write_report
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
@@ -42,7 +43,8 @@ from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("photos", "poses", "images", "report")
-RECORD, REPORT = "capture.json", "capture_report.html"
+RECORD, FORMER_RECORD = RECORDS
+FORMER_REPORT = "capture_report.html"
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
 _OUTPUT_NAMES = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
 
@@ -114,6 +116,7 @@ def make_dataset(
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     in_place = sources.contain(folder / "input")
     _check_free(folder, in_place, sources.inputs, options, overwrite)
+    _rename_former_files(folder)
     with _remove_on_failure(folder):
         folder.mkdir(parents=True, exist_ok=True)
         stages = Stages(folder / RECORD, STAGES)
@@ -263,8 +266,8 @@ def _check_free(
     if not folder.is_dir():
         raise UserError(f"{folder}: is a file; use a folder for the dataset")
     remove_temporaries(folder, (RECORD, REPORT))
-    record = folder / RECORD
-    if record.is_file():
+    record = next((folder / name for name in RECORDS if (folder / name).is_file()), None)
+    if record is not None:
         before = Stages(record, STAGES).about.get("inputs")
         if not in_place and _were_in_place(before, folder):
             raise UserError(
@@ -287,6 +290,14 @@ def _check_free(
             f"{folder}: contains other files ({', '.join(others[:3])}"
             f"{', …' if len(others) > 3 else ''}); use a new or an empty folder"
         )
+
+
+def _rename_former_files(folder: Path) -> None:
+    """Rename the record of version 0.1.0; its report is written again, with the new name."""
+    former, record = folder / FORMER_RECORD, folder / RECORD
+    if former.is_file() and not record.exists():
+        former.rename(record)
+        (folder / FORMER_REPORT).unlink(missing_ok=True)
 
 
 def _were_in_place(inputs: Any, folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""capture_report.html: the result of structure from motion as one self-contained page."""
+"""dataset_report.html: the result of structure from motion as one self-contained page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from snowsplat.util.files import write_text
 from snowsplat.util.html import bar, cards, page, picture, table, text
 from snowsplat.util.safe_json import printable
 
-_FILE = "capture_report.html"
+REPORT = "dataset_report.html"
 _MAX_THUMBNAILS = 24  # evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
@@ -41,7 +41,7 @@ td img { height: 74px; border-radius: 4px; display: block; }
 
 
 def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
-    """Write ``capture_report.html`` of a finished dataset; returns its path.
+    """Write ``dataset_report.html`` of a finished dataset; returns its path.
 
     Args:
         facts: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
@@ -67,7 +67,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _timing(facts),
         _next_step(dataset),
     ]
-    path = dataset / _FILE
+    path = dataset / REPORT
     write_text(path, page(f"{name} – dataset", body, _STYLE))
     return path
 
@@ -252,7 +252,7 @@ def _left_out(facts: dict[str, Any]) -> str:
         return ""
     rows = [[text(name), text(why)] for name, why in entries[:_MAX_UNUSED]]
     more = len(entries) - _MAX_UNUSED
-    rest = f'<p class="soft">… and {more:,} more, see capture.json.</p>' if more > 0 else ""
+    rest = f'<p class="soft">… and {more:,} more, see sfm.json.</p>' if more > 0 else ""
     return f"<h2>Photos not used</h2>\n{table(['photo', 'reason'], rows, 'names')}{rest}"
 
 

@@ -23,7 +23,7 @@ NAME = "mon <château>"
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> dict[str, Any]:
     """Arguments of `Trained`, with a name that needs escaping."""
-    folder = tmp_path_factory.mktemp("report") / "capture"
+    folder = tmp_path_factory.mktemp("report") / "dataset"
     write_toy_dataset(folder, n_views=17, width=48, height=36, n_points=300)
     dataset = load_dataset(folder, hold_out=2)
     trainer = Trainer(dataset, TrainConfig(iterations=40, test_iterations=(20, 40)))

@@ -28,7 +28,7 @@ def test_a_curve_has_few_points_and_correct_means():
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    root = tmp_path_factory.mktemp("sampled_psnr") / "capture"
+    root = tmp_path_factory.mktemp("sampled_psnr") / "dataset"
     return load_dataset(write_toy_dataset(root, "colmap-bin", 6, 48, 36, n_points=200))
 
 
@@ -48,7 +48,7 @@ def test_psnr_equals_an_evaluation(dataset):
 
 def test_without_photos_there_is_no_psnr(dataset, tmp_path):
     assert not SampledPsnr([], torch.zeros(3)).can_measure
-    root = write_toy_dataset(tmp_path / "capture", "colmap-bin", 2, 48, 36, n_points=50)
+    root = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 2, 48, 36, n_points=50)
     views = load_dataset(root).train
     for photo in (root / "images").iterdir():
         photo.unlink()

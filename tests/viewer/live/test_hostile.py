@@ -72,7 +72,7 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
-    root = tmp_path_factory.mktemp("hostile") / "capture"
+    root = tmp_path_factory.mktemp("hostile") / "dataset"
     return load_dataset(write_toy_dataset(root, "colmap-bin", 9, 96, 72, n_points=1000))
 
 

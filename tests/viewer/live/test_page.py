@@ -55,7 +55,7 @@ class Training:
 def training(tmp_path_factory, browser) -> Iterator[Training]:
     """It starts after the browser, since it uses the processor all the time."""
     root = tmp_path_factory.mktemp("page")
-    dataset = write_toy_dataset(root / "capture", "colmap-bin", 9, 96, 72, n_points=600)
+    dataset = write_toy_dataset(root / "dataset", "colmap-bin", 9, 96, 72, n_points=600)
     training = Training(dataset, root / "out")
     yield training
     if training.process.poll() is None:

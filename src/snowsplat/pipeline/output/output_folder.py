@@ -51,7 +51,9 @@ if TYPE_CHECKING:
     from snowsplat.training.core.config import TrainConfig
 
 #: Folders inside the folder of `make`: the dataset, and the output folder of its training.
-CAPTURE, SCENE = "capture", "scene"
+DATASET, SCENE = "dataset", "scene"
+#: The name of a dataset in version 0.1.0: of its folder, and of its key in JSON files.
+FORMER_DATASET = "capture"
 # _WORD: a string, a name, a number, or a single character. _LITERAL: a literal whose value is used.
 # _WORD does not match spaces. An expression that matches them would take quadratic time for a file
 # with a million spaces.
@@ -184,7 +186,7 @@ class OutputFolder:
         self._remove_unwritten_scenes()
         whole = {
             "snowsplat": __version__,
-            "capture": asdict(settings),
+            "dataset": asdict(settings),
             "training": config_to_json(config),
         }
         write_json(self.path / "config.json", whole)
@@ -308,7 +310,7 @@ class OutputFolder:
         try:
             if ours.is_file():
                 whole = read_json(ours)
-                dataset = from_json(DatasetSettings, whole["capture"])
+                dataset = from_json(DatasetSettings, whole.get("dataset") or whole[FORMER_DATASET])
                 white = whole["training"]["background"] == "white"
             elif theirs.is_file():
                 values = _namespace(theirs)

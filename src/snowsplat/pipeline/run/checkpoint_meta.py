@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from snowsplat.pipeline.output.output_folder import DatasetSettings
+from snowsplat.pipeline.output.output_folder import FORMER_DATASET, DatasetSettings
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import from_json
@@ -22,14 +22,14 @@ class CheckpointMeta:
     """The JSON object in a checkpoint; its keys are the names of the fields.
 
     Attributes:
-        capture: how the dataset was read.
+        dataset: how the dataset was read.
         recipe: the recipe from which the configuration was derived.
         training: the configuration, see `config_to_json`.
         time: see `TimeBudget.as_json`; None without a time budget.
         schedule: the schedule, if it has changed: for a time budget, or because the scene overfits.
     """
 
-    capture: DatasetSettings
+    dataset: DatasetSettings
     recipe: Recipe
     training: dict[str, Any]
     time: dict[str, float] | None = None
@@ -43,7 +43,10 @@ class CheckpointMeta:
             UserError: not a checkpoint of a training run, or damaged.
         """
         try:
-            meta = from_json(CheckpointMeta, start.meta)
+            values = dict(start.meta)
+            if FORMER_DATASET in values:
+                values["dataset"] = values.pop(FORMER_DATASET)
+            meta = from_json(CheckpointMeta, values)
             if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
                 raise ValueError("invalid time budget")
         except ValueError as error:

@@ -319,7 +319,7 @@ class TrainingRun:
                 poses=about_poses,
                 settings={
                     "recipe": self.recipe,
-                    "capture": dataset,
+                    "dataset": dataset,
                     "training": config_to_json(self.config),
                 },
                 peak_bytes=peak_bytes(),

@@ -23,8 +23,10 @@ VIDEO_SUFFIXES = _suffixes(
 )
 _RAW_SUFFIXES = _suffixes("dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw")
 MASKS = "masks"
+#: The record of the stages of a dataset, and its name in version 0.1.0.
+RECORDS = ("sfm.json", "capture.json")
 # Folders that contain one of these files are datasets or output folders. They are skipped.
-_OUTPUT_FILES = ("capture.json", "cfg_args")
+_OUTPUT_FILES = (*RECORDS, "cfg_args")
 
 
 @dataclass(frozen=True)
