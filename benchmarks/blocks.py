@@ -34,7 +34,7 @@ from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
-from snowsplat.trajectory.video import video_writer
+from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.files import write_json
 from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
 

@@ -43,7 +43,7 @@ class Findings:
             self._all = [(j, f) for j, f in self._all if (j, f["kind"]) != (job, found["kind"])]
         self._all.append((job, found))
 
-    def of(self, kind: str) -> list[Finding]:
+    def of_kind(self, kind: str) -> list[Finding]:
         return [found for _, found in self._all if found["kind"] == kind]
 
     def last_by_job(self, kind: str) -> dict[str, Finding]:
@@ -51,15 +51,15 @@ class Findings:
 
     def one(self, kind: str, **where: object) -> Finding | None:
         """The last finding of a kind with these values."""
-        for found in reversed(self.of(kind)):
+        for found in reversed(self.of_kind(kind)):
             if all(found.get(name) == value for name, value in where.items()):
                 return found
         return None
 
     def sizes(self, kind: str) -> list[str]:
         """Sizes, sorted by the number of Gaussians."""
-        frames = {found["size"]: found["gaussians"] for found in self.of("frame")}
-        sizes = {found["size"] for found in self.of(kind)}
+        frames = {found["size"]: found["gaussians"] for found in self.of_kind("frame")}
+        sizes = {found["size"] for found in self.of_kind(kind)}
         return sorted(sizes, key=lambda size: (frames.get(size, 0), size))
 
     def as_json(self) -> list[dict[str, object]]:
@@ -68,7 +68,7 @@ class Findings:
     def wrong(self) -> int:
         """Number of failed tests and sanitizer errors."""
         errors = (found["errors"] for found in self.last_by_job("sanitizer").values())
-        return len(self.of("failure")) + sum(errors)
+        return len(self.of_kind("failure")) + sum(errors)
 
 
 def page(findings: Findings, outcomes: Sequence[Outcome], when: str, running: bool) -> str:
@@ -134,7 +134,8 @@ def _tests(findings: Findings, name: str) -> str:
         "",
         f"{counts}{f', {left} not reached' * (left > 0)}, of {total} in {len(by_job)} files.",
     ]
-    failures = [f"- {found['test']}: {found['line']}"[:200] for found in findings.of("failure")]
+    failed = findings.of_kind("failure")
+    failures = [f"- {found['test']}: {found['line']}"[:200] for found in failed]
     return "\n".join(lines + _some(failures))
 
 
@@ -153,8 +154,8 @@ def _sanitizer(findings: Findings, name: str) -> str:
 def _training(findings: Findings, name: str) -> str:
     rows = []
     key = ("dataset", "iterations", "seed")
-    runs = {tuple(f[k] for k in key): {} for f in findings.of("training")}
-    for found in findings.of("training"):
+    runs = {tuple(f[k] for k in key): {} for f in findings.of_kind("training")}
+    for found in findings.of_kind("training"):
         runs[tuple(found[k] for k in key)][found["device"]] = found
     differences: dict[str, list[float]] = {}
     for (dataset, iterations, seed), by_device in sorted(runs.items()):
@@ -173,7 +174,7 @@ def _training(findings: Findings, name: str) -> str:
         else:
             cells += ["—"] * 5
         rows.append(cells)
-    absent = sorted({found["dataset"] for found in findings.of("absent")})
+    absent = sorted({found["dataset"] for found in findings.of_kind("absent")})
     if not rows and not absent:
         return ""
     lines = [f"## Training on {name}, PSNR of held-out photos in dB", ""]
@@ -319,14 +320,14 @@ def _peer(findings: Findings, name: str) -> str:
     if peer is None:
         return ""
     rows = []
-    for found in findings.of("peer times"):
+    for found in findings.of_kind("peer times"):
         ratio = found["theirs"] / found["ours"] if found["ours"] > 0 else math.nan
         goal = ""
         if found["what"] == "training step":
             goal = f"goal {PEER_GOAL:.0f}: {'reached' if ratio >= PEER_GOAL else 'NOT reached'}"
         times = [f"{found['ours']:.3f}", f"{found['theirs']:.3f}", f"{ratio:.2f}"]
         rows.append([found["size"], found["what"], *times, goal])
-    images = [f"{f['size']}: {f['psnr']:.1f} dB" for f in findings.of("peer image")]
+    images = [f"{f['size']}: {f['psnr']:.1f} dB" for f in findings.of_kind("peer image")]
     lines = [f"## {name}: compared with gsplat {peer['version']}", ""]
     if images:
         lines += [f"PSNR between the two images: {', '.join(images)}.", ""]

@@ -39,7 +39,7 @@ from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
-from snowsplat.trajectory.video import video_writer
+from snowsplat.trajectory.video_file import video_writer
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
 VERSION = 5

@@ -40,7 +40,7 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.sfm import dataset_folder
-from snowsplat.sfm.ingest import clip, mask_files, photo_files, video
+from snowsplat.sfm.ingest import clip, mask_files, photo_files, video_frames
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent
@@ -375,7 +375,7 @@ def _video(name: str, file: str, **options: Any) -> Reader:
         path = folder / file
         clip.is_video(path)
         found = clip.read_clip(path)
-        return video.extract_frames(found, folder, 4, 640, silent)
+        return video_frames.extract_frames(found, folder, 4, 640, silent)
 
     def memory(path: Path) -> int:
         try:
@@ -435,7 +435,7 @@ def _read_checkpoint(folder: Path) -> Any:
     from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 
     loaded = checkpoint.load(folder / "step_000005.safetensors")
-    CheckpointMeta.of(loaded)
+    CheckpointMeta.from_checkpoint(loaded)
     return loaded
 
 

@@ -10,12 +10,12 @@ from ..trajectory.rigs import camera_at
 
 def test_sizes_are_even():
     camera = camera_at((0.0, 0.0, -3.0))  # 64×48
-    assert VideoSize.parse(None).of(camera) == (64, 48)
-    assert VideoSize.parse("127").of(camera) == (126, 94)
-    assert VideoSize.parse("33x21").of(camera) == (32, 20)
+    assert VideoSize.parse(None).for_camera(camera) == (64, 48)
+    assert VideoSize.parse("127").for_camera(camera) == (126, 94)
+    assert VideoSize.parse("33x21").for_camera(camera) == (32, 20)
     large = camera.scaled(4000, 3000)
-    assert VideoSize.parse(None).of(large) == (1920, 1440)
-    assert VideoSize.parse("8192").of(camera.scaled(1, 100_000)) == (8192, 8192)
+    assert VideoSize.parse(None).for_camera(large) == (1920, 1440)
+    assert VideoSize.parse("8192").for_camera(camera.scaled(1, 100_000)) == (8192, 8192)
 
 
 def test_number_of_frames():

@@ -78,7 +78,7 @@ def test_equal_gaussians_cost_nothing_and_different_ones_cost_more():
     far.means += same.scales[0, 0]
     red.sh_dc += 1.0
     costs = [
-        float(module._costs(module._Mixture.of(Gaussians.cat([same, other]), []))[0, 0])
+        float(module._costs(module._Mixture.from_gaussians(Gaussians.cat([same, other]), []))[0, 0])
         for other in (same, near, far, red)
     ]
     assert costs[0] == pytest.approx(0.0, abs=1e-6)

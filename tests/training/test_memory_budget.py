@@ -70,7 +70,7 @@ def test_without_a_budget_nothing_is_reduced() -> None:
     assert plan.photos == 100 * 3 * 1000 * 500
     assert plan.config.image_memory == config.image_memory
     assert plan.limit is not None
-    decoding = plan.total - plan.photos - CPU.of(plan.limit, 500_000, 3)
+    decoding = plan.total - plan.photos - CPU.bytes_for(plan.limit, 500_000, 3)
     assert decoding == DECODERS * 18 * 500_000
 
 
@@ -163,7 +163,7 @@ def test_gaussians_of_a_resumed_training_have_to_fit() -> None:
 
 
 def test_a_million_gaussians_take_less_than_a_gigabyte_on_a_gpu() -> None:
-    assert GPU.of(1_000_000, 0, 3) < 1_000_000_000
+    assert GPU.bytes_for(1_000_000, 0, 3) < 1_000_000_000
 
 
 @pytest.mark.parametrize("random", [20_000, 200_000])
@@ -180,7 +180,7 @@ def test_random_gaussians_are_larger(random: int) -> None:
     assert plans[1].limit is not None
     assert plans[1].limit < 140_000
     assert plans[1].total <= budget
-    later = CPU.of(plans[1].limit, 0, 3) - CPU.fixed
+    later = CPU.bytes_for(plans[1].limit, 0, 3) - CPU.fixed
     assert plans[1].scene == later + 2 * CPU.gaussian * min(random, plans[1].limit)
     assert plan_memory(replace(with_points, points=None), config, DEVICE, 10**10, budget, 140_000)
 
@@ -189,4 +189,4 @@ def test_random_gaussians_are_larger(random: int) -> None:
 def test_the_number_of_gaussians_that_fit_is_the_largest(available: int) -> None:
     cost = _SceneCost(each=100, random=10, extra=300)
     count = cost.gaussians_in(available)
-    assert cost.of(count) <= available < cost.of(count + 1)
+    assert cost.bytes_for(count) <= available < cost.bytes_for(count + 1)

@@ -233,7 +233,7 @@ class _Job:
         from snowsplat.training.core.recipes import recipe
 
         options = self.options
-        budget = TimeBudget.of(options.minutes, None, self.started)
+        budget = TimeBudget.for_run(options.minutes, None, self.started)
         settings = options.dataset_settings(path)
         name = options.recipe or "default"
         config = recipe(name, **options.settings)
@@ -271,10 +271,10 @@ class _Job:
         if start is None:
             assert path is not None
             return self.train(path)
-        options, meta = self.options, CheckpointMeta.of(start)
+        options, meta = self.options, CheckpointMeta.from_checkpoint(start)
         budget, schedule = None, None
         if options.iterations is None:  # `iterations` replaces the time budget and its schedule
-            budget = TimeBudget.of(options.minutes, meta.time, self.started)
+            budget = TimeBudget.for_run(options.minutes, meta.time, self.started)
             schedule = meta.schedule
         settings = _resumed_dataset(options, path, start, meta)
         config = _resumed_config(options, start, meta)

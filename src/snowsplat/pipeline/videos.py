@@ -22,7 +22,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.trajectory.video import video_writer
+from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import remove_temporaries
 from snowsplat.util.stages import Outcome
@@ -68,7 +68,7 @@ class VideoSize:
             )
         return cls(width, height)
 
-    def of(self, camera: Camera) -> tuple[int, int]:
+    def for_camera(self, camera: Camera) -> tuple[int, int]:
         """Width and height, both even; a side that was not requested is taken from ``camera``."""
         width, height = camera.width, camera.height
         if self.width is None:
@@ -251,7 +251,7 @@ def cameras_along(
             f"{path} needs the cameras of a training run; use its output folder, or ellipse or a "
             "file of cameras",
         )
-    width, height = size.of(cameras[0])
+    width, height = size.for_camera(cameras[0])
     return [trajectory.resized(camera, width, height) for camera in cameras]
 
 

@@ -77,7 +77,7 @@ def simplify(
     if count <= 0:
         return gaussians.select(torch.empty(0, dtype=torch.int64))
     gaussians = gaussians.select(gaussians.finite_rows())
-    mixture, turn = _Mixture.of(gaussians, cameras), torch.eye(3, dtype=torch.float64)
+    mixture, turn = _Mixture.from_gaussians(gaussians, cameras), torch.eye(3, dtype=torch.float64)
     while len(mixture) > count:
         mixture = mixture.select(morton_order(mixture.means.T @ turn))
         surplus = min(len(mixture) - count, max(1, int(_SHARE * len(mixture))))
@@ -112,7 +112,7 @@ class _Mixture:
     weights: Tensor
 
     @staticmethod
-    def of(gaussians: Gaussians, cameras: Sequence[Camera]) -> _Mixture:
+    def from_gaussians(gaussians: Gaussians, cameras: Sequence[Camera]) -> _Mixture:
         seen = sight(gaussians, cameras)
         axes = rotation_from_quat(gaussians.rotations.double()) * gaussians.scales.double()[:, None]
         return _Mixture(

@@ -28,12 +28,12 @@ from typing import Any, Protocol
 
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import thread_count
+from snowsplat.sfm.dataset_report import REPORT, write_report
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sources import RECORDS, Sources, find_sources
 from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.progress import Report
-from snowsplat.sfm.report import REPORT, write_report
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort

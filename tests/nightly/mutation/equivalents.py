@@ -49,7 +49,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "across = torch.eye(3, dtype=None) - forward[:, :, None] * forward[:, None, :]",
     ): "0 and 1 are exact in float32, and the difference is float64",
     (
-        "trajectory/video.py",
+        "trajectory/video_file.py",
         "src_color_range=ColorRange.JPEG,",
         "",
     ): "FFmpeg assumes the full range for RGB by default",
@@ -209,7 +209,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "_Path = None",
     ): "it is used in annotations only",
     (
-        "trajectory/video.py",
+        "trajectory/video_file.py",
         "dst_color_range=ColorRange.MPEG,",
         "dst_color_range=None,",
     ): "FFmpeg converts to the limited range by default",
@@ -285,7 +285,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "i = torch.searchsorted(length, wanted).clamp(1, len(t) - 2)",
     ): "the last frame is many samples before the end of the path",
     (
-        "trajectory/video.py",
+        "trajectory/video_file.py",
         "dst_color_range=ColorRange.MPEG,\n)",
         ")",
     ): "FFmpeg converts to the limited range by default",
@@ -308,7 +308,7 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "and float(upper @ DEFAULT_UP) >= 0:",
     ): "the mean of upward directions is never exactly level",
     (
-        "trajectory/video.py",
+        "trajectory/video_file.py",
         "_BITS_PER_PIXEL = 0.25",
         "_BITS_PER_PIXEL = 0.234375",
     ): "any bit rate of about this size is suitable",

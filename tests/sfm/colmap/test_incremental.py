@@ -101,7 +101,7 @@ def test_photos_that_follow_each_other_come_first_then_those_with_the_most_match
     names = {1: "IMG_1.jpg", 2: "IMG_2.jpg", 3: "IMG_3.jpg", 8: "x.jpg", 9: "y.jpg"}
     pairs = [(1, 2, 14), (1, 3, 20), (1, 8, 500), (1, 9, 900), (3, 8, 2000)]
     growth = SimpleNamespace(
-        graph=ViewGraph.of(names, pairs), model=SimpleNamespace(reg_image_ids=lambda: [1])
+        graph=ViewGraph.from_pairs(names, pairs), model=SimpleNamespace(reg_image_ids=lambda: [1])
     )
     assert _Growth._in_order(growth, [2, 3, 8, 9]) == [3, 9, 8, 2]
 

@@ -22,7 +22,7 @@ def walk(matches, named=True, weak=()):
         for d, number in enumerate(matches, start=1)
         for i in range(1, COUNT + 1 - d)
     ]
-    return ViewGraph.of(names, pairs)
+    return ViewGraph.from_pairs(names, pairs)
 
 
 def test_the_photos_are_spread():
@@ -64,7 +64,7 @@ def test_the_same_photos_give_the_same_subset():
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_very_few_photos(count):
-    graph = ViewGraph.of({i: f"{i}.jpg" for i in range(count)}, [])
+    graph = ViewGraph.from_pairs({i: f"{i}.jpg" for i in range(count)}, [])
     assert spread_subset(graph, count) == set(range(count))
 
 
@@ -77,7 +77,7 @@ def test_photos_left_out_at_once_or_one_by_one_are_the_same():
         for step in steps
         for i in range(1, COUNT + 1 - step)
     ]
-    graph = ViewGraph.of(walk([], named=False).names, pairs)
+    graph = ViewGraph.from_pairs(walk([], named=False).names, pairs)
     left = set(graph.names)
     for _ in range(COUNT):
         left = spread_subset(graph.of_photos(left), len(left) - 1)
@@ -88,7 +88,7 @@ def test_photos_left_out_at_once_or_one_by_one_are_the_same():
 def test_no_long_gaps_in_a_series():
     """Photos far apart by name have many matches, too: two rooms look alike."""
     pairs = [(i, j, 200 + i + j) for i in range(1, 41) for j in range(i + 1, 41)]
-    graph = ViewGraph.of({i: f"{i:03}.jpg" for i in range(1, 41)}, pairs)
+    graph = ViewGraph.from_pairs({i: f"{i:03}.jpg" for i in range(1, 41)}, pairs)
     subset = sorted(spread_subset(graph, 5))
     assert max(b - a for a, b in itertools.pairwise(subset)) == 4
     assert {1, 40} <= set(subset)

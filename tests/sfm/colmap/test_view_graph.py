@@ -21,7 +21,7 @@ def test_photos_follow_each_other_if_at_most_one_photo_is_between_them():
 
 
 def test_the_pairs_of_a_graph_are_those_between_its_photos():
-    graph = ViewGraph.of(NAMES, [(2, 3, 80), (1, 2, 90), (1, 9, 70), (1, 5, 60)])
+    graph = ViewGraph.from_pairs(NAMES, [(2, 3, 80), (1, 2, 90), (1, 9, 70), (1, 5, 60)])
     found = [(pair.first, pair.second, pair.matches, pair.follows) for pair in graph.pairs]
     assert found == [(1, 2, 90, True), (1, 5, 60, False), (2, 3, 80, True)]
     assert [pair.other(2) for pair in graph.pairs_of[2]] == [3, 1]
@@ -29,20 +29,20 @@ def test_the_pairs_of_a_graph_are_those_between_its_photos():
 
 
 def test_a_part_of_the_photos_has_its_own_order():
-    graph = ViewGraph.of(NAMES, [(1, 2, 90), (1, 5, 60), (5, 6, 70)])
+    graph = ViewGraph.from_pairs(NAMES, [(1, 2, 90), (1, 5, 60), (5, 6, 70)])
     (pair,) = graph.of_photos([1, 3, 5]).pairs
     assert (pair.first, pair.second, pair.matches, pair.follows) == (1, 5, 60, True)
     assert list(graph.of_photos([1, 3, 5]).names) == [1, 3, 5]
 
 
 def test_the_matrix_is_symmetric():
-    ids, matches = ViewGraph.of({4: "x", 2: "y", 9: "z"}, [(2, 9, 30), (2, 4, 5)]).matrix()
+    ids, matches = ViewGraph.from_pairs({4: "x", 2: "y", 9: "z"}, [(2, 9, 30), (2, 4, 5)]).matrix()
     assert ids == [2, 4, 9]
     assert matches.tolist() == [[0, 5, 30], [5, 0, 0], [30, 0, 0]]
 
 
 @pytest.mark.parametrize("names", [{}, {1: "only.jpg"}])
 def test_a_graph_without_pairs(names):
-    graph = ViewGraph.of(names, [])
+    graph = ViewGraph.from_pairs(names, [])
     assert graph.pairs == []
     assert graph.matrix()[1].shape == (len(names), len(names))

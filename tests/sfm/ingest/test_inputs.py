@@ -332,7 +332,7 @@ def test_the_disk_becomes_full(writes, tmp_path, monkeypatch):
         monkeypatch.setattr("snowsplat.sfm.ingest.gather_photos.save", full)
     else:
         source = write_video(tmp_path / "a.mp4", pan(9))
-        monkeypatch.setattr("snowsplat.sfm.ingest.video.save", full)
+        monkeypatch.setattr("snowsplat.sfm.ingest.video_frames.save", full)
     with pytest.raises(UserError, match="disk: full; free some space"):
         gathered(source, tmp_path / "out")
 

@@ -22,10 +22,10 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.render import render
-from snowsplat.viewer.web.page import FILM_SECONDS
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import ready, site
 from snowsplat.viewer.web.server import StaticServer
+from snowsplat.viewer.web.viewer_page import FILM_SECONDS
 
 from ...browser import Browser, Page
 

@@ -15,7 +15,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.videos import VideoSize
-from snowsplat.trajectory.video import video_writer
+from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.stages import Outcome
 

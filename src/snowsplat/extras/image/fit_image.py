@@ -23,7 +23,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.image_files import to_8bit, write_png
 from snowsplat.training.core.progress import Progress
-from snowsplat.trajectory.video import video_writer
+from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.process import single_threaded

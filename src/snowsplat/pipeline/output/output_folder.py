@@ -310,7 +310,9 @@ class OutputFolder:
         try:
             if ours.is_file():
                 whole = read_json(ours)
-                dataset = from_json(DatasetSettings, whole.get("dataset") or whole[FORMER_DATASET])
+                dataset = from_json(
+                    DatasetSettings, whole["dataset" if "dataset" in whole else FORMER_DATASET]
+                )
                 white = whole["training"]["background"] == "white"
             elif theirs.is_file():
                 values = _namespace(theirs)

@@ -36,7 +36,7 @@ class CheckpointMeta:
     schedule: Schedule | None = None
 
     @classmethod
-    def of(cls, start: Checkpoint) -> CheckpointMeta:
+    def from_checkpoint(cls, start: Checkpoint) -> CheckpointMeta:
         """The checked data of the checkpoint ``start``, from which a training run resumes.
 
         Raises:

@@ -40,7 +40,7 @@ class TimeBudget:
     started: float = field(default_factory=time.monotonic)
 
     @classmethod
-    def of(
+    def for_run(
         cls, minutes: float | None, before: dict[str, Any] | None, started: float
     ) -> TimeBudget | None:
         """The budget of a training run.
@@ -97,4 +97,4 @@ class TimeBudget:
         from snowsplat.training.budgets.pace import Pace
         from snowsplat.training.budgets.step_cost import Work
 
-        return Pace(Work.of(trainer.config, trainer.dataset), self.left, time_ratio)
+        return Pace(Work.for_training(trainer.config, trainer.dataset), self.left, time_ratio)

@@ -70,7 +70,7 @@ class TrainingRun:
         self.started = self.last_checkpoint = time.monotonic()
         self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
         self.history = History.read(self.out.history, self.first_step)
-        self._left = StepsLeft(Work.of(self.config, self.trainer.dataset))
+        self._left = StepsLeft(Work.for_training(self.config, self.trainer.dataset))
         self.together = Collective(self.trainer)
         self.transients = self.trainer.part(Transients)
         self.overfitting = self.trainer.part(OverfittingCheck)

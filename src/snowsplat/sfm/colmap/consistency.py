@@ -118,7 +118,7 @@ def check_pairs(
     """
     placed = set(model.reg_image_ids())
     points = {image_id: _point_ids(model.image(image_id)) for image_id in placed}
-    positions = _Positions.of(model)
+    positions = _Positions.from_model(model)
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
@@ -215,7 +215,7 @@ class _Positions:
     xyz: Floats  # (P, 3)
 
     @staticmethod
-    def of(model: pycolmap.Reconstruction) -> _Positions:
+    def from_model(model: pycolmap.Reconstruction) -> _Positions:
         ids = np.array(sorted(model.points3D), np.uint64)
         xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
         return _Positions(ids, xyz)

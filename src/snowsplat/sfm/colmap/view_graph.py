@@ -58,7 +58,7 @@ class ViewGraph:
     pairs_of: Mapping[int, list[VerifiedPair]]  # image id -> its pairs
 
     @staticmethod
-    def of(names: Mapping[int, str], pairs: Iterable[tuple[int, int, int]]) -> ViewGraph:
+    def from_pairs(names: Mapping[int, str], pairs: Iterable[tuple[int, int, int]]) -> ViewGraph:
         """``pairs``: image ids (first < second) and number of verified matches.
 
         Pairs with a photo that is not in ``names`` are left out.
@@ -78,7 +78,7 @@ class ViewGraph:
         with closing_database(database) as source:
             names = database_names(source)
         found = verified_pairs(database)
-        return ViewGraph.of(names, ((p.first + 1, p.second + 1, p.inliers) for p in found))
+        return ViewGraph.from_pairs(names, ((p.first + 1, p.second + 1, p.inliers) for p in found))
 
     @property
     def pairs(self) -> list[VerifiedPair]:
@@ -93,7 +93,7 @@ class ViewGraph:
         """
         chosen = set(photos)
         names = {i: name for i, name in self.names.items() if i in chosen}
-        return ViewGraph.of(names, ((p.first, p.second, p.matches) for p in self.pairs))
+        return ViewGraph.from_pairs(names, ((p.first, p.second, p.matches) for p in self.pairs))
 
     def matrix(self) -> tuple[list[int], NDArray[np.floating[Any]]]:
         """The image ids in ascending order, and the number of verified matches of each pair.

@@ -25,7 +25,7 @@ from snowsplat.sfm.ingest.gather_photos import (
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.sources import Source, Sources, find_sources
-from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
+from snowsplat.sfm.ingest.video_frames import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import shown

@@ -47,7 +47,7 @@ class Cost:
     gaussian: int
     decoding: int
 
-    def of(self, gaussians: int, pixels: int, sh_degree: int) -> int:
+    def bytes_for(self, gaussians: int, pixels: int, sh_degree: int) -> int:
         """Bytes, without the photos that stay decoded."""
         return self.fixed + self.pixel * pixels + self.of_gaussian(sh_degree) * gaussians
 
@@ -113,11 +113,11 @@ class _SceneCost:
     random: int
     extra: int
 
-    def of(self, gaussians: int) -> int:
+    def bytes_for(self, gaussians: int) -> int:
         return self.each * gaussians + self.extra * min(gaussians, self.random)
 
     def gaussians_in(self, available: int) -> int:
-        """The largest number of Gaussians for which `of` is at most ``available``."""
+        """The largest number of Gaussians for which `bytes_for` is at most ``available``."""
         if_all_random = available // (self.each + self.extra)
         if_more = (available - self.extra * self.random) // self.each
         return max(min(self.random, if_all_random), if_more)
@@ -156,14 +156,14 @@ def plan_memory(
         extra=_EXTRA_OF_RANDOM * cost.gaussian,
     )
     stored = max(largest, *(view.image.stored for view in dataset.train))
-    images = cost.of(0, largest, config.sh_degree) + cost.decoding * stored
+    images = cost.bytes_for(0, largest, config.sh_degree) + cost.decoding * stored
     all_photos = _photo_bytes(dataset)
     photos = min(all_photos, config.image_memory or available // 2)
     limit = config.density.max_gaussians or None
     reductions = []
     if budget is not None:
         fewest_photos = _RGB * sum(sizes[-_FEWEST_PHOTOS:])
-        least = images + fewest_photos + scene.of(max(_FEWEST_GAUSSIANS, present))
+        least = images + fewest_photos + scene.bytes_for(max(_FEWEST_GAUSSIANS, present))
         if budget < least:
             raise _too_little(budget, least, present, files_too_large=stored > largest)
         fitting = scene.gaussians_in(budget - images - min(photos, fewest_photos))
@@ -172,7 +172,7 @@ def plan_memory(
             reductions.append(f"at most {fitting:,} Gaussians instead of {before}")
             limit = fitting
             config = changed(config, max_gaussians=limit)
-        left = max(fewest_photos, budget - images - scene.of(limit))
+        left = max(fewest_photos, budget - images - scene.bytes_for(limit))
         if photos > left:
             share = 100 * left // all_photos
             reductions.append(
@@ -181,7 +181,7 @@ def plan_memory(
             photos = left
         config = replace(config, image_memory=photos)
     gaussians = 1_000_000 if limit is None else limit
-    return MemoryPlan(config, scene.of(gaussians), images, photos, tuple(reductions), limit)
+    return MemoryPlan(config, scene.bytes_for(gaussians), images, photos, tuple(reductions), limit)
 
 
 def _photo_bytes(dataset: Dataset) -> int:

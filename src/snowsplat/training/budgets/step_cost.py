@@ -56,7 +56,7 @@ class Work:
     held_out: int
 
     @classmethod
-    def of(cls, config: TrainConfig, dataset: Dataset) -> Work:
+    def for_training(cls, config: TrainConfig, dataset: Dataset) -> Work:
         """The work of training on ``dataset``."""
         sizes = [view.camera.width * view.camera.height for view in dataset.train]
         return cls(config, sum(sizes) / len(sizes), len(dataset.test))

@@ -47,7 +47,7 @@ def carved_points(
     size = float((high - low).max()) / _SIDE
     shape = ((high - low) / size).ceil().to(torch.int64).clamp(min=1).tolist()
     views = dataset.train[:: math.ceil(len(dataset.train) / _VIEWS)]
-    pictures = [_Picture.of(view, images, 0.5 * (low + high), size) for view in views]
+    pictures = [_Picture.from_view(view, images, 0.5 * (low + high), size) for view in views]
     solid = torch.ones(shape, dtype=torch.bool)
     for _ in range(_ROUNDS):
         cells = _surface(solid).nonzero()
@@ -73,7 +73,7 @@ class _Picture:
     transparent: Tensor | None  # (H, W) bool
 
     @staticmethod
-    def of(view: View, images: Photos, middle: Tensor, size: float) -> _Picture:
+    def from_view(view: View, images: Photos, middle: Tensor, size: float) -> _Picture:
         camera = view.camera
         distance = max(float((camera.position.to(torch.float64) - middle).norm()), size)
         scale = min(1.0, _PIXELS * distance / (size * camera.fx))

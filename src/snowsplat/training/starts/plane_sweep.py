@@ -63,7 +63,7 @@ class _Picture:
     usable: Tensor | None  # (H, W) bool: False for masked and transparent pixels
 
     @staticmethod
-    def of(view: View, images: Photos) -> _Picture:
+    def from_view(view: View, images: Photos) -> _Picture:
         photo = photo_for_map(view, images)
         luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
         height, width = luminance.shape
@@ -76,8 +76,8 @@ def _depth_map(
     span = _inverse_depths(view.camera, points)
     if span is None or not source_views:
         return None
-    picture = _Picture.of(view, images)
-    sources = [_Picture.of(source, images) for source in source_views]
+    picture = _Picture.from_view(view, images)
+    sources = [_Picture.from_view(source, images) for source in source_views]
     low, high = span
     coarse, fine = _Level(picture, sources, 2), _Level(picture, sources, 1)
     shift = round(coarse.displacement(low, high))

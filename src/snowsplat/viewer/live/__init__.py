@@ -9,7 +9,7 @@ requested are rendered, without a copy of the Gaussians. `viewer.NetworkViewer` 
     curves.py       curves of loss and PSNR
     server.py       starts viser's server on a free port
     guard.py        checks connections and messages, and limits their cost
-    page.py         the controls of the page
+    controls.py     the controls of the page
     photos.py       the cameras of the photos: frustums in the scene, and views from their poses
     key_cameras.py  views that a user stores, for a video along them
     shortcuts.py    keys and theme

@@ -10,7 +10,7 @@ import viser
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import entries_of
-from snowsplat.viewer.live.page import in_server_thread, note
+from snowsplat.viewer.live.controls import in_server_thread, note
 from snowsplat.viewer.live.session import Visitor
 
 FILE = "cameras.json"

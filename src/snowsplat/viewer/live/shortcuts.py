@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from torch import Tensor
 
-from snowsplat.viewer.live.page import Controls, in_server_thread
+from snowsplat.viewer.live.controls import Controls, in_server_thread
 
 #: The accent colour of the reports, RGB.
 ACCENT = (184, 101, 10)

@@ -7,8 +7,8 @@ import time
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.process import raise_deferred_interrupt
+from snowsplat.viewer.live.controls import TrainingPanel
 from snowsplat.viewer.live.curves import Curve, SampledPsnr
-from snowsplat.viewer.live.page import TrainingPanel
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 _SECONDS = 1.0  # time between two updates of the displayed numbers

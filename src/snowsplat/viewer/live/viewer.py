@@ -15,6 +15,7 @@ import viser
 
 from snowsplat.data import Dataset
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.viewer.live.controls import Controls, ScenePanel
 from snowsplat.viewer.live.display import Pose
 from snowsplat.viewer.live.guard import (
     Connection,
@@ -23,7 +24,6 @@ from snowsplat.viewer.live.guard import (
     current_connection,
 )
 from snowsplat.viewer.live.key_cameras import KeyCameras
-from snowsplat.viewer.live.page import Controls, ScenePanel
 from snowsplat.viewer.live.photos import Photos, fitted_photo
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.server import start_server, stop_server

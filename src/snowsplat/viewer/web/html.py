@@ -13,9 +13,9 @@ from snowsplat.formats import GaussianArrays
 from snowsplat.formats.compressed_ply import encode_compressed_ply
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
-from snowsplat.viewer.web.page import whole_page
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import ReadyScene
+from snowsplat.viewer.web.viewer_page import whole_page
 
 #: Largest scene in bytes. Browsers support strings of about 500 million characters, and base64
 #: makes 4 characters of 3 bytes.

@@ -18,9 +18,9 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
-from snowsplat.viewer.web.page import asset, content_policy, page
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene, ready
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page
 
 SCENE, POSTER = "scene.sog", "poster.jpg"
 #: The size that services recommend for the picture of a link (Open Graph).

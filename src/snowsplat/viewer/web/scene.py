@@ -27,10 +27,10 @@ from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.hiding import Hiding, hiding_of
-from snowsplat.viewer.web.page import asset, content_policy, page, settings
 from snowsplat.viewer.web.panel import Description, panel_settings
 from snowsplat.viewer.web.served_file import FileOnDisk, Served, ServedFile
 from snowsplat.viewer.web.stops import Stops, stops_of
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page, settings
 
 _SCENE = "scene.compressed.ply"
 _TYPES = {".json": "application/json", ".webp": "image/webp"}

@@ -12,7 +12,7 @@ from PIL import Image
 
 from snowsplat.sfm.ingest.clip import decoded_frames, max_frame_count, read_clip
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED
-from snowsplat.sfm.ingest.video import SAME_VIEW, extract_frames
+from snowsplat.sfm.ingest.video_frames import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
@@ -114,8 +114,8 @@ def test_few_files_and_few_frames_in_memory(tmp_path, monkeypatch):
             yield holder
             files.append((len(list((tmp_path / "f").iterdir())), len(alive)))
 
-    monkeypatch.setattr("snowsplat.sfm.ingest.video.decoded_frames", decoded)
-    monkeypatch.setattr("snowsplat.sfm.ingest.video._MIN_COUNT", 5)
+    monkeypatch.setattr("snowsplat.sfm.ingest.video_frames.decoded_frames", decoded)
+    monkeypatch.setattr("snowsplat.sfm.ingest.video_frames._MIN_COUNT", 5)
     frames = pan(50, step=8)
     made = extract(write_video(tmp_path / "a.mp4", frames), tmp_path / "f", 5)
     assert len(made.kept) == 5
@@ -247,7 +247,7 @@ def test_a_full_disk_is_not_reported_as_a_damaged_video(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("snowsplat.sfm.ingest.video.save", full)
+    monkeypatch.setattr("snowsplat.sfm.ingest.video_frames.save", full)
     with pytest.raises(OSError, match="No space left"):
         extract(write_video(tmp_path / "a.mp4", [wall()] * 3), tmp_path / "f", 1)
 

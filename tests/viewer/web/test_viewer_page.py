@@ -10,9 +10,8 @@ import pytest
 
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.web import page as viewer_page
-from snowsplat.viewer.web import panel
-from snowsplat.viewer.web.page import asset, content_policy, page, settings, whole_page
+from snowsplat.viewer.web import panel, viewer_page
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page, settings, whole_page
 
 HOSTILE = "</script><script>alert(1)</script><!-- <script>"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from av.codec.codec import UnknownCodecError
 
-from snowsplat.trajectory import video as video_module
-from snowsplat.trajectory.video import video_writer
+from snowsplat.trajectory import video_file as video_module
+from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import UserError
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 10

@@ -15,7 +15,7 @@ from PIL import Image
 
 from snowsplat.data.colmap import read_model, read_points, write_model
 from snowsplat.scene.geometry import look_at
-from snowsplat.sfm.report import write_report
+from snowsplat.sfm.dataset_report import write_report
 
 NAMES = [
     "one.jpg",
