@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 class GaussianArrays:
     """N Gaussians: the parameters of `snowsplat.Gaussians` as float32 arrays, in its order.
 
-    ``antialiased`` is that of `snowsplat.Gaussians`. Iterating yields the six arrays.
+    ``antialiased``: see `snowsplat.Gaussians`. Iterating yields the six arrays.
     """
 
     means: np.ndarray  # (N, 3) world units

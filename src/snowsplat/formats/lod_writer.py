@@ -6,7 +6,8 @@ the level before it: from twice the distance, a surface covers a quarter of the 
 merged on its own, so the levels of two adjacent leaves fit together in any combination, and the
 memory that is needed does not grow with the scene.
 
-A file has the same level of leaves that follow each other in the tree, which are neighbours.
+A file contains one level of a run of consecutive leaves. Consecutive leaves of the tree are
+neighbours in the scene.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def read_ply(path: Path | str) -> GaussianArrays:
 
 
 def is_antialiased(comments: Sequence[str]) -> bool:
-    """Whether the comments of a header say so; the last one that says something counts."""
+    """Whether the last comment that names a mode of rendering names the antialiased one."""
     marks = [_MODES[line] for line in map(str.lower, comments) if line in _MODES]
     return bool(marks) and marks[-1]
 

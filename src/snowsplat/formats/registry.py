@@ -44,7 +44,7 @@ class Format:
         loses: a description, for users, of the data that a scene loses in this format.
         marks_antialiased: whether a file can say that its scene is antialiased, see `Gaussians`.
         version: the version of a file that ``recognises`` accepts, if the format has several.
-        bytes: the size of a scene; None: that of its file, the only one.
+        bytes: the size of a scene; None: the scene is a single file, whose size is taken.
     """
 
     name: str

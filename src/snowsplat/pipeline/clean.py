@@ -43,7 +43,7 @@ class Cleaned:
     Attributes:
         before, after: the numbers of Gaussians.
         compared: what was compared with the renderings, such as "7 held-out photos".
-        psnr: of these, in dB, before and after.
+        psnr: PSNR of the renderings in dB, before and after.
     """
 
     before: int
@@ -69,7 +69,7 @@ def clean(
     Args:
         scene: the output folder of a training run, or a scene file.
         target: the file to write; its suffix selects the format.
-        dataset: the photos of the scene; default: those of the training, if they are still there.
+        dataset: the photos of the scene; default: the photos of the training, if they are still there.
         overwrite: replace ``target``.
         compute: the device; default: a GPU if there is one.
 

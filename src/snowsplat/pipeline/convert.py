@@ -187,7 +187,7 @@ def convert(
 def _decimation(
     edits: Edits, scenes: Sequence[Path], dataset: Path | str | None, observer: Observer
 ) -> Decimation:
-    """What is known of the views of these scene files.
+    """The decimation, with the cameras or photos that are known for these scene files.
 
     Raises:
         UserError: the photos of ``dataset`` do not show the edited scene.

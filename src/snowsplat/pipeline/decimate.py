@@ -54,7 +54,7 @@ class Decimation:
     """Makes fewer Gaussians of a scene: neighbours are merged, and the result is fitted to views.
 
     Attributes:
-        cameras: those of the photos; empty: unknown.
+        cameras: the cameras of the photos; empty: unknown.
         background: the colour behind the scene.
         refined: trains the result on the photos; None: it is trained on renderings of the whole
             scene from the cameras.

@@ -33,7 +33,7 @@ def describe(path: Path | str) -> dict[str, Any]:
     - "point cloud": number of points, bounds.
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
-      The folder is that of `train` or of `make`.
+      ``path`` is the output folder of `train` or of `make`.
     - "dataset": number and sizes of the photos, focal lengths, number of points, extent.
 
     Bounds and lengths are in world units, in the frame of the file. torch is imported only for

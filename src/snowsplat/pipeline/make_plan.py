@@ -1,8 +1,8 @@
 """`choose_plan`: how `make` keeps a time budget: quality, size and number of the photos.
 
 Structure from motion must be finished after `_SHARE` of the time; training uses the rest.
-`sfm.cost` predicts the time of structure from motion on this machine. The plan is the first of
-these that is fast enough:
+`sfm.cost` predicts the time of structure from motion on this machine. The plan is the first entry
+of this list that is fast enough:
 
     all photos      at the size of "best", then at the size at which "best" detects features;
                     the same for "normal", then for "draft"

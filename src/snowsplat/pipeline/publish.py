@@ -27,7 +27,7 @@ class PublishOptions:
     """Options of a published scene.
 
     Attributes:
-        title: the name on the page; None: that of the scene.
+        title: the name on the page; None: the name of the scene.
         licence: the licence of the scene, such as "CC BY 4.0".
         url: the address of the folder on the web. Services that show a preview of a link need it.
 

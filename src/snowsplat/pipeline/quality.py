@@ -10,13 +10,13 @@ Quality = Literal["draft", "normal", "best"]
 
 @dataclass(frozen=True)
 class Preset:
-    """The settings at one quality. Sizes are those of the longer side, in pixels.
+    """The settings at one quality. A size is the length of the longer side, in pixels.
 
     Attributes:
         photos: the size to which photos are reduced when they are copied into the dataset.
         side: the size of the photos in training.
         iterations: steps of the training.
-        max_gaussians, densify_interval: settings of the training; None: those of the recipe.
+        max_gaussians, densify_interval: settings of the training; None: the value of the recipe.
         stop_overfitting: whether the training ends earlier if the scene overfits. With few steps,
             this would only cost time.
         training: about the time of the training and of the test views, in seconds of one core of

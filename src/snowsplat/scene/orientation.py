@@ -72,7 +72,7 @@ def up_direction(rotations: np.ndarray) -> np.ndarray:
 def up_of_surfaces(
     normals: np.ndarray, areas: np.ndarray, positions: np.ndarray
 ) -> np.ndarray | None:
-    """The up direction of a scene without cameras: that of the ground, tables and ceilings.
+    """The up direction of a scene without cameras: the normal of the ground, tables and ceilings.
 
     It is the direction within `_LARGEST_TILT` of −y, the usual up direction of files, to which most
     surfaces are perpendicular. If there is none, but the scene stands on ground at its lowest z, it

@@ -1,8 +1,8 @@
 """What cameras see of each Gaussian: from where, how large a pixel is there, and how much of it.
 
 The blending weight of a Gaussian in a pixel is w = T α, with the transmittance T in front of it.
-Sums of these weights are gradients of a rendered image: that of Σ w(p) g(p) with respect to a
-colour.
+Sums of these weights are gradients: Σ w(p) g(p) is the gradient of Σ c(p) g(p), with the rendered
+image c and any weights g of the pixels p, with respect to the colour of the Gaussian.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def sight(gaussians: Gaussians, cameras: Sequence[Camera]) -> Sight:
 
     Args:
         gaussians: N finite Gaussians on the CPU.
-        cameras: those of the photos; some of them, evenly spaced, are used.
+        cameras: the cameras of the photos; some of them, evenly spaced, are used.
     """
     found = _by_cameras(gaussians, cameras) if cameras else _by_spacing(gaussians)
     if gaussians.antialiased:

@@ -4,10 +4,11 @@ Two Gaussians are replaced by one with the mean and the covariance of both toget
 the pairs that lose least are merged, at most a third of the scene; a merged Gaussian can be merged
 again in the next pass.
 
-What counts is what is seen. A renderer draws a Gaussian that is smaller than a pixel as large as a
-pixel, so areas are those after this blur. Without it, a scene whose Gaussians are small loses most
-of its opacity when they are merged. If the cameras are known, it is also known how large a pixel
-is, from where a Gaussian is seen, and how much of it is not hidden (`sight`).
+The cost of a merge is measured in the image. A renderer blurs a Gaussian that is smaller than a
+pixel to the size of a pixel, so areas are measured after this blur. Without the blur, a merge of
+small Gaussians would lose most of their opacity. From the cameras, if they are known, follow the
+size of a pixel at each Gaussian, the directions from which the Gaussian is seen, and the part of
+the Gaussian that is not hidden (`sight`).
 
 The candidates for a partner are close in a Morton order. In every pass the grid of this order has
 another orientation, so two neighbours that are on different sides of a border meet in another pass.
@@ -27,7 +28,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, quat_from_rotation, rotation_from_quat
 from snowsplat.scene.sight import ENTRIES, sight
 
-# Candidates for a partner: so many that follow in the Morton order, and as many before.
+# Candidates for a partner: this number of Gaussians after it in the Morton order, and before it.
 _NEIGHBOURS = 8
 # Largest share of the Gaussians that one pass removes.
 _SHARE = 1 / 3
@@ -35,7 +36,7 @@ _SHARE = 1 / 3
 _COLOR = 0.3
 # Gaussians that are compared at a time, so that the intermediate results fit into the cache.
 _CHUNK = 1 << 15
-# The rotation of the grid between two passes, about an axis that is no axis of the grid.
+# The rotation of the grid between two passes. Its axis is not parallel to x, y or z.
 _TURN = rotation_from_quat(torch.tensor([[0.9, 0.25, -0.31, 0.17]], dtype=torch.float64))[0]
 # Largest opacity of a merged Gaussian: its logit is finite.
 _MAX_OPACITY = 0.9999
@@ -63,7 +64,7 @@ def simplify(
     Args:
         gaussians: N Gaussians on the CPU. Those that are not finite are removed first.
         count: how many to keep. If it is at least N, the result is ``gaussians``.
-        cameras: those of the photos, see `sight`. They make the result better.
+        cameras: the cameras of the photos, see `sight`. They make the result better.
         farther: the factor by which a pixel becomes larger where two Gaussians are merged. 1: the
             result is for views from the same distance; 3: with a quarter of the Gaussians, it is
             for views from three times the distance.

@@ -62,7 +62,7 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
 
 
 def _file_name(image: PosedImage) -> str:
-    """The name of a photo in the model: that of the view, with the suffix of its file."""
+    """The name of a photo in the model: the name of the view, with the suffix of its file."""
     suffix = image.path.suffix
     return image.name if image.name.endswith(suffix) else image.name + suffix
 

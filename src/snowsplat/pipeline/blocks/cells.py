@@ -11,7 +11,7 @@ from torch import Tensor
 
 #: The two axes of the ground plane, unit vectors in the world frame.
 Axes = tuple[tuple[float, float, float], tuple[float, float, float]]
-# The size of a cell in a direction is that of the part of its content between these quantiles.
+# The size of a cell in a direction is the distance between these quantiles of its content.
 # Distant points, such as those of the sky, would make it too large.
 _INNER = (0.05, 0.95)
 

@@ -51,11 +51,15 @@ class BlockContent:
 def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, list[BlockContent]]:
     """Cut a dataset into ``count`` blocks.
 
-    The views of a block are those whose cameras are in the cell, expanded by ``margin`` times its
-    size; those of whose image at least a quarter shows the cell; and, a fifth as many, views that
-    are spread over the rest, because parts of the cell are seen only from afar, for example high
-    roofs. The points are those in the expanded cell, and a random selection, a quarter as many,
-    of others that these views show.
+    The cell of a block is expanded by ``margin`` times its size. The views of the block are
+
+    - the views whose cameras are in the expanded cell,
+    - the views of whose image at least a quarter shows the cell,
+    - a fifth as many views from the rest of the scene, evenly spread, because some parts of the
+      cell, such as high roofs, are seen only from afar.
+
+    The points of the block are the points in the expanded cell and, a quarter as many, a random
+    selection of the other points that these views show.
 
     Returns:
         the axes of the ground plane, and the blocks in the order of `cut`.

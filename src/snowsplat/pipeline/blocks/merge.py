@@ -1,4 +1,4 @@
-"""`merge_blocks`: joins the scenes of the blocks. Its memory is that of one block."""
+"""`merge_blocks`: joins the scenes of the blocks. It needs the memory of one block."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _deviations(gaussians: Gaussians, axes: Axes) -> Tensor:
 
 
 def _own(plan: Plan, cell: Cell, file: Path) -> Callable[[], tuple[int, GaussianArrays]]:
-    """Reads a block: the number of its Gaussians, and those in its cell."""
+    """Reads a block: its number of Gaussians, and the Gaussians in its cell."""
 
     def read() -> tuple[int, GaussianArrays]:
         arrays = read_ply(file)

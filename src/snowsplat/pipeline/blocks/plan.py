@@ -61,7 +61,7 @@ class Plan:
         dataset: how the whole dataset is read.
         recipe: the recipe of all blocks.
         settings: changed settings of all blocks, see `TrainOptions`.
-        axes: those of the ground plane.
+        axes: the axes of the ground plane.
         margin: the margin by which cells are expanded, as a share of their size.
     """
 

@@ -62,6 +62,6 @@ def folder_around(scene: Path) -> OutputFolder:
 
 
 def scene_name(scene: Path) -> str:
-    """The name of a scene: that of its folder, or of its file without suffixes."""
+    """The name of a scene: the name of its folder, or of its file without suffixes."""
     scene = scene.resolve()
     return scene.name.split(".")[0] or scene.name

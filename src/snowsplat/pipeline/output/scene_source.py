@@ -69,7 +69,7 @@ def load_dataset_of(
 ) -> tuple[Dataset, Color]:
     """The dataset of the training in ``folder``, and its background colour; see `load_trained`.
 
-    If the training has refined the cameras, they are those of the dataset.
+    If the training has refined the cameras, the dataset has the refined cameras.
     """
     settings, background = folder.settings()
     if dataset is not None:

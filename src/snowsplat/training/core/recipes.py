@@ -27,9 +27,9 @@ def default() -> TrainConfig:
     training, all learning rates decrease; opacities and scales decay, so that Gaussians which no
     photo needs become transparent; Gaussians with an opacity below 0.1 are removed, and their
     places are used again; no Gaussian is much nearer to a camera than the points that it sees;
-    densification lasts longer, uses absolute gradients, and always reaches the maximum number; of
-    the same time, more is used for Gaussians and less for steps; what moves in several photos is
-    masked; and the scene is antialiased.
+    densification lasts longer, uses absolute gradients, and always reaches the maximum number; more
+    Gaussians and fewer steps take the same time; objects that move between the photos are masked;
+    and the scene is antialiased.
     """
     config = classic()
     return replace(

@@ -1,4 +1,4 @@
-"""The keys and the theme of the page. F and R are those of the page of a finished scene.
+"""The keys and the theme of the page. F and R do the same on the page of a finished scene.
 
 viser also lists the keys in its command palette (Ctrl-K).
 """

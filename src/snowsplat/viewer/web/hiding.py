@@ -1,7 +1,7 @@
-"""What the sliders of the page can hide: what is far from the subject, and what is large.
+"""What the sliders of the page can hide: Gaussians far from the subject, and large Gaussians.
 
-The Gaussians that hang around a trained scene, where no photo shows it, are much larger than those
-of the surfaces. `hiding.js` hides Gaussians by distance and by size while they are copied for the
+In places that no photo shows, a trained scene has Gaussians that are much larger than those of the
+surfaces. `hiding.js` hides Gaussians by distance and by size while they are copied for the
 drawing; the scene itself is not changed.
 """
 
