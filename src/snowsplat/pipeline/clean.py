@@ -69,7 +69,7 @@ def clean(
     Args:
         scene: the output folder of a training run, or a scene file.
         target: the file to write; its suffix selects the format.
-        dataset: the photos of the scene; default: the photos of the training, if they are still there.
+        dataset: the photos of the scene; default: the photos of the training, if they still exist.
         overwrite: replace ``target``.
         compute: the device; default: a GPU if there is one.
 

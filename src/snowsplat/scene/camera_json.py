@@ -1,7 +1,7 @@
 """Camera lists in the JSON format of `cameras.json`, as 3D Gaussian Splatting programs use it.
 
-Position and rotation are the parts of world_from_cam, in OpenCV axes. Sizes and focal lengths are in
-pixels. The format does not store the principal point; readers use the middle of the image.
+Position and rotation are the parts of world_from_cam, in OpenCV axes. Sizes and focal lengths are
+in pixels. The format does not store the principal point; readers use the middle of the image.
 """
 
 from __future__ import annotations

@@ -231,7 +231,7 @@ def _merge(mixture: _Mixture, first: Tensor, second: Tensor, farther: float = 1.
 
 
 def _together(a: _Mixture, b: _Mixture, share: Tensor) -> _Mixture:
-    """Each Gaussian of a with that of b, whose share is ``share`` (N,); without an opacity."""
+    """Merge row i of ``a`` and row i of ``b``, whose share is ``share`` (N,); without opacities."""
     offset = b.means - a.means
     spread = torch.stack([offset[i] * offset[j] for i, j in ENTRIES])
     return _Mixture(
