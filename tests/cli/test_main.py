@@ -110,6 +110,14 @@ def test_help_and_invalid_flags_import_neither_torch_nor_other_subcommands():
         assert not {"torch", "numpy", "PIL"} & imported
 
 
+@pytest.mark.slow
+def test_the_help_of_no_subcommand_imports_torch():
+    names = list(module.SUBCOMMANDS)
+    for name, imported in zip(names, imported_by(*([n, "--help"] for n in names)), strict=True):
+        assert module.SUBCOMMANDS[name].module in imported
+        assert not {"torch", "numpy", "PIL"} & imported, name
+
+
 def test_info_describes_each_kind_of_file_and_folder_without_torch(tmp_path):
     scenes = [
         tmp_path / f"scene{suffix}"

@@ -1,4 +1,7 @@
-"""`Compute`: the device, the number of threads, and whether sums on a GPU have a fixed order."""
+"""`Compute`: the device, the number of threads, and whether sums on a GPU have a fixed order.
+
+The flags of `train` use this module: torch is imported in the functions that need it.
+"""
 
 from __future__ import annotations
 

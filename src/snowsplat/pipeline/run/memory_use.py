@@ -1,4 +1,7 @@
-"""`MemoryUse`: the memory plan of a training run, and its peak memory so far."""
+"""`MemoryUse`: the memory plan of a training run, and its peak memory so far.
+
+The flags of `train` use this module: torch is imported in the functions that need it.
+"""
 
 from __future__ import annotations
 

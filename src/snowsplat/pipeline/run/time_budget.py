@@ -1,4 +1,7 @@
-"""`TimeBudget`: the time that a training run may take, and the time that is left."""
+"""`TimeBudget`: the time that a training run may take, and the time that is left.
+
+The flags of `train` use this module: torch is imported in the functions that need it.
+"""
 
 from __future__ import annotations
 
