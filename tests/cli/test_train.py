@@ -21,8 +21,8 @@ from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.run.training_run import TrainingRun
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.recipes import RECIPES, recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.recipes import RECIPES, recipe
 
 QUICK = ("--iterations", 30, "--threads", 1)
 

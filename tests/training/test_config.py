@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from snowsplat.training.core.config import TrainConfig, changed, config_from_json, config_to_json
-from snowsplat.training.core.recipes import RECIPES, recipe
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.density import McmcDensity
+from snowsplat.training.settings import TrainConfig, changed, config_from_json, config_to_json
+from snowsplat.training.settings.recipes import RECIPES, recipe
 from snowsplat.util.errors import SettingError, UserError
 
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.recipes import recipe
-from snowsplat.training.parts.decay import INTERVAL, Decay, DecayRates
+from snowsplat.training.parts.decay import INTERVAL, Decay
+from snowsplat.training.settings.rates import DecayRates
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import SettingError
 
 from .stage import stage

@@ -12,9 +12,9 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.near_limit import INTERVAL, NearLimit, nearest_depth, unseen_cameras
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import SettingError
 
 from .stage import stage

@@ -9,9 +9,9 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.parts import scale_limit
 from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit, distances_to_cameras
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import SettingError
 
 from .stage import stage

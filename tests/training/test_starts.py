@@ -17,7 +17,7 @@ from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, transform_points
-from snowsplat.training.core.config import TrainConfig, changed
+from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts import carved_points, random_points
 from snowsplat.training.starts.init import initial_count, initial_gaussians, starts_at_random
 from snowsplat.util.errors import SettingError

@@ -18,7 +18,7 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.core.config import TrainConfig, changed
+from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts import swept_points
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.training.starts.fusion import consistent, thinned

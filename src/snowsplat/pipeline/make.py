@@ -17,7 +17,8 @@ from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, des
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import CAPTURE, SCENE, DatasetSettings, OutputFolder
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
-from snowsplat.pipeline.run.time_budget import check_minutes
+from snowsplat.pipeline.run import option
+from snowsplat.training.settings.declare import Settings
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
@@ -53,7 +54,7 @@ _RENDER_SECONDS = 0.3
 
 
 @dataclass(frozen=True)
-class MakeOptions:
+class MakeOptions(Settings):
     """Options of `make`.
 
     Attributes:
@@ -67,17 +68,13 @@ class MakeOptions:
         compute: device and threads.
 
     Raises:
-        UserError: ``minutes`` is not positive.
+        SettingError: a value is invalid.
     """
 
     quality: Quality | None = None
-    minutes: float | None = None
-    memory: int | str | None = None
+    minutes: float | None = option.minutes()
+    memory: int | str | None = option.memory()
     compute: Compute = field(default_factory=Compute)
-
-    def __post_init__(self) -> None:
-        if self.minutes is not None:
-            check_minutes(self.minutes)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
@@ -21,6 +20,7 @@ from snowsplat.training.density.mcmc import (
     McmcDensityControl,
     shared_opacity,
 )
+from snowsplat.training.settings.rates import LearningRates
 from snowsplat.util.errors import SettingError
 
 

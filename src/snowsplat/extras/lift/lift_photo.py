@@ -211,7 +211,7 @@ def _begin(out: OutputFolder, name: str, pixels: Tensor, camera: Camera) -> None
     import torch
 
     from snowsplat.pipeline.output.image_files import to_8bit, write_png
-    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.settings.config import TrainConfig
 
     folder = out.path / PHOTO
     (folder / "images").mkdir(parents=True, exist_ok=True)

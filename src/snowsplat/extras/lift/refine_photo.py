@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from snowsplat.extras.lift.lift import LiftOptions
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.core.config import TrainConfig
     from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.settings.config import TrainConfig
 
 # Share of the largest number of Gaussians that the lifted photo may use. Densification needs the
 # others for what the photo does not show.
@@ -60,8 +60,8 @@ def refine_photo(
     from snowsplat.data import ImageLoader
     from snowsplat.data.depth_alignment import align
     from snowsplat.extras.lift.lift import LiftOptions, lift
-    from snowsplat.training.core.recipes import recipe
     from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.settings.recipes import recipe
 
     options, started = options or LiftOptions(), time.monotonic()
     out = OutputFolder(Path(output))

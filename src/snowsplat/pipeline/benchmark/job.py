@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.claims import claimed
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
@@ -44,7 +43,7 @@ class Job:
     scene: str
     dataset: str
     output: str
-    recipe: Recipe
+    recipe: str
     settings: dict[str, Any] = field(default_factory=dict)
     resolution: int | None = None
     hold_out: int = 8
