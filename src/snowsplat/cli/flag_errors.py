@@ -47,12 +47,12 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         if get_origin(kinds[0]) is tuple:
             kinds = [get_args(kinds[0])[0]]
         elif not texts:
-            return f"{name}: needs a value; use {allowed(hint, declared)}"
+            return f"{spelling}: needs a value; use {allowed(hint, declared)}"
         else:
             texts = texts[:1]
         for text in texts:
             if not any(_is_of(text, each) for each in kinds):
-                return f"{name}: {shown(text)} is not valid; use {allowed(hint, declared)}"
+                return f"{spelling}: {shown(text)} is not valid; use {allowed(hint, declared)}"
     lines = [line.strip(_FRAME) for line in message.splitlines()[1:]]
     end = lines.index("") if "" in lines else len(lines)
     return " ".join(lines[:end]).rstrip(".") or "invalid flags"

@@ -21,7 +21,6 @@ from snowsplat.training.density.mcmc import (
     shared_opacity,
 )
 from snowsplat.training.settings.rates import LearningRates
-from snowsplat.util.errors import SettingError
 
 
 def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
@@ -281,8 +280,3 @@ def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
     (0.02 * leaves.opacities.mean() + 0.03 * leaves.scales.mean()).backward()
     torch.testing.assert_close(gaussians.opacity_logits.grad, leaves.opacity_logits.grad)
     torch.testing.assert_close(gaussians.log_scales.grad, leaves.log_scales.grad)
-
-
-def test_a_limit_is_required():
-    with pytest.raises(SettingError, match="^max_gaussians: MCMC density control needs a limit"):
-        set_up(some_gaussians(3), max_gaussians=0)
