@@ -27,13 +27,13 @@ from snowsplat.ops.cuda.launches import Execute, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
 from snowsplat.training.core.batch import BatchView
-from snowsplat.training.core.config import TrainConfig
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import AdaptiveDensity
 from snowsplat.training.parts.densification import Densification
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.rates import LearningRates
 from snowsplat.util.native_layout import Params
 
 GPU = torch.device("cuda")

@@ -32,11 +32,11 @@ from snowsplat.data.decode import ImageSource
 from snowsplat.pipeline.run import processes
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import project
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.run_state import row_tensors
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.processes.process_shards import ProcessShards
 from snowsplat.training.processes.shards import Shards
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.process_memory import peak_bytes, reset_peak, resident_bytes
 
 #: Number of updates before the measurement, and of measured ones.

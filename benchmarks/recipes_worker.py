@@ -21,7 +21,7 @@ from snowsplat import Dataset, Trainer, UserError, load_dataset, ops, recipe
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.render import project, render
 from snowsplat.training.core.background import FIXED_BACKGROUNDS
-from snowsplat.training.core.config import config_to_json
+from snowsplat.training.settings.stored import config_to_json
 
 #: Share of the views that `sector` holds out.
 SECTOR = 1 / 8

@@ -24,7 +24,7 @@ from typing import Any
 from plot import line_chart
 
 from snowsplat import Dataset, TrainConfig, Trainer, UserError, load_dataset, ops, recipe
-from snowsplat.training.core.recipes import RECIPES
+from snowsplat.training.settings.recipes import RECIPES
 
 
 @dataclass(frozen=True)

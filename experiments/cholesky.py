@@ -35,7 +35,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.sh_constants import SH_C0
-from snowsplat.training.core.recipes import recipe
+from snowsplat.training.settings.recipes import recipe
 
 DOWNSCALE = 4
 NEAR = 0.2

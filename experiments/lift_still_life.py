@@ -40,8 +40,8 @@ from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, phone_lens, photograph, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.recipes import recipe
 
 RESULTS = Path(__file__).with_suffix(".json")
 WIDTH, HEIGHT = 512, 384

@@ -21,9 +21,9 @@ def import_all() -> None:
     import snowsplat.sfm.undistort
     import snowsplat.training.budgets.time_plan
     import snowsplat.training.core.checkpoint
-    import snowsplat.training.core.recipes
     import snowsplat.training.core.trainer
     import snowsplat.training.report
+    import snowsplat.training.settings.recipes
     import snowsplat.viewer.web.scene
     import snowsplat.viewer.web.server
 

@@ -40,8 +40,8 @@ from snowsplat.evaluation.metrics import psnr
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.scene.render import render
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.recipes import recipe
 
 #: Number of photos whose poses are found together with the first depths.
 START = 5

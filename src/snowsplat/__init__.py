@@ -52,10 +52,10 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.videos import VideoOptions, render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.core.config import TrainConfig, parts_of
-    from snowsplat.training.core.recipes import recipe
     from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.part import Part
+    from snowsplat.training.settings.config import TrainConfig, parts_of
+    from snowsplat.training.settings.recipes import recipe
     from snowsplat.util.errors import UserError
 
 
@@ -74,7 +74,7 @@ _MODULES = {
     "Observer": "pipeline.observer",
     "Part": "training.parts.part",
     "Points": "data",
-    "TrainConfig": "training.core.config",
+    "TrainConfig": "training.settings.config",
     "TrainOptions": "pipeline.train",
     "Trainer": "training.core.trainer",
     "TrainingStopped": "pipeline.run.train_result",
@@ -98,12 +98,12 @@ _MODULES = {
     "PlanOptions": "pipeline.blocks.plan",
     "PublishOptions": "pipeline.publish",
     "merge_blocks": "pipeline.blocks.merge",
-    "parts_of": "training.core.config",
+    "parts_of": "training.settings.config",
     "plan_blocks": "pipeline.blocks.plan",
     "train_blocks": "pipeline.blocks.train",
     "publish": "pipeline.publish",
     "read_gaussians": "formats",
-    "recipe": "training.core.recipes",
+    "recipe": "training.settings.recipes",
     "refine_photo": "extras.lift.refine_photo",
     "render_images": "pipeline.render",
     "render_video": "pipeline.videos",

@@ -216,7 +216,7 @@ def test_output_folders_with_other_files(refused, dataset, tmp_path):
     [
         ([], "needs photos"),
         (["absent"], "absent"),
-        (["PHOTOS", "--minutes", 0], "--minutes: 0 is not"),
+        (["PHOTOS", "--minutes", 0], "--minutes: 0.0 is too small"),
         (["PHOTOS", "--threads", 0], "--threads: 0 is too small"),
     ],
 )

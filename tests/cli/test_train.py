@@ -9,20 +9,19 @@ import time
 import weakref
 from dataclasses import fields
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
-from snowsplat.cli.config_flags import ConfigFlags
+from snowsplat.cli.config_flags import SETTINGS, ConfigFlags
 from snowsplat.cli.train import Train
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.run.training_run import TrainingRun
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.recipes import RECIPES, recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.names import setting_names
+from snowsplat.training.settings.recipes import recipe
 
 QUICK = ("--iterations", 30, "--threads", 1)
 
@@ -113,14 +112,11 @@ def test_the_reference_spelling_of_flags(run, dataset, tmp_path):
 
 def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
     flags = {field.name for field in fields(Train)}
-    settings = [field.name for field in fields(ConfigFlags)]
-    assert len(settings) >= 23
+    settings = [name for name, _, _ in SETTINGS]
+    assert len(settings) >= 35
     for name in settings:
         assert name in flags
-        value: object = (5,) if name == "test_iterations" else 1
-        value = {"background": "white", "init": "random", "transients": "on"}.get(name, value)
-        recipe("default", **{name: value})
-    assert list(RECIPES) == list(get_args(Recipe))
+        assert name in setting_names(recipe("default"))
 
 
 @pytest.mark.parametrize("name", ["abs_grad", "stop_overfitting"])

@@ -46,8 +46,8 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.history import History
+from snowsplat.training.settings.config import TrainConfig
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 
@@ -418,7 +418,7 @@ def _make_cfg_args(folder: Path) -> None:
 
 
 def _make_checkpoint(folder: Path) -> None:
-    from snowsplat.training.core.config import config_to_json
+    from snowsplat.training.settings.stored import config_to_json
 
     tensors = {"means": torch.rand(7, 3), "order": torch.arange(5), "none": torch.zeros(0, 3)}
     meta = {

@@ -9,11 +9,11 @@ from snowsplat import Gaussians
 from snowsplat.ops import reference
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.density.adaptive import RESET_OPACITY, SPLIT_SHRINK, AdaptiveDensity
 from snowsplat.training.density.mcmc import McmcDensity
+from snowsplat.training.settings.rates import LearningRates
 
 
 def gaussians(log_scales: list[float], opacities: list[float]) -> Gaussians:

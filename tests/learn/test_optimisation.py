@@ -7,8 +7,8 @@ import torch
 
 from snowsplat import Gaussians, Points, TrainConfig
 from snowsplat.ops import reference
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.rates import LearningRates
 
 
 def test_the_table_of_parameters():

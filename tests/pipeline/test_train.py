@@ -260,7 +260,7 @@ def test_a_time_budget_does_not_lengthen_a_training_that_ends_early(dataset, tmp
 def test_options_that_contradict_each_other():
     with pytest.raises(UserError, match="`minutes` and `iterations` cannot be combined"):
         options(5, minutes=1.0)
-    with pytest.raises(SettingError, match="^minutes: 0 is not"):
+    with pytest.raises(SettingError, match="^minutes: 0.0 is too small"):
         TrainOptions(minutes=0.0)
 
 

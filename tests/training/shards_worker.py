@@ -17,9 +17,9 @@ import torch
 from snowsplat import ops
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.run.processes import joined
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.processes.process_shards import ProcessShards
+from snowsplat.training.settings.recipes import recipe
 
 
 def main(dataset: str, output: str, runs: str) -> None:

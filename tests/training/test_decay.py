@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.recipes import recipe
-from snowsplat.training.parts.decay import INTERVAL, Decay, DecayRates
-from snowsplat.util.errors import SettingError
+from snowsplat.training.parts.decay import INTERVAL, Decay
+from snowsplat.training.settings.rates import DecayRates
 
 from .stage import stage
 
@@ -72,9 +71,3 @@ def test_without_rates_nothing_changes():
     Decay(DecayRates()).between(stage(gaussians, INTERVAL, views=10))
     for name, tensor in scene().parameters().items():
         assert torch.equal(gaussians.parameters()[name], tensor)
-
-
-@pytest.mark.parametrize("name", ["decay_opacity", "decay_scale"])
-def test_a_negative_rate_is_rejected(name):
-    with pytest.raises(SettingError, match=f"^{name}: -1 is not valid; use e.g. 0.04"):
-        recipe("default", **{name: -1.0})

@@ -18,7 +18,7 @@ from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, transform_points
-from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.starts import depth_points
 from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.util.errors import SettingError, UserError

@@ -26,12 +26,12 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.batch import BatchView
 from snowsplat.training.core.losses import view_loss
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.exposure_start import GAMMA, exposure_start, log_gains
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.processes.shards import ALONE
+from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage
 

@@ -15,7 +15,7 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
-from snowsplat.training.core.config import TrainConfig, changed
+from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts.init import initial_gaussians
 
 CONFIG = TrainConfig(sh_degree=1, initial_opacity=0.2, initial_scale=0.5, initial_points=70)

@@ -16,12 +16,11 @@ from snowsplat.training.budgets.memory_budget import (
     CPU,
     GPU,
     _SceneCost,
-    format_bytes,
-    parse_bytes,
     plan_memory,
 )
-from snowsplat.training.core.config import changed
-from snowsplat.training.core.recipes import recipe
+from snowsplat.training.settings import changed
+from snowsplat.training.settings.recipes import recipe
+from snowsplat.util.byte_size import format_bytes, parse_bytes
 from snowsplat.util.errors import SettingError
 
 DEVICE = torch.device("cpu")

@@ -1,8 +1,5 @@
 """The limit of Gaussians near the cameras."""
 
-import math
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import Tensor
@@ -12,10 +9,9 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.near_limit import INTERVAL, NearLimit, nearest_depth, unseen_cameras
-from snowsplat.util.errors import SettingError
+from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage
 
@@ -116,9 +112,3 @@ def test_recipes():
     assert recipe("default").near_limit == 0.6
     for name in ("classic", "paper", "mcmc", "mcmc-short"):
         assert recipe(name).near_limit == 0.0
-
-
-@pytest.mark.parametrize("share", [-0.1, math.inf, math.nan])
-def test_invalid_shares(share):
-    with pytest.raises(SettingError, match="near_limit"):
-        replace(recipe("default"), near_limit=share)

@@ -12,8 +12,6 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.config import TrainConfig
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts import overfitting
@@ -24,6 +22,8 @@ from snowsplat.training.parts.overfitting import (
     estimated_psnr,
     unseen_views,
 )
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
 
 from .stage import stage

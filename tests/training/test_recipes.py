@@ -2,10 +2,10 @@
 
 import pytest
 
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
-from snowsplat.training.parts.decay import DecayRates
+from snowsplat.training.settings.rates import DecayRates
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import SettingError
 
 
@@ -50,7 +50,7 @@ def test_the_other_recipes_neither_anneal_nor_decay(name):
 def test_an_unknown_recipe_is_rejected():
     with pytest.raises(
         SettingError,
-        match="^recipe: 'fast' does not exist; use one of default, classic, paper, mcmc",
+        match="^recipe: 'fast' is unknown; use one of default, classic, paper, mcmc",
     ):
         recipe("fast")
 

@@ -1,18 +1,15 @@
 """The limit of scales by the distance to the cameras."""
 
 import math
-from dataclasses import replace
 
-import pytest
 import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.parts import scale_limit
 from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit, distances_to_cameras
-from snowsplat.util.errors import SettingError
+from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage
 
@@ -70,9 +67,3 @@ def test_recipes():
     assert recipe("default").relative_scale == 0.3
     for name in ("classic", "paper", "mcmc", "mcmc-short"):
         assert recipe(name).relative_scale == 0.0
-
-
-@pytest.mark.parametrize("ratio", [-0.1, math.inf, math.nan])
-def test_invalid_ratios(ratio):
-    with pytest.raises(SettingError, match="relative_scale"):
-        replace(recipe("default"), relative_scale=ratio)

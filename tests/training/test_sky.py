@@ -17,8 +17,6 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.core.config import changed
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.direction_cells import (
     ANGLE,
@@ -30,6 +28,8 @@ from snowsplat.training.parts.direction_cells import (
 )
 from snowsplat.training.parts.found_sky import find_sky, sky_distance
 from snowsplat.training.parts.sky import INTERVAL, SkyPart
+from snowsplat.training.settings import changed
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.starts.init import initial_count
 
 from .stage import stage

@@ -17,10 +17,9 @@ from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, transform_points
-from snowsplat.training.core.config import TrainConfig, changed
+from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts import carved_points, random_points
 from snowsplat.training.starts.init import initial_count, initial_gaussians, starts_at_random
-from snowsplat.util.errors import SettingError
 
 SIZE = 64
 RADIUS = 1.0
@@ -162,15 +161,3 @@ def test_starts_are_joined(sphere: Dataset) -> None:
     assert starts_at_random(dataset, replace(config, init="random"))
     assert starts_at_random(replace(dataset, points=None), config)
     assert initial_count(replace(dataset, points=None), replace(config, init="points")) == 50
-
-
-@pytest.mark.parametrize("init", ["", "cloud", "points+", "points,sweep"])
-def test_unknown_starts(init: str) -> None:
-    with pytest.raises(SettingError, match="points, random, carve, depth, sweep"):
-        TrainConfig(init=init)
-
-
-@pytest.mark.parametrize("value", [0, -3, 0.0, 1.5, math.nan])
-def test_unusable_numbers_of_points(value: float) -> None:
-    with pytest.raises(SettingError, match=r"20000 or 0\.4"):
-        TrainConfig(initial_points=value)

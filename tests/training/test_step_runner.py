@@ -17,11 +17,11 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
+from snowsplat.training.settings.rates import LearningRates
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(3, 4).double())
 VIEW = View("a.png", CAMERA, ImageSource(Path("a.png"), 8, 6))

@@ -18,7 +18,7 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.core.config import TrainConfig, changed
+from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts import swept_points
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.training.starts.fusion import consistent, thinned
@@ -246,8 +246,6 @@ def test_the_result_does_not_depend_on_the_number_of_threads(dataset: Dataset) -
 
 
 def test_dense_points_need_a_limit(dataset: Dataset) -> None:
-    config = changed(TrainConfig(), max_gaussians=0, init="points+sweep", initial_points=0.4)
+    config = changed(TrainConfig(), init="points", initial_points=0.4)
     with pytest.raises(SettingError, match="max_gaussians"):
-        initialised(dataset, config)
-    with pytest.raises(SettingError, match="share"):
-        changed(TrainConfig(), initial_points=2.0)
+        initialised(replace(dataset, points=None), config)

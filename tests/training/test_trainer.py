@@ -21,16 +21,15 @@ from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.background import Background
-from snowsplat.training.core.config import TrainConfig, changed
 from snowsplat.training.core.losses import view_loss
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
-from snowsplat.training.parts.decay import DecayRates
 from snowsplat.training.parts.densification import Densification
-from snowsplat.training.starts import STARTS
+from snowsplat.training.settings import TrainConfig, changed
+from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.training.settings.starts import STARTS
 from snowsplat.util.errors import UserError
 
 WIDTH, HEIGHT, COUNT = 24, 20, 40

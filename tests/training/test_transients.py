@@ -21,7 +21,7 @@ from snowsplat.training.parts.densification import delayed
 from snowsplat.training.parts.transients import MOMENTS, Transients, cells_that_move
 from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
 from snowsplat.training.starts.depth_map import DepthMap
-from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.errors import UserError
 
 COUNT, WIDTH, HEIGHT = 36, 128, 96
 #: The photos with something in front of the camera, and where: left, upper, right, lower edge.
@@ -332,8 +332,3 @@ def test_growth_waits_for_the_masks():
         assert delayed(recipe(name).density).densify_from == MOMENTS[1]
     later = replace(recipe("default").density, densify_from=0.4)
     assert delayed(later) is later
-
-
-def test_an_unknown_value():
-    with pytest.raises(SettingError, match="auto, on or off"):
-        recipe("default", transients="maybe")

@@ -12,10 +12,10 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.config import TrainConfig
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.unexplained import Unexplained, fitted, standing_out
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
 
 COUNT = 24

@@ -15,8 +15,8 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.demo import demo
 from snowsplat.scene.render import render
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.recipes import recipe
 
 BUILD = Path(__file__).resolve().parents[3] / "build" / "learn"
 VIEW = "IMG_0013.jpg"  # the photo that the figures show

@@ -16,9 +16,9 @@ from snowsplat import Gaussians
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.demo import demo
 from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.densification import Densification
+from snowsplat.training.settings.recipes import recipe
 
 STEPS = 4000
 SNAPSHOTS = (0, 200, 500, 600, 1000, 1010, 1500, 2500, 4000)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import tyro
 
+from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
 from snowsplat.cli.flags import flag
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.errors import UserError
 
 
@@ -42,13 +42,11 @@ class Benchmark:
     """The benchmark suite."""
     scenes: Annotated[tuple[str, ...], flag("[NAME ...]", default="all")] = ()
     """Only these scenes."""
-    recipe: Annotated[Recipe, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")] = (
-        "default"
-    )
+    recipe: Annotated[RecipeName, RECIPE_FLAG] = "default"
     """The recipe of the training."""
-    iterations: Annotated[int | None, flag("N", default="set by the recipe")] = None
+    iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Number of training steps."""
-    max_gaussians: Annotated[int | None, flag("N", default="set by the recipe")] = None
+    max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
     """Maximum number of Gaussians; 0: no limit."""
     resolution: Annotated[int | None, flag("N", "-r", default="set by the suite")] = None
     """1, 2, 4 or 8: divide the size of the photos by this number; another number: the width."""

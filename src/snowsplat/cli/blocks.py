@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from snowsplat.cli.config_flags import RECIPE
+from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.util.errors import UserError
 
 # The flags of each action; the others have no effect and are rejected.
@@ -71,9 +70,7 @@ class Blocks:
     margin: Annotated[float | None, flag("F", default="0.2")] = None
     """plan: a block is trained with the photos and points of its cell, expanded on each side by
     this share of its size."""
-    recipe: Annotated[
-        Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
-    ] = None
+    recipe: Annotated[RecipeName | None, RECIPE_FLAG] = None
     """plan: the recipe of the training, see snowsplat train."""
     iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
     """plan: number of training steps of each block."""

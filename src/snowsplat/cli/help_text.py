@@ -27,7 +27,7 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     """Name of a field -> the string below it in the source of the class, on one line."""
     try:
         source = inspect.getsource(kind)
-    except OSError:  # installed without sources: flags have no help text
+    except (OSError, TypeError):  # no sources: installed without them, or made at run time
         return {}
     (definition,) = ast.parse(textwrap.dedent(source)).body
     assert isinstance(definition, ast.ClassDef)

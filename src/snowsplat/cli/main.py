@@ -7,11 +7,13 @@ it. Any other failure is a defect of the program and shows a traceback.
 
 import difflib
 import inspect
+import io
 import logging
 import os
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import make_dataclass
 from typing import Annotated, Any, Union
 
@@ -63,23 +65,33 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parse(arguments: Sequence[str]) -> Any:
     """Parse the arguments into the dataclass of their subcommand.
 
-    Exits the process, as argparse does, after printing a help text or an error in the flags.
+    Exits the process, as argparse does, after printing a help text.
 
     Raises:
-        UserError: an unknown subcommand.
+        UserError: an unknown subcommand, or invalid flags.
     """
     name, *rest = arguments
     name = _FORMER_NAMES.get(name, name)
     if name not in SUBCOMMANDS and not name.startswith("-"):
         raise UserError(_unknown_subcommand(name))
     union: Any = Union[tuple(_choices(name))]  # noqa: UP007 (made at run time)
-    return tyro.cli(
-        union,
-        prog="snowsplat",
-        description=description(),
-        args=[name, *rest],
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    printed = io.StringIO()
+    try:
+        with redirect_stderr(printed):
+            return tyro.cli(
+                union,
+                prog="snowsplat",
+                description=description(),
+                args=[name, *rest],
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as ended:
+        if name.startswith("-") or not ended.code:
+            sys.stderr.write(printed.getvalue())
+            raise
+        from snowsplat.cli.flag_errors import explained
+
+        raise UserError(explained(load_subcommand(name), rest, printed.getvalue())) from None
 
 
 def _choices(called: str) -> list[Any]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import tyro
 
-from snowsplat.cli.config_flags import RECIPE, ConfigFlags
+from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, ConfigFlags, RecipeName
 from snowsplat.cli.flags import flag, switch
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.pipeline.train import TrainOptions
 from snowsplat.util.errors import UserError
 
@@ -26,9 +25,7 @@ class JobFlags:
     output: Annotated[Path | None, flag("OUT", "-o", "-m", "--model-path")] = None
     """Output folder. It is created if it does not exist."""
 
-    recipe: Annotated[
-        Recipe | None, flag(f"{{{','.join(get_args(Recipe))}}}", default="default")
-    ] = None
+    recipe: Annotated[RecipeName | None, RECIPE_FLAG] = None
     """Named configuration, which determines the defaults of the other settings. default: 2000
     steps, designed for CPUs; classic: the default recipe of version 0.1; paper: the 30,000 steps of
     the paper; mcmc: 30,000 steps with a fixed maximum number of Gaussians; mcmc-short: the same in
@@ -51,11 +48,6 @@ class JobFlags:
     """The same as --background white."""
     feature_lr: Annotated[float | None, flag("F", default=RECIPE)] = None
     """Set --lr-sh-dc to F and --lr-sh-rest to F/20, as in the reference implementation."""
-
-    refine_poses: Annotated[bool, switch()] = False
-    """Optimise the poses and focal lengths of the photos together with the scene, if they are not
-    exact. The refined cameras are written to OUT/cameras.json and, as a COLMAP model, to
-    OUT/refined/sparse/0."""
 
     view: Annotated[bool, switch()] = False
     """Show the training in the browser: the scene, curves of loss and PSNR, and a button to pause.
@@ -121,8 +113,6 @@ class TrainFlags(ConfigFlags, JobFlags):
 
     def _settings(self) -> dict[str, Any]:
         settings = self.config_settings()
-        if self.refine_poses:
-            settings["refine_poses"] = True
         if self.white_background and settings.setdefault("background", "white") != "white":
             raise UserError("-w and --background set different colours; use one of them")
         if self.feature_lr is not None:

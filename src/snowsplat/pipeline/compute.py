@@ -7,21 +7,24 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.run import processes
-from snowsplat.util.errors import SettingError
+from snowsplat.training.settings.declare import Settings, setting
 
 if TYPE_CHECKING:
     import torch
 
 logger = logging.getLogger(__name__)
 
+_DEVICE = re.compile(r"(cpu|cuda)(:\d+)?")
+
 
 @dataclass(frozen=True)
-class Compute:
+class Compute(Settings):
     """The device and the number of threads for a computation.
 
     Attributes:
@@ -33,16 +36,17 @@ class Compute:
             bit-identical.
 
     Raises:
-        UserError: fewer than 1 thread.
+        SettingError: an unknown device, or fewer than 1 thread.
     """
 
-    device: str | None = None
-    threads: int | None = None
+    device: str | None = setting(
+        None,
+        "Device for the computation.",
+        allowed="cpu, cuda or cuda:1",
+        check=lambda device: None if _DEVICE.fullmatch(device) else "is unknown",
+    )
+    threads: int | None = setting(None, "Number of CPU threads.", least=1)
     deterministic: bool = False
-
-    def __post_init__(self) -> None:
-        if self.threads is not None and self.threads < 1:
-            raise SettingError("threads", f"{self.threads} is too small; use at least 1")
 
     def apply(self) -> torch.device:
         """Apply these settings to the process; returns the device.

@@ -26,8 +26,8 @@ from snowsplat.pipeline.output.output_folder import (
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
 from snowsplat.pipeline.render import render_images
+from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.time_budget import check_minutes
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.sfm.colmap import SfmOptions
 from snowsplat.sfm.cost import measure_speed
@@ -38,6 +38,7 @@ from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
+from snowsplat.training.settings.declare import Settings
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
@@ -68,7 +69,7 @@ _RENDER_SECONDS = 0.3
 
 
 @dataclass(frozen=True)
-class MakeOptions:
+class MakeOptions(Settings):
     """Options of `make`.
 
     Attributes:
@@ -82,17 +83,13 @@ class MakeOptions:
         compute: device and threads.
 
     Raises:
-        UserError: ``minutes`` is not positive.
+        SettingError: a value is invalid.
     """
 
     quality: Quality | None = None
-    minutes: float | None = None
-    memory: int | str | None = None
+    minutes: float | None = option.minutes()
+    memory: int | str | None = option.memory()
     compute: Compute = field(default_factory=Compute)
-
-    def __post_init__(self) -> None:
-        if self.minutes is not None:
-            check_minutes(self.minutes)
 
 
 @dataclass(frozen=True)

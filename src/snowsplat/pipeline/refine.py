@@ -11,8 +11,8 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings
 from snowsplat.pipeline.output.scene_paths import folder_around
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.distillation import MERGED_RATES
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.recipes import recipe
 
 # See docs/performance.md.
 _STEPS = 600

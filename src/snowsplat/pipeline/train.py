@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, Any
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.run import option
+from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.memory_use import MemoryUse
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
-from snowsplat.pipeline.run.time_budget import TimeBudget, check_minutes
+from snowsplat.pipeline.run.time_budget import TimeBudget
+from snowsplat.training.settings.declare import Settings, setting
+from snowsplat.training.settings.names import changed
+from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 
@@ -25,19 +30,19 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.live_page import LivePage
     from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.training.core.checkpoint import Checkpoint
-    from snowsplat.training.core.config import TrainConfig
     from snowsplat.training.core.run import Loss
     from snowsplat.training.core.step_schedule import Schedule
     from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
+    from snowsplat.training.settings.config import TrainConfig
 
 # Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 
 @dataclass(frozen=True)
-class TrainOptions:
+class TrainOptions(Settings):
     """Options of the training. None selects the value of the recipe or, in `resume`, that of the
     checkpoint.
 
@@ -46,7 +51,7 @@ class TrainOptions:
     Attributes:
         recipe: name of the recipe, which defines the defaults of all settings.
         settings: names and values of changed settings, see
-            `snowsplat.training.core.config.changed`.
+            `snowsplat.training.settings.names.changed`.
         images: name of the folder of photos in the dataset; default: "images".
         resolution: 1, 2, 4 or 8: divide width and height of the photos by this number; any other
             number: the new width in pixels; default: unchanged.
@@ -65,27 +70,25 @@ class TrainOptions:
         compute: device, threads, determinism.
 
     Raises:
-        UserError: ``minutes`` is not positive, or given together with iterations.
+        UserError: a value is invalid, or ``minutes`` is given together with iterations.
     """
 
-    recipe: Recipe | None = None
+    recipe: str | None = option.recipe()
     settings: Mapping[str, Any] = field(default_factory=dict)
     images: str | None = None
-    resolution: int | None = None
-    hold_out: int | None = None
+    resolution: int | None = option.resolution()
+    hold_out: int | None = option.hold_out()
     test_list: Path | None = None
-    minutes: float | None = None
-    memory: int | str | None = None
-    save_iterations: tuple[int, ...] = ()
-    checkpoint_seconds: float | None = None
+    minutes: float | None = option.minutes()
+    memory: int | str | None = option.memory()
+    save_iterations: tuple[int, ...] = setting((), "Steps after which to save.", least=-1)
+    checkpoint_seconds: float | None = setting(None, "Time between checkpoints.", least=0.0)
     compute: Compute = field(default_factory=Compute)
 
     def __post_init__(self) -> None:
-        if self.minutes is None:
-            return
-        if self.iterations is not None:
+        super().__post_init__()
+        if self.minutes is not None and self.iterations is not None:
             raise UserError("`minutes` and `iterations` cannot be combined; set one of them")
-        check_minutes(self.minutes)
 
     @property
     def iterations(self) -> int | None:
@@ -143,6 +146,7 @@ def train(
     """
     started = time.monotonic()
     options = options or TrainOptions()
+    recipe(options.recipe or "default", **options.settings)  # reports an invalid setting first
     out = OutputFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
     job = _Job(out, options, observer, page, started, parts, loss)
@@ -230,8 +234,6 @@ class _Job:
         self.memory_before = resident_bytes()
 
     def train(self, path: Path | str) -> TrainResult:
-        from snowsplat.training.core.recipes import recipe
-
         options = self.options
         budget = TimeBudget.for_run(options.minutes, None, self.started)
         settings = options.dataset_settings(path)
@@ -296,8 +298,8 @@ class _Job:
         schedule: Schedule | None = None,
         state: dict[str, Tensor] | None = None,
     ) -> Trainer:
-        from snowsplat.training.core.config import parts_of
         from snowsplat.training.core.trainer import Trainer
+        from snowsplat.training.settings.config import parts_of
 
         return Trainer(
             dataset,
@@ -319,7 +321,7 @@ class _Job:
     def _run(
         self,
         settings: DatasetSettings,
-        recipe: Recipe,
+        recipe: str,
         trainer: Trainer,
         budget: TimeBudget | None,
         time_ratio: float,
@@ -386,8 +388,6 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
 
     Raises UserError if another setting has changed.
     """
-    from snowsplat.training.core.config import changed, config_from_json
-
     config = config_from_json(meta.training)
     if options.recipe not in (None, meta.recipe):
         raise UserError(

@@ -10,7 +10,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
@@ -21,6 +20,7 @@ from snowsplat.training.density.adaptive import (
     AdaptiveDensity,
     AdaptiveDensityControl,
 )
+from snowsplat.training.settings.rates import LearningRates
 
 EXTENT = 10.0  # with percent_dense = 0.01: scales up to 0.1 are cloned, larger ones split
 #: φ of section 5.2. It is not imported, so that the tests detect a changed value.

@@ -11,7 +11,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
@@ -21,7 +20,7 @@ from snowsplat.training.density.mcmc import (
     McmcDensityControl,
     shared_opacity,
 )
-from snowsplat.util.errors import SettingError
+from snowsplat.training.settings.rates import LearningRates
 
 
 def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
@@ -281,8 +280,3 @@ def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
     (0.02 * leaves.opacities.mean() + 0.03 * leaves.scales.mean()).backward()
     torch.testing.assert_close(gaussians.opacity_logits.grad, leaves.opacity_logits.grad)
     torch.testing.assert_close(gaussians.log_scales.grad, leaves.log_scales.grad)
-
-
-def test_a_limit_is_required():
-    with pytest.raises(SettingError, match="^max_gaussians: MCMC density control needs a limit"):
-        set_up(some_gaussians(3), max_gaussians=0)

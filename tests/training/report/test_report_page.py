@@ -10,10 +10,10 @@ import pytest
 
 from snowsplat.data import load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.report import Trained, write_training_report
+from snowsplat.training.settings.config import TrainConfig
 
 pytestmark = pytest.mark.slow  # trains
 

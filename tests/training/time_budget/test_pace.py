@@ -6,9 +6,9 @@ import pytest
 
 from snowsplat.training.budgets.pace import Pace
 from snowsplat.training.budgets.step_cost import StepCost, Work
-from snowsplat.training.core.config import TrainConfig
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.recipes import recipe
 
 PIXELS, FINAL, VIEWS = 500_000.0, 120_000, 6
 

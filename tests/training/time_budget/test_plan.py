@@ -15,9 +15,9 @@ from snowsplat.scene.camera import Camera
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.budgets import time_plan as planning
 from snowsplat.training.budgets.time_plan import Plan, make_plan, measure_time_ratio
-from snowsplat.training.core.config import changed
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings import changed
+from snowsplat.training.settings.recipes import recipe
 
 POSE = torch.eye(4, dtype=torch.float64)[:3]
 

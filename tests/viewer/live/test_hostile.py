@@ -16,8 +16,8 @@ from viser.infra._async_message_buffer import AsyncMessageBuffer
 from snowsplat import ops
 from snowsplat.data import Dataset, load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.config import TrainConfig
 from snowsplat.viewer.live import guard
 from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.guard import call_in_server_thread

@@ -26,7 +26,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
-from snowsplat.training.core.config import TrainConfig
+from snowsplat.training.settings.config import TrainConfig
 from snowsplat.trajectory.swing import swing_path
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError

@@ -16,9 +16,9 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
-from snowsplat.training.core.config import TrainConfig
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
 
 # Share of the largest number of Gaussians that the lifted photo may use. Densification needs the

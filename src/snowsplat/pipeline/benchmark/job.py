@@ -26,7 +26,6 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.scene.render import render
 from snowsplat.util.claims import claimed
@@ -55,7 +54,7 @@ class Job:
     scene: str
     dataset: str
     output: str
-    recipe: Recipe
+    recipe: str
     settings: dict[str, Any] = field(default_factory=dict)
     resolution: int | None = None
     hold_out: int = 8

@@ -15,12 +15,14 @@ from snowsplat.data.transforms_json import find_transforms
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
+from snowsplat.pipeline.run import option
+from snowsplat.training.settings.declare import Settings, setting
+from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
 
 
 @dataclass(frozen=True)
-class BenchmarkOptions:
+class BenchmarkOptions(Settings):
     """Options of a benchmark.
 
     Attributes:
@@ -40,18 +42,18 @@ class BenchmarkOptions:
 
     suite: str | None = None
     scenes: tuple[str, ...] = ()
-    recipe: Recipe = "default"
+    recipe: str = setting("default", "Name of the recipe.", check=check_recipe)
     settings: dict[str, Any] = field(default_factory=dict)
-    resolution: int | None = None
+    resolution: int | None = option.resolution()
     lpips: Path | None = None
-    jobs: int = 1
+    jobs: int = setting(1, "Number of scenes at the same time.", least=1)
     device: str | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.suite is not None and self.suite not in SUITES:
             raise SettingError("suite", f"{self.suite} is unknown; use {', '.join(SUITES)}")
-        if self.jobs < 1:
-            raise SettingError("jobs", f"{self.jobs} is too small; use at least 1")
+        recipe(self.recipe, **self.settings)  # raises an error if a setting is invalid
 
 
 def benchmark(

@@ -21,10 +21,11 @@ from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.pipeline.blocks.cells import Axes, Cell
 from snowsplat.pipeline.blocks.content import block_content
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.run.checkpoint_meta import Recipe
+from snowsplat.pipeline.run import option
 from snowsplat.pipeline.train import TrainOptions
-from snowsplat.training.core.recipes import recipe
 from snowsplat.training.parts.found_sky import sky_distance
+from snowsplat.training.settings.declare import Settings, setting
+from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, read_json
@@ -66,7 +67,7 @@ class Plan:
     """
 
     dataset: DatasetSettings
-    recipe: Recipe
+    recipe: str
     settings: dict[str, Any]
     axes: Axes
     margin: float
@@ -102,7 +103,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class PlanOptions:
+class PlanOptions(Settings):
     """Options of `plan_blocks`. None selects the value of the recipe or of `load_dataset`.
 
     Attributes:
@@ -119,20 +120,14 @@ class PlanOptions:
         UserError: a value out of its range.
     """
 
-    blocks: int = 4
-    margin: float = 0.2
-    recipe: Recipe = "default"
+    blocks: int = setting(4, "Number of blocks.", least=1, most=MOST_BLOCKS)
+    margin: float = setting(0.2, "Share of the size of a cell.", least=0.0, most=10.0)
+    recipe: str = setting("default", "Name of the recipe.", check=check_recipe)
     settings: Mapping[str, Any] = field(default_factory=dict)
     images: str | None = None
-    resolution: int | None = None
-    hold_out: int | None = None
+    resolution: int | None = option.resolution()
+    hold_out: int | None = option.hold_out()
     test_list: Path | None = None
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.blocks <= MOST_BLOCKS:
-            raise SettingError("blocks", f"{self.blocks} is out of range; use 2 or more")
-        if not 0.0 <= self.margin <= 10.0:
-            raise SettingError("margin", f"{self.margin:g} is out of range; use e.g. 0.2")
 
 
 def plan_blocks(

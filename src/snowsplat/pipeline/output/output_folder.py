@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from snowsplat.data import Dataset, DatasetFiles, View
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.scene.gaussians import Gaussians
-    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.settings.config import TrainConfig
 
 #: Folders inside the folder of `make`: the dataset, and the output folder of its training.
 DATASET, SCENE = "dataset", "scene"
@@ -180,7 +180,7 @@ class OutputFolder:
 
     def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:
         """Write `config.json` and `cfg_args`; remove unfinished files of a killed process."""
-        from snowsplat.training.core.config import config_to_json
+        from snowsplat.training.settings.stored import config_to_json
 
         remove_temporaries(self.path, _FILES)
         self._remove_unwritten_scenes()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.output.output_folder import FORMER_DATASET, DatasetSettings
 from snowsplat.training.core.step_schedule import Schedule
@@ -12,9 +12,6 @@ from snowsplat.util.safe_json import from_json
 
 if TYPE_CHECKING:
     from snowsplat.training.core.checkpoint import Checkpoint
-
-#: Names of `training.core.recipes.RECIPES`, without importing torch.
-Recipe = Literal["default", "classic", "paper", "mcmc", "mcmc-short"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class CheckpointMeta:
     """
 
     dataset: DatasetSettings
-    recipe: Recipe
+    recipe: str
     training: dict[str, Any]
     time: dict[str, float] | None = None
     schedule: Schedule | None = None

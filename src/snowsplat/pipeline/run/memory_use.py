@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from snowsplat.data import Dataset
     from snowsplat.training.budgets.memory_budget import MemoryPlan
-    from snowsplat.training.core.config import TrainConfig
+    from snowsplat.training.settings.config import TrainConfig
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class MemoryUse:
             UserError: ``budget`` is not a number of bytes, or is too small.
         """
         from snowsplat.data.image_loader import available_memory
-        from snowsplat.training.budgets.memory_budget import parse_bytes, plan_memory
+        from snowsplat.training.budgets.memory_budget import plan_memory
+        from snowsplat.util.byte_size import parse_bytes
 
         if isinstance(budget, str):
             budget = parse_bytes(budget)

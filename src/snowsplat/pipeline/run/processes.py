@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     import torch
 
     from snowsplat.pipeline.output.output_folder import DatasetSettings
-    from snowsplat.training.core.config import TrainConfig
     from snowsplat.training.core.run import Loss
     from snowsplat.training.core.step_schedule import Schedule
     from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
+    from snowsplat.training.settings.config import TrainConfig
 
 # Process 0 may compute the first Gaussians for a long time, while the others wait.
 _TIMEOUT = timedelta(hours=2)
@@ -120,9 +120,9 @@ def follow(
     """
     from snowsplat.pipeline.run.collective import Collective
     from snowsplat.training.core.checkpoint import load
-    from snowsplat.training.core.config import parts_of
     from snowsplat.training.core.finite import Diverged
     from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.settings.config import parts_of
 
     setup = shards.of_first(None)
     assert isinstance(setup, Setup)

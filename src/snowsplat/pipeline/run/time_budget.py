@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.util.duration import duration
-from snowsplat.util.errors import SettingError
 
 if TYPE_CHECKING:
     import torch
@@ -18,14 +17,8 @@ if TYPE_CHECKING:
     from snowsplat.data import Dataset
     from snowsplat.training.budgets.pace import Pace
     from snowsplat.training.budgets.time_plan import Plan
-    from snowsplat.training.core.config import TrainConfig
     from snowsplat.training.core.trainer import Trainer
-
-
-def check_minutes(minutes: float) -> None:
-    """Raises UserError if ``minutes`` is not a positive, finite number."""
-    if not 0.0 < 60.0 * minutes < float("inf"):
-        raise SettingError("minutes", f"{minutes:g} is not a duration; use a number above 0")
+    from snowsplat.training.settings.config import TrainConfig
 
 
 @dataclass
@@ -54,12 +47,8 @@ class TimeBudget:
 
         Returns:
             None if no time was requested, neither now nor in an earlier run.
-
-        Raises:
-            UserError: not a positive number of minutes.
         """
         if minutes is not None:
-            check_minutes(minutes)
             return cls(60.0 * minutes, 0.0, started)
         return None if before is None else cls(before["seconds"], before["spent"], started)
 

@@ -12,7 +12,7 @@ from PIL.Image import Image
 from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta, Recipe
+from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.collective import Collective
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
@@ -24,7 +24,6 @@ from snowsplat.training.budgets.pace import Pace
 from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.budgets.steps_left import StepsLeft
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.config import config_to_json
 from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.history import History
 from snowsplat.training.core.progress import Progress
@@ -35,6 +34,7 @@ from snowsplat.training.parts.overfitting import OverfittingCheck
 from snowsplat.training.parts.pose_refinement import PoseRefinement
 from snowsplat.training.parts.transients import Transients
 from snowsplat.training.report import Trained, write_training_report
+from snowsplat.training.settings.stored import config_to_json
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import peak_bytes
 
@@ -54,7 +54,7 @@ class TrainingRun:
 
     out: OutputFolder
     settings: DatasetSettings
-    recipe: Recipe
+    recipe: str
     trainer: Trainer
     budget: TimeBudget | None
     pace: Pace | None

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.config import TrainConfig
 
 if TYPE_CHECKING:
     from snowsplat.data import Dataset

@@ -16,10 +16,10 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops import scratch
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.lr_schedule import LearningRates
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.settings.rates import LearningRates
 
 #: β₁ and β₂ for a batch of one view.
 BETAS = (0.9, 0.999)

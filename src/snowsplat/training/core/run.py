@@ -16,7 +16,6 @@ from snowsplat.data.image_loader import ImageLoader, Photos, available_memory
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.background import Background
-from snowsplat.training.core.config import TrainConfig, parts_of
 from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.run_state import load_state, state_tensors
@@ -26,6 +25,7 @@ from snowsplat.training.core.view_queue import ViewQueue
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.sharded_render import sharded_render
 from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.settings.config import TrainConfig, parts_of
 from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded

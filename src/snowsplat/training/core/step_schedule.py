@@ -6,8 +6,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-#: A moment of the training: a step (int), or a fraction of all steps (float).
-When = int | float
+from snowsplat.training.settings.declare import When
 
 
 @dataclass

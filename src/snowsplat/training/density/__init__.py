@@ -1,27 +1,37 @@
 """Density control: adds and removes Gaussians during training.
 
-Each density control is a module with two dataclasses: its settings, and its state. The settings
-are frozen and part of `TrainConfig`. `DensityConfig.control` creates the state, which follows the
-protocol `DensityControl`. The trainer uses only these two dataclasses. `AdaptiveDensity` is the
-density control of the paper, and `McmcDensity` is that of Kheradmand et al. 2024.
+A density control has two dataclasses: its settings, and its state. The settings are frozen and part
+of `TrainConfig`; those of the package are in `snowsplat.training.settings.density`. The method
+`DensityConfig.control` of the settings creates the state, which follows the protocol
+`DensityControl`. The trainer uses only these two dataclasses. `AdaptiveDensity` is the density
+control of the paper, and `McmcDensity` is that of Kheradmand et al. 2024.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol
+from typing import Protocol
 
-import torch
 from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule, When
 from snowsplat.training.core.view_gradient import ViewGradient
-from snowsplat.training.density.adaptive import AdaptiveDensity
-from snowsplat.training.density.mcmc import McmcDensity
-from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.settings.density import (
+    DENSITY_CONTROLS,
+    AdaptiveDensity,
+    DensityConfig,
+    McmcDensity,
+    register_density,
+)
 
-__all__ = ["DENSITY_CONTROLS", "AdaptiveDensity", "DensityConfig", "DensityControl", "McmcDensity"]
+__all__ = [
+    "DENSITY_CONTROLS",
+    "AdaptiveDensity",
+    "DensityConfig",
+    "DensityControl",
+    "McmcDensity",
+    "register_density",
+]
 
 
 class DensityControl(Protocol):
@@ -54,63 +64,3 @@ class DensityControl(Protocol):
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Copy what `state_tensors` returned."""
-
-
-class DensityConfig(Protocol):
-    """The settings of a density control: a dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def max_gaussians(self) -> int:
-        """Maximum number of Gaussians, including the initial ones; 0: no limit."""
-        ...
-
-    @property
-    def abs_grad(self) -> bool:
-        """Whether `DensityControl.after_backward` uses ``gradient.splats.abs_grad``."""
-        ...
-
-    @property
-    def densify_from(self) -> When:
-        """The first step at which Gaussians may be added (float: fraction of all steps)."""
-        ...
-
-    @property
-    def densify_until(self) -> When:
-        """The last step at which Gaussians may be added (float: fraction of all steps)."""
-        ...
-
-    @property
-    def densify_interval(self) -> int:
-        """Number of steps between two densifications."""
-        ...
-
-    def control(
-        self,
-        count: int,
-        *,
-        schedule: Schedule,
-        extent: float,
-        random_init: bool,
-        generator: torch.Generator,
-        device: torch.device | None = None,
-        shards: Shards = ALONE,
-    ) -> DensityControl:
-        """The initial state.
-
-        Args:
-            count: number of Gaussians of this process.
-            extent: extent of the scene, in world units.
-            random_init: whether training starts from random points instead of SfM points.
-            generator: a random generator on the CPU.
-            device: the device of the Gaussians; default: the CPU.
-            shards: the processes of the training.
-        """
-        ...
-
-
-#: The settings class of every density control, by its name. Checkpoints contain this name.
-DENSITY_CONTROLS: dict[str, type[DensityConfig]] = {
-    settings.__name__: settings for settings in (AdaptiveDensity, McmcDensity)
-}

@@ -17,9 +17,10 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.core.finite import check_parameters
 from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule, When
+from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.settings.density import AdaptiveDensity
 
 #: φ of the paper: a split divides the scale by this factor, which was determined by experiments.
 SPLIT_SHRINK = 1.6
@@ -27,78 +28,6 @@ SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
 #: Approximate number of steps that a scene needs to recover from an opacity reset.
 RESET_RECOVERY = 500
-
-
-@dataclass(frozen=True)
-class AdaptiveDensity:
-    """Settings of adaptive density control; the defaults are those of the paper.
-
-    Attributes:
-        densify_from, densify_until: first and last step of densification (float: fraction of all
-            steps).
-        densify_interval: number of steps between two densifications.
-        grad_threshold: τ_pos of the paper: a Gaussian is densified if the norm of its view-space
-            position gradient, averaged over the views, is larger than this value.
-        abs_grad: whether this gradient is the sum of the absolute values of the gradients of the
-            tiles (`Splats2D.abs_grad`) instead of their sum. A large Gaussian in a detailed region
-            is pulled in opposite directions by different pixels. In the sum of the paper, these
-            gradients cancel, and the Gaussian is not split; see AbsGS (Ye et al. 2024). Sums over
-            pixels, as in AbsGS, are larger and need a larger threshold; sums over tiles do not.
-        percent_dense: Gaussians up to this scale, in units of the scene extent, are cloned; larger
-            ones are split.
-        prune_opacity: Gaussians with a lower opacity are removed.
-        prune_world_size: Gaussians with a larger scale, in units of the scene extent, are removed;
-            0 disables this. Use 0 for forward-facing scenes, whose extent is small compared to
-            their depth; otherwise most of the Gaussians would be removed.
-        prune_screen_size: Gaussians with a larger 3σ radius, in pixels, are removed; 0 disables
-            this. Pruning by either size begins after step ``opacity_reset_interval``; if that is 0,
-            Gaussians are never pruned by size.
-        opacity_reset_interval: steps between opacity resets; 0 disables them. The last one is at
-            least 500 steps before densification ends.
-        reset_random_start: whether to reset opacity also at ``densify_from``, if training started
-            from random points and at least 500 steps are left. Most random points lie in empty
-            space, where they get the colour of the background instead of becoming transparent.
-            Without the reset, 100,000 of them can remain as a cloud of that colour.
-        max_gaussians: maximum number of Gaussians; 0: no limit. If it would be exceeded, only the
-            Gaussians with the largest gradients are densified.
-    """
-
-    densify_from: When = 500
-    densify_until: When = 15_000
-    densify_interval: int = 100
-    grad_threshold: float = 2e-4
-    abs_grad: bool = False
-    percent_dense: float = 0.01
-    prune_opacity: float = 0.005
-    prune_world_size: float = 0.1
-    prune_screen_size: float = 20.0
-    opacity_reset_interval: int = 3000
-    reset_random_start: bool = True
-    max_gaussians: int = 0
-
-    def control(
-        self,
-        count: int,
-        *,
-        schedule: Schedule,
-        extent: float,
-        random_init: bool,
-        generator: torch.Generator,
-        device: torch.device | None = None,
-        shards: Shards = ALONE,
-    ) -> AdaptiveDensityControl:
-        """The initial state for ``count`` Gaussians in a scene of ``extent`` world units."""
-        return AdaptiveDensityControl(
-            settings=self,
-            schedule=schedule,
-            first_reset=self.reset_random_start and random_init,
-            extent=extent,
-            generator=generator,
-            grad_sum=torch.zeros(count, device=device),
-            views=torch.zeros(count, device=device),
-            max_radii=torch.zeros(count, device=device),
-            shards=shards,
-        )
 
 
 @dataclass
@@ -123,6 +52,32 @@ class AdaptiveDensityControl:
     views: Tensor
     max_radii: Tensor
     shards: Shards = ALONE
+
+    @classmethod
+    def begin(
+        cls,
+        settings: AdaptiveDensity,
+        count: int,
+        *,
+        schedule: Schedule,
+        extent: float,
+        random_init: bool,
+        generator: torch.Generator,
+        device: torch.device | None = None,
+        shards: Shards = ALONE,
+    ) -> AdaptiveDensityControl:
+        """The initial state; see `DensityConfig.control`."""
+        return cls(
+            settings=settings,
+            schedule=schedule,
+            first_reset=settings.reset_random_start and random_init,
+            extent=extent,
+            generator=generator,
+            grad_sum=torch.zeros(count, device=device),
+            views=torch.zeros(count, device=device),
+            max_radii=torch.zeros(count, device=device),
+            shards=shards,
+        )
 
     @property
     def first(self) -> int:

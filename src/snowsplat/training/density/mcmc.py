@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,10 +21,10 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.core.finite import check_parameters
 from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule, When
+from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
-from snowsplat.util.errors import SettingError
+from snowsplat.training.settings.density import McmcDensity
 
 #: Maximum number of copies of one Gaussian for which eq. 9 is evaluated; larger numbers are rare.
 MAX_COPIES = 51
@@ -36,59 +35,6 @@ NOISE_SHARPNESS = 100.0
 NOISE_NEGLIGIBLE = 1e-4
 
 
-@dataclass(frozen=True)
-class McmcDensity:
-    """Settings of MCMC density control; the defaults are those of its paper.
-
-    Attributes:
-        densify_from, densify_until: first and last step of relocation (float: fraction of all
-            steps).
-        densify_interval: number of steps between two relocations.
-        max_gaussians: maximum number of Gaussians.
-        growth: fraction by which the number of Gaussians grows at each relocation, up to the limit.
-        prune_opacity: Gaussians of this opacity or less are dead; they are relocated.
-        noise: scale of the noise on the positions, in units of their learning rate.
-        noise_until: the last step with noise (float: fraction of all steps).
-        opacity_regularizer, scale_regularizer: weights of the mean opacity and the mean scale in
-            the loss.
-    """
-
-    abs_grad: ClassVar[bool] = False  # there are no statistics of gradients
-
-    densify_from: When = 500
-    densify_until: When = 25_000
-    densify_interval: int = 100
-    max_gaussians: int = 1_000_000
-    growth: float = 0.05
-    prune_opacity: float = 0.005
-    noise: float = 5e5
-    noise_until: When = 1.0
-    opacity_regularizer: float = 0.01
-    scale_regularizer: float = 0.01
-
-    def control(
-        self,
-        count: int,
-        *,
-        schedule: Schedule,
-        extent: float,
-        random_init: bool,
-        generator: torch.Generator,
-        device: torch.device | None = None,
-        shards: Shards = ALONE,
-    ) -> McmcDensityControl:
-        """The initial state. ``extent``, ``random_init`` and ``device`` are not used.
-
-        Raises:
-            SettingError: ``max_gaussians`` is not positive.
-        """
-        if self.max_gaussians <= 0:
-            raise SettingError(
-                "max_gaussians", "MCMC density control needs a limit; use a positive number"
-            )
-        return McmcDensityControl(self, schedule, generator, shards)
-
-
 @dataclass
 class McmcDensityControl:
     """State of MCMC density control: the random generator, which the trainer saves."""
@@ -97,6 +43,19 @@ class McmcDensityControl:
     schedule: Schedule
     generator: torch.Generator
     shards: Shards = ALONE
+
+    @classmethod
+    def begin(
+        cls,
+        settings: McmcDensity,
+        *,
+        schedule: Schedule,
+        generator: torch.Generator,
+        shards: Shards = ALONE,
+        **_: object,
+    ) -> McmcDensityControl:
+        """The initial state; see `DensityConfig.control`. The other arguments are not used."""
+        return cls(settings, schedule, generator, shards)
 
     @property
     def first(self) -> int:

@@ -17,13 +17,12 @@ opacity is also larger, because fewer photos show each place.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
-from snowsplat.training.core.step_schedule import When
 from snowsplat.training.parts.part import Part
+from snowsplat.training.settings.rates import DecayRates
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
@@ -34,23 +33,6 @@ INTERVAL = 10
 #: `MAX_FACTOR`.
 MANY_VIEWS = 50
 MAX_FACTOR = 2.5
-
-
-@dataclass(frozen=True)
-class DecayRates:
-    """The rates of decay; the defaults, 0, disable it.
-
-    Attributes:
-        opacity: fraction of its opacity that a Gaussian loses per epoch, with at least `MANY_VIEWS`
-            views.
-        scale: fraction of its scales that a Gaussian loses per epoch.
-        until: the last moment of the decay. Afterwards, the remaining Gaussians regain the opacity
-            that the photos require.
-    """
-
-    opacity: float = 0.0
-    scale: float = 0.0
-    until: When = 0.9
 
 
 class Decay(Part):

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -45,12 +45,11 @@ from snowsplat.training.parts.view_residuals import (
     cell_size,
     residuals_elsewhere,
 )
+from snowsplat.training.settings.config import AutoOnOff
 
 if TYPE_CHECKING:
     from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
-
-TransientsMode = Literal["auto", "on", "off"]
 
 #: When masks are computed, as fractions of the schedule.
 MOMENTS = (0.1, 0.2, 0.3, 0.4)
@@ -92,7 +91,7 @@ class Transients(Part):
 
     name = "transients"
 
-    def __init__(self, mode: TransientsMode) -> None:
+    def __init__(self, mode: AutoOnOff) -> None:
         """
         Args:
             mode: "auto": only if something moves in several photos; see ``TrainConfig.transients``.
@@ -203,7 +202,7 @@ class Transients(Part):
 
 
 def _moving_cells(
-    maps: Sequence[CellMap], before: Sequence[Tensor], mode: TransientsMode
+    maps: Sequence[CellMap], before: Sequence[Tensor], mode: AutoOnOff
 ) -> list[Tensor]:
     """The cells (h, w) bool of each map in which something moves; ``before``: of the last time."""
     large = _large([cells.residual for cells in maps])

@@ -23,8 +23,8 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_fit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
-from snowsplat.training.core.step_schedule import When
 from snowsplat.training.parts.part import Part
+from snowsplat.training.settings.declare import When
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run

@@ -11,10 +11,10 @@ from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
-from snowsplat.training.core.config import TrainConfig
 from snowsplat.training.core.finite import check_finite
 from snowsplat.training.parts.found_sky import most_sky_points
-from snowsplat.training.starts import STARTS
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.starts import STARTS
 
 
 def initial_count(dataset: Dataset, config: TrainConfig) -> int:

@@ -2,8 +2,7 @@
 
     config = recipe("paper", iterations=7000, max_gaussians=200_000)
 
-A recipe is a function that returns a `TrainConfig`. To add one, write a function and add it to
-`RECIPES`.
+A recipe is a function that returns a `TrainConfig`. `register_recipe` adds one to `RECIPES`.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from snowsplat.training.core.config import TrainConfig, changed
-from snowsplat.training.core.lr_schedule import LearningRates
-from snowsplat.training.density import AdaptiveDensity, McmcDensity
-from snowsplat.training.parts.decay import DecayRates
-from snowsplat.util.errors import SettingError
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.declare import Setting, checked, suggestion
+from snowsplat.training.settings.density import AdaptiveDensity, McmcDensity
+from snowsplat.training.settings.names import changed
+from snowsplat.training.settings.rates import DecayRates, LearningRates
 
 
 def default() -> TrainConfig:
@@ -155,12 +154,24 @@ RECIPES: dict[str, Callable[[], TrainConfig]] = {
 }
 
 
+def register_recipe(name: str, make: Callable[[], TrainConfig]) -> None:
+    """Add a recipe under a name, for `recipe` and ``TrainOptions.recipe``."""
+    RECIPES[name] = make
+
+
+def check_recipe(name: str) -> str | None:
+    """What is wrong with the name of a recipe; None: nothing."""
+    if name in RECIPES:
+        return None
+    advice = suggestion(name, list(RECIPES)) or f"; use one of {', '.join(RECIPES)}"
+    return f"is unknown{advice}"
+
+
 def recipe(name: str = "default", **settings: Any) -> TrainConfig:
     """A recipe by name, with other values for some settings; see `changed`.
 
     Raises:
         SettingError: there is no such recipe, it has no such setting, or a value is invalid.
     """
-    if name not in RECIPES:
-        raise SettingError("recipe", f"{name!r} does not exist; use one of {', '.join(RECIPES)}")
+    checked("recipe", name, str, Setting(check=check_recipe))
     return changed(RECIPES[name](), **settings)

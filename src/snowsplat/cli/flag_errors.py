@@ -1,0 +1,97 @@
+"""Invalid flags as one line: the flag, its value, and what is allowed.
+
+tyro parses the flags. If it rejects them, the arguments are examined here: an unknown flag gets the
+most similar one as a suggestion, and an invalid value is explained as it is in Python, with the
+declaration of the setting.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import tyro
+
+from snowsplat.training.settings.declare import Setting, allowed, kinds_of, shown
+from snowsplat.training.settings.declare import suggestion as similar
+from snowsplat.util.safe_json import printable
+
+_FLAG = re.compile(r"-[^\d.]")
+_FRAME = "│|╭╮╰╯─┌┐└┘+-= "
+
+
+def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
+    """Why the arguments of a subcommand are invalid, on one line.
+
+    Args:
+        kind: the dataclass of the subcommand.
+        message: what tyro has printed; it is used if the arguments do not show the reason.
+    """
+    flags = dict(_flags(kind))
+    for number, argument in enumerate(arguments):
+        if not _FLAG.match(argument):
+            continue
+        name, given, value = argument.partition("=")
+        spelling = name.replace("_", "-")
+        if spelling not in flags:
+            advice = similar(spelling, list(flags)) or "; leave it out"
+            return f"{printable(name)}: unknown flag{advice}"
+        hint, declared = flags[spelling]
+        kinds = [each for each in kinds_of(hint) if each is not NoneType]
+        if kinds == [bool]:
+            continue
+        texts = [value] if given else _values(arguments[number + 1 :])
+        if get_origin(kinds[0]) is tuple:
+            kinds = [get_args(kinds[0])[0]]
+        elif not texts:
+            return f"{spelling}: needs a value; use {allowed(hint, declared)}"
+        else:
+            texts = texts[:1]
+        for text in texts:
+            if not any(_is_of(text, each) for each in kinds):
+                return f"{spelling}: {shown(text)} is not valid; use {allowed(hint, declared)}"
+    lines = [line.strip(_FRAME) for line in message.splitlines()[1:]]
+    end = lines.index("") if "" in lines else len(lines)
+    return " ".join(lines[:end]).rstrip(".") or "invalid flags"
+
+
+def _flags(kind: Any) -> Iterator[tuple[str, tuple[Any, Setting]]]:
+    """Each spelling of a flag -> its type, and its declaration if it is a setting."""
+    from snowsplat.cli.config_flags import SETTINGS  # analysed only if there is an error
+
+    settings = {name: declared for name, _, declared in SETTINGS}
+    yield from (("-h", (bool, Setting())), ("--help", (bool, Setting())))
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+        if tyro.conf.Positional in extras:
+            continue
+        type_ = get_args(hint)[0] if extras else hint
+        aliases = [each for extra in extras for each in getattr(extra, "aliases", None) or ()]
+        declared = settings.get(name, Setting()) if get_origin(type_) is not Literal else Setting()
+        for spelling in ("--" + name.replace("_", "-"), *aliases):
+            yield spelling, (type_, declared)
+
+
+def _values(arguments: Sequence[str]) -> list[str]:
+    """The arguments before the next flag."""
+    values = []
+    for argument in arguments:
+        if _FLAG.match(argument):
+            break
+        values.append(argument)
+    return values
+
+
+def _is_of(text: str, kind: Any) -> bool:
+    """Whether a text is a value of the type ``kind``."""
+    if get_origin(kind) is Literal:
+        return text in get_args(kind)
+    if kind in (int, float):
+        with suppress(ValueError):
+            kind(text)
+            return True
+        return False
+    return True

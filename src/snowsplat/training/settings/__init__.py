@@ -1,0 +1,50 @@
+"""The settings of a training: the ground floor of `snowsplat.training`.
+
+declare.py   how a setting is declared: type, default, valid values, help and flag in its field
+config.py    `TrainConfig`
+rates.py     learning rates, and the rates of the decay
+density.py   the settings of density control; `DENSITY_CONTROLS`
+starts.py    the names of the starts; `STARTS`
+recipes.py   complete configurations by name; `RECIPES`
+names.py     changing settings by name
+stored.py    a configuration as JSON
+
+These modules import neither torch nor any other part of the training.
+"""
+
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.declare import Settings, When, setting
+from snowsplat.training.settings.density import (
+    DENSITY_CONTROLS,
+    AdaptiveDensity,
+    DensityConfig,
+    McmcDensity,
+    register_density,
+)
+from snowsplat.training.settings.names import changed
+from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.training.settings.recipes import RECIPES, recipe, register_recipe
+from snowsplat.training.settings.starts import STARTS, register_start
+from snowsplat.training.settings.stored import config_from_json, config_to_json
+
+__all__ = [
+    "DENSITY_CONTROLS",
+    "RECIPES",
+    "STARTS",
+    "AdaptiveDensity",
+    "DecayRates",
+    "DensityConfig",
+    "LearningRates",
+    "McmcDensity",
+    "Settings",
+    "TrainConfig",
+    "When",
+    "changed",
+    "config_from_json",
+    "config_to_json",
+    "recipe",
+    "register_density",
+    "register_recipe",
+    "register_start",
+    "setting",
+]

@@ -1,0 +1,331 @@
+"""`TrainConfig`: the settings of a training run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+from snowsplat.training.settings.declare import Settings, When, part, setting
+from snowsplat.training.settings.density import AdaptiveDensity, DensityConfig, check_density
+from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.training.settings.starts import check_starts
+from snowsplat.util.errors import SettingError
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.step_schedule import Schedule
+    from snowsplat.training.parts.part import Part
+
+#: Whether a part takes part: always, never, or if the photos show that it is needed.
+AutoOnOff = Literal["auto", "on", "off"]
+
+#: The generators are seeded with four times the seed, which has to fit into 64 bits.
+_SEED_LIMIT = 2**61
+
+
+@dataclass(frozen=True)
+class TrainConfig(Settings):
+    """All settings of a training run; the defaults are those of the paper.
+
+    A moment (`When`) is a step (int) or a fraction of ``iterations`` (float). See
+    `snowsplat.training.settings.names.changed` for changing settings by name.
+
+    Raises:
+        SettingError: a value is invalid, or two settings contradict each other.
+    """
+
+    iterations: int = setting(
+        30_000, "Number of training steps; each uses one photo.", least=1, metavar="N"
+    )
+    # The gradient of an update is the mean over the views of the batch, and Adam's β₁ and β₂ are
+    # raised to the power batch (Zhao et al. 2024, arXiv:2406.18533).
+    batch: int = setting(
+        1,
+        "Number of photos per update of the Gaussians. All other settings still count photos; the "
+        "learning rates are multiplied by the square root of N.",
+        "1",
+        least=1,
+        metavar="N",
+    )
+    checkpoint_every: int = setting(
+        0,
+        "Save a checkpoint every N steps. `resume` can continue from it.",
+        "none",
+        least=0,
+        metavar="N",
+    )
+    seed: int = setting(
+        0,
+        "Seed of all random choices. On the CPU, the same seed produces a bit-identical scene; on "
+        "a GPU, this requires `deterministic`.",
+        "0",
+        least=-_SEED_LIMIT,
+        most=_SEED_LIMIT - 1,
+        allowed="a whole number closer to 0 than 2**61",
+        metavar="N",
+    )
+    test_iterations: tuple[int, ...] = setting(
+        (7_000, 30_000),
+        "Steps after which to evaluate the scene on the held-out photos, in addition to the last "
+        "step; -1: only after the last step.",
+        least=-1,
+        metavar="[N ...]",
+    )
+    background: Literal["black", "white", "random"] = setting(
+        "black",
+        "Colour of the background of the scene and of transparent photos; random: a new colour in "
+        "each step, which prevents fog before a transparent background.",
+        "black",
+        metavar="{black,white,random}",
+    )
+    leave_out_after: When = setting(
+        0,
+        "After this step, leave out the training photos that the scene does not explain: their "
+        "camera poses are probably wrong. A value with a decimal point (0.15) is a fraction of all "
+        "steps; 0: never.",
+        "0",
+        least=0,
+        metavar="N|F",
+    )
+    transients: AutoOnOff = setting(
+        "off",
+        "Whether to mask what moves, such as people who walk past: it looks different from what "
+        "the other photos show at this place. auto: if there are at least 30 photos and something "
+        "moves in several of them; on: in any of at least 8 photos, and add Gaussians only after "
+        "the first masks are known.",
+        metavar="{auto,on,off}",
+    )
+    stop_overfitting: bool = setting(
+        False,
+        "Whether the training ends earlier if the views between the photos become worse. This "
+        "happens in long training runs with few photos. The dataset needs points.",
+        "off",
+        metavar="{on,off}",
+    )
+    exposure: AutoOnOff = setting(
+        "off",
+        "Whether to learn a gain for each photo and colour channel, for photos with different "
+        "exposures or white balances. auto: if the photos differ by at least 0.05 EV.",
+        metavar="{auto,on,off}",
+    )
+    refine_poses: bool = setting(
+        False,
+        "Optimise the poses and focal lengths of the photos together with the scene, if they are "
+        "not exact. The refined cameras are written to OUT/cameras.json and, as a COLMAP model, to "
+        "OUT/refined/sparse/0.",
+        metavar="",
+    )
+    antialias: bool = setting(
+        False,
+        "Whether to train a scene that also looks right in images that are smaller or larger than "
+        "the photos. The scene file is marked. off: for viewers that draw as the reference "
+        "implementation does, in images of the size of the photos.",
+        metavar="{on,off}",
+    )
+    sh_degree: int = setting(
+        3,
+        "Degree of the spherical harmonics (view-dependent colour). A lower degree needs less "
+        "memory.",
+        "3",
+        least=0,
+        most=3,
+        allowed="0, 1, 2 or 3",
+        metavar="{0,1,2,3}",
+    )
+    sh_interval: int = setting(
+        1000,
+        "The degree in use begins at 0 and increases by one after this many steps; 0: use "
+        "`sh_degree` from the first step.",
+        least=0,
+    )
+    ssim_weight: float = setting(
+        0.2,
+        "Weight of 1 - SSIM in the loss. The mean absolute difference has the weight 1 - F.",
+        least=0.0,
+        most=1.0,
+        metavar="F",
+        aliases=("--lambda-dssim",),
+    )
+    init: str = setting(
+        "points",
+        "Where the first Gaussians come from. points: the points of the dataset; sweep: depth maps "
+        "computed from the photos (plane sweep); depth: the depth maps of the dataset "
+        "(depths/IMG.png); carve: voxels with the same colour in all photos (space carving); "
+        "random: random depths of random pixels. Example: points+sweep.",
+        allowed="names of starts, such as points+sweep",
+        check=check_starts,
+        metavar="START[+START…]",
+    )
+    initial_points: int | float = setting(
+        100_000,
+        "Number of points of each start except points, which uses all. A value with a decimal "
+        "point (0.4) is a share of the maximum number of Gaussians.",
+        above=0,
+        allowed="a number such as 20000, or a share of the limit of Gaussians such as 0.4",
+        metavar="N|F",
+    )
+    initial_opacity: float = setting(
+        0.1, "Opacity of every Gaussian at initialisation.", above=0.0, below=1.0
+    )
+    initial_scale: float = setting(
+        1.0,
+        "Scale of every Gaussian at initialisation, in units of the mean distance to its three "
+        "nearest neighbours.",
+        above=0.0,
+    )
+    sky: bool = setting(
+        False,
+        "Whether to start with Gaussians far behind the scene if the photos show the sky, and with "
+        "none before it. The dataset needs points.",
+        metavar="{on,off}",
+    )
+    sky_distance: float = setting(
+        0.0,
+        "Distance of these Gaussians from the middle of the cameras, in units of the scene.",
+        "100 x the size of the path",
+        least=0.0,
+        metavar="F",
+    )
+    density: DensityConfig = part(
+        AdaptiveDensity, "Settings of density control.", check=check_density
+    )
+    gaussians_per_pixel: float = setting(
+        0.0,
+        "Limit of the number of Gaussians relative to the number of pixels of a photo, in addition "
+        "to `max_gaussians`; more would not improve the scene. 0: no limit, and `limit_views` has "
+        "no effect.",
+        least=0.0,
+    )
+    limit_views: int = setting(
+        0,
+        "With more training photos than this, the limit of Gaussians grows with the square root of "
+        "their number, because they show a larger scene; 0: it does not grow.",
+        least=0,
+    )
+    learning_rates: LearningRates = part(LearningRates, "Learning rates and their schedules.")
+    decay: DecayRates = part(DecayRates, "Rates of the decay of opacities and scales.")
+    relative_scale: float = setting(
+        0.0,
+        "Largest scale of a Gaussian, in units of its distance to the nearest camera of a training "
+        "photo; 0: no limit.",
+        least=0.0,
+    )
+    near_limit: float = setting(
+        0.0,
+        "Smallest depth of a Gaussian in a photo, in units of that of the nearest points of the "
+        "dataset in this photo; 0: no limit.",
+        least=0.0,
+    )
+    # In the paper, the momentum of Gaussians that are not visible continues to change them.
+    # Skipping them is faster, without a measurable loss of quality.
+    visible_only: bool = setting(
+        False,
+        "Whether the optimiser skips Gaussians that are not visible in the photo of the step.",
+    )
+    coarse_to_fine: tuple[When, When] = setting(
+        (0, 0),
+        "Until the first moment, images have a quarter of the resolution; until the second one, "
+        "half of it; 0: never.",
+        least=0,
+    )
+    image_memory: int = setting(
+        0,
+        "Bytes for decoded images, in each process; 0: half of the available memory, for all "
+        "processes of the computer together.",
+        least=0,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        # The relations between settings are checked here, and nowhere else.
+        share = isinstance(self.initial_points, float)
+        limited = self.density.max_gaussians or self.gaussians_per_pixel
+        if share and not limited and (self.sky or self.starts != ("points",)):
+            raise SettingError(
+                "initial_points",
+                f"{self.initial_points:g} is a share of the limit of Gaussians; set max_gaussians "
+                "as well",
+            )
+
+    @property
+    def starts(self) -> tuple[str, ...]:
+        """The names in ``init``."""
+        return tuple(self.init.split("+"))
+
+    @property
+    def points_per_start(self) -> int:
+        """``initial_points`` as a number, at most the limit of Gaussians.
+
+        Raises:
+            SettingError: it is a share, but the number of Gaussians has no limit.
+        """
+        limit = self.density.max_gaussians
+        if isinstance(self.initial_points, int):
+            return min(self.initial_points, limit or self.initial_points)
+        if not limit:
+            raise SettingError(
+                "initial_points", "is a share of the limit of Gaussians; set max_gaussians as well"
+            )
+        return max(1, round(self.initial_points * limit))
+
+    def capped(self, pixels: int, views: int) -> TrainConfig:
+        """This configuration with the limit of Gaussians for a dataset.
+
+        The result has no ``gaussians_per_pixel``, so another call does not change it.
+
+        Args:
+            pixels: number of pixels of a photo.
+            views: number of training views.
+        """
+        if self.gaussians_per_pixel <= 0:
+            return self
+        cap = self.gaussians_per_pixel * pixels
+        if self.density.max_gaussians > 0:
+            cap = min(cap, self.density.max_gaussians)
+        if self.limit_views > 0:
+            cap *= max(1.0, math.sqrt(views / self.limit_views))
+        density = replace(self.density, max_gaussians=max(1, round(cap)))
+        return replace(self, density=density, gaussians_per_pixel=0.0)
+
+    def downscale_at(self, step: int, schedule: Schedule) -> int:
+        """The factor by which images are reduced at this step: 1, 2 or 4."""
+        quarter, half = (schedule.step_of(when) for when in self.coarse_to_fine)
+        return 4 if step <= quarter else 2 if step <= half else 1
+
+    def sh_degree_at(self, step: int) -> int:
+        """The degree of the spherical harmonics in use at this step."""
+        return min(self.sh_degree, step // self.sh_interval) if self.sh_interval else self.sh_degree
+
+
+def parts_of(config: TrainConfig) -> list[Part]:
+    """What takes part in a training with these settings, in order. This is the only list of parts.
+
+    A new option is a field of `TrainConfig`, a part in its own file, and a line here.
+    """
+    # The settings can be read without the parts.
+    from snowsplat.training.parts.decay import Decay
+    from snowsplat.training.parts.densification import Densification
+    from snowsplat.training.parts.exposure import Exposure
+    from snowsplat.training.parts.near_limit import NearLimit
+    from snowsplat.training.parts.overfitting import OverfittingCheck
+    from snowsplat.training.parts.pose_refinement import PoseRefinement
+    from snowsplat.training.parts.scale_limit import ScaleLimit
+    from snowsplat.training.parts.sky import SkyPart
+    from snowsplat.training.parts.smoothing import SmoothingFilter
+    from snowsplat.training.parts.transients import Transients
+    from snowsplat.training.parts.unexplained import Unexplained
+
+    parts: list[tuple[bool, Part]] = [
+        (config.exposure != "off", Exposure(config.exposure)),
+        (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
+        (config.refine_poses, PoseRefinement()),
+        (config.stop_overfitting, OverfittingCheck()),
+        (config.transients != "off", Transients(config.transients)),
+        (config.near_limit > 0, NearLimit(config.near_limit)),
+        (config.sky, SkyPart(config.sky_distance)),
+        (True, Densification(late=config.transients == "on")),
+        (True, Decay(config.decay)),
+        (config.relative_scale > 0, ScaleLimit(config.relative_scale)),
+        (config.antialias, SmoothingFilter()),
+    ]
+    return [part for used, part in parts if used]

@@ -1,0 +1,280 @@
+"""How a setting is declared. Type, default, valid values, help and flag stand in its field.
+
+    @dataclass(frozen=True)
+    class Sharpening(Settings):
+        strength: float = setting(0.5, "Weight of the sharpness.", least=0.0, metavar="F")
+
+`Settings` checks the values when the object is created. The flags of the command line
+(`snowsplat.cli.config_flags`), their help texts and the table in the documentation are made from
+the same fields. This module imports nothing slow: neither torch nor numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
+from functools import cache
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from snowsplat.util.errors import SettingError
+from snowsplat.util.safe_json import printable
+
+#: A moment of the training: a step (int), or a fraction of all steps (float).
+When = int | float
+
+#: Larger whole numbers do not fit into the 64 bits of tensors and kernels.
+_LARGEST = 2**63 - 1
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a field declares besides its type and its default.
+
+    Attributes:
+        help: one or two sentences. Names of other settings are in backquotes.
+        least, most, above, below: limits of a number; ``above`` and ``below`` are not included. If
+            a value is a list, they are limits of its items.
+        largest_fraction: the limit of a float, if the type is "a whole number or a fraction".
+        allowed: what is valid, if the limits cannot say it, for a message: "use <allowed>".
+        check: called with a value of the declared type; returns what is wrong with it, or None.
+        metavar: the placeholder of the value of the flag; "": a flag without a value; None: there
+            is no flag.
+        aliases: other spellings of the flag.
+        default: the default in the help text; None: it is set by the recipe.
+    """
+
+    help: str = ""
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    largest_fraction: float = 1.0
+    allowed: str | None = None
+    check: Callable[[Any], str | None] | None = None
+    metavar: str | None = None
+    aliases: tuple[str, ...] = ()
+    default: str | None = None
+
+
+_UNDECLARED = Setting()
+
+
+def setting(value: _Value, help: str, flag: str | None = None, **declared: Any) -> _Value:
+    """A field with the default ``value``.
+
+    Args:
+        help: see `Setting`.
+        flag: the attribute ``default`` of `Setting`.
+        declared: the other attributes of `Setting`.
+    """
+    metadata = {"setting": Setting(help, default=flag, **declared)}
+    return field(default=value, metadata=metadata)
+
+
+def part(kind: Callable[[], _Value], help: str, **declared: Any) -> _Value:
+    """A field for settings that have a class of their own; the default is ``kind()``."""
+    metadata = {"setting": Setting(help, **declared)}
+    return field(default_factory=kind, metadata=metadata)
+
+
+def same(kind: type, name: str, value: _Value, **changes: Any) -> _Value:
+    """The field ``name`` of another class, with the default ``value``."""
+    (known,) = (each for each in fields(kind) if each.name == name)
+    declared = {**vars(known.metadata["setting"]), **changes}
+    return field(default=value, metadata={"setting": Setting(**declared)})
+
+
+class Settings:
+    """The base of a frozen dataclass whose fields are settings.
+
+    Numbers of NumPy become numbers of Python, and lists become tuples.
+
+    Attributes:
+        prefix: of the names by which `changed` and the flags know the fields: "lr_".
+
+    Raises:
+        SettingError: a value is invalid. The message is one line that names the setting, the value
+            and what is allowed.
+    """
+
+    prefix: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        kind: type = type(self)
+        for name, hint, declared in declarations(kind):
+            value = checked(self.prefix + name, getattr(self, name), hint, declared)
+            object.__setattr__(self, name, value)
+
+
+@cache
+def declarations(kind: type) -> tuple[tuple[str, Any, Setting], ...]:
+    """Name, type and declaration of the fields of a class. A plain field declares only its type."""
+    hints = get_type_hints(kind)
+    return tuple(
+        (each.name, hints[each.name], each.metadata.get("setting", _UNDECLARED))
+        for each in fields(kind)
+    )
+
+
+def checked(name: str, value: Any, hint: Any, declared: Setting = _UNDECLARED) -> Any:
+    """``value`` as a value of the type ``hint``, within the limits of the declaration.
+
+    Raises:
+        SettingError: it is not valid.
+    """
+    try:
+        value = _typed(value, hint, declared)
+        problem = declared.check(value) if declared.check and value is not None else None
+    except ValueError as error:
+        problem = str(error)
+    if problem is None:
+        return value
+    advice = "" if "; " in problem else f"; use {allowed(hint, declared)}"
+    raise SettingError(name, f"{shown(value)} {problem}{advice}")
+
+
+def shown(value: Any) -> str:
+    """A value in a message of one line."""
+    return printable(" ".join(repr(value).split()))[:80]
+
+
+def suggestion(name: str, known: Sequence[str]) -> str:
+    """``"; did you mean NAME?"``, or an empty text if no known name is similar."""
+    similar = get_close_matches(name, known, 1)
+    return f"; did you mean {similar[0]}?" if similar else ""
+
+
+def allowed(hint: Any, declared: Setting = _UNDECLARED) -> str:
+    """The valid values, in words: "a number from 0 to 1"."""
+    if declared.allowed:
+        return declared.allowed
+    kinds = [kind for kind in kinds_of(hint) if kind is not NoneType]
+    if int in kinds and float in kinds:
+        least = "above 0" if declared.above is not None else "0 or more"
+        most = declared.largest_fraction
+        fraction = "0.5" if math.isinf(most) else f"0.5, at most {most:.1f}"
+        return f"a whole number, {least}, or a fraction such as {fraction}"
+    return " or ".join(_words(kind, declared) for kind in kinds)
+
+
+def _words(kind: Any, declared: Setting) -> str:
+    if get_origin(kind) is Literal:
+        *first, last = map(str, get_args(kind))
+        return f"{', '.join(first)} or {last}" if first else last
+    if get_origin(kind) in (tuple, list):
+        return f"a list; each item is {allowed(get_args(kind)[0], declared)}"
+    if kind is int or kind is float:
+        noun = "a whole number" if kind is int else "a number"
+        return f"{noun}{_limits(declared)}"
+    names = {bool: "True or False", str: "a text", Path: "a path"}
+    return names.get(kind, f"a {getattr(kind, '__name__', kind)}")
+
+
+def _limits(declared: Setting) -> str:
+    if declared.least is not None and declared.most is not None:
+        return f" from {declared.least:g} to {declared.most:g}"
+    words = {
+        "of at least": declared.least,
+        "above": declared.above,
+        "at most": declared.most,
+        "below": declared.below,
+    }
+    limits = " and ".join(f"{word} {n:g}" for word, n in words.items() if n is not None)
+    return f" {limits}" if limits else ""
+
+
+def kinds_of(hint: Any) -> tuple[Any, ...]:
+    """The types that are joined by "|"."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def _item_kinds(hint: Any, count: int) -> list[Any]:
+    """The types of ``count`` items of a list or tuple."""
+    kinds = get_args(hint)
+    if get_origin(hint) is list or kinds[-1] is Ellipsis:
+        return [kinds[0]] * count
+    return list(kinds)
+
+
+def _typed(value: Any, hint: Any, declared: Setting) -> Any:
+    """``value`` with the types of Python; raises ValueError with what is wrong."""
+    problem = "has the wrong type"
+    for kind in kinds_of(hint):
+        try:
+            return _of_kind(value, kind, hint, declared)
+        except TypeError:
+            continue
+        except ValueError as error:
+            problem = str(error)
+    raise ValueError(problem)
+
+
+def _of_kind(value: Any, kind: Any, hint: Any, declared: Setting) -> Any:
+    """Raises TypeError if the type is another one, ValueError if only the value is wrong."""
+    origin = get_origin(kind)
+    if origin is Literal:
+        if isinstance(value, str) and value in get_args(kind):
+            return value
+        raise ValueError("is unknown")
+    if origin in (tuple, list):
+        if not isinstance(value, list | tuple):
+            raise TypeError
+        kinds = _item_kinds(kind, len(value))
+        if len(kinds) != len(value):
+            raise ValueError(f"has {len(value)} items instead of {len(kinds)}")
+        return origin(_typed(item, each, declared) for item, each in zip(value, kinds, strict=True))
+    if kind is int or kind is float:
+        return _number(value, kind, hint, declared)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    kind = origin or kind
+    if kind is not Any and not getattr(kind, "_is_protocol", False) and not isinstance(value, kind):
+        raise TypeError
+    return value
+
+
+def _number(value: Any, kind: type, hint: Any, declared: Setting) -> int | float:
+    if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
+        raise TypeError
+    if isinstance(value, Integral):
+        number: int | float = int(value)
+        if abs(number) > _LARGEST:
+            raise ValueError("is too large")
+    else:
+        number = float(value)
+        if not math.isfinite(number):
+            raise ValueError("is not finite")
+        if int in kinds_of(hint) and number > declared.largest_fraction:
+            raise ValueError("is too large for a fraction")
+    least, most, above, below = declared.least, declared.most, declared.above, declared.below
+    if (least is not None and number < least) or (above is not None and number <= above):
+        raise ValueError("is too small")
+    if (most is not None and number > most) or (below is not None and number >= below):
+        raise ValueError("is too large")
+    return number
+
+
+def flags_of(*kinds: type) -> Iterator[tuple[str, Any, Setting]]:
+    """Name, type and declaration of all settings with a flag; the first of each name."""
+    seen: set[str] = set()
+    for kind in kinds:
+        for name, hint, declared in declarations(kind):
+            flag = getattr(kind, "prefix", "") + name
+            if declared.metavar is not None and flag not in seen:
+                seen.add(flag)
+                yield flag, hint, declared

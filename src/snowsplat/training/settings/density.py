@@ -1,0 +1,265 @@
+"""The settings of density control, which adds and removes Gaussians; their registered names.
+
+A density control has two dataclasses: its settings, here, and its state, in
+`snowsplat.training.density`. The method `DensityConfig.control` of the settings creates the state.
+A class from outside of the package can be used as it is, ``TrainConfig(density=MyDensity())``. To
+resume such a training from a checkpoint, the class is registered:
+
+    @register_density
+    @dataclass(frozen=True)
+    class MyDensity: ...
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+
+from snowsplat.training.settings.declare import Settings, When, checked, declarations, same, setting
+
+if TYPE_CHECKING:
+    import torch
+
+    from snowsplat.training.core.step_schedule import Schedule
+    from snowsplat.training.density import DensityControl
+    from snowsplat.training.density.adaptive import AdaptiveDensityControl
+    from snowsplat.training.density.mcmc import McmcDensityControl
+    from snowsplat.training.processes.shards import Shards
+
+_Kind = TypeVar("_Kind", bound=type)
+
+
+class DensityConfig(Protocol):
+    """The settings of a density control: a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def max_gaussians(self) -> int:
+        """Maximum number of Gaussians, including the initial ones; 0: no limit."""
+        ...
+
+    @property
+    def abs_grad(self) -> bool:
+        """Whether `DensityControl.after_backward` uses ``gradient.splats.abs_grad``."""
+        ...
+
+    @property
+    def densify_from(self) -> When:
+        """The first step at which Gaussians may be added (float: fraction of all steps)."""
+        ...
+
+    @property
+    def densify_until(self) -> When:
+        """The last step at which Gaussians may be added (float: fraction of all steps)."""
+        ...
+
+    @property
+    def densify_interval(self) -> int:
+        """Number of steps between two densifications."""
+        ...
+
+    def control(
+        self,
+        count: int,
+        *,
+        schedule: Schedule,
+        extent: float,
+        random_init: bool,
+        generator: torch.Generator,
+        device: torch.device | None = ...,
+        shards: Shards = ...,
+    ) -> DensityControl:
+        """The initial state.
+
+        Args:
+            count: number of Gaussians of this process.
+            extent: extent of the scene, in world units.
+            random_init: whether training starts from random points instead of SfM points.
+            generator: a random generator on the CPU.
+            device: the device of the Gaussians; default: the CPU.
+            shards: the processes of the training; default: this one alone.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class AdaptiveDensity(Settings):
+    """Adaptive density control; the defaults are those of the paper. See `density.adaptive`."""
+
+    max_gaussians: int = setting(
+        0,
+        "Maximum number of Gaussians, which determines memory and time; 0: no limit. If it would "
+        "be exceeded, only the Gaussians with the largest gradients are densified.",
+        least=0,
+        metavar="N",
+    )
+    # Gradients of opposite directions cancel in the sum of the paper, so a large Gaussian in a
+    # detailed region is not split; see AbsGS (Ye et al. 2024). Sums of absolute values over pixels,
+    # as in AbsGS, are larger and need a larger threshold; sums over tiles do not.
+    grad_threshold: float = setting(
+        2e-4,
+        "Clone or split Gaussians whose view-space gradient exceeds this threshold. With a larger "
+        "value, fewer Gaussians are added.",
+        least=0.0,
+        metavar="F",
+        aliases=("--densify-grad-threshold",),
+    )
+    abs_grad: bool = setting(
+        False,
+        "Whether `grad_threshold` applies to the sum of the absolute gradients of the 16x16 tiles "
+        "of the image. In this sum, gradients of opposite directions do not cancel, so more "
+        "Gaussians are cloned or split in detailed regions.",
+        metavar="{on,off}",
+    )
+    densify_interval: int = setting(
+        100,
+        "Number of steps between densifications. With a larger value, fewer Gaussians are added.",
+        least=1,
+        metavar="N",
+        aliases=("--densification-interval",),
+    )
+    densify_from: When = setting(
+        500,
+        "First step of densification. A value with a decimal point (0.1) is a fraction of all "
+        "steps.",
+        least=0,
+        metavar="N|F",
+        aliases=("--densify-from-iter",),
+    )
+    densify_until: When = setting(
+        15_000,
+        "Last step of densification. A value with a decimal point (0.5) is a fraction of all "
+        "steps.",
+        least=0,
+        metavar="N|F",
+        aliases=("--densify-until-iter",),
+    )
+    opacity_reset_interval: int = setting(
+        3000,
+        "Number of steps between opacity resets; 0: no resets. The last one is at least 500 steps "
+        "before densification ends.",
+        least=0,
+        metavar="N",
+    )
+    percent_dense: float = setting(
+        0.01,
+        "Densification clones Gaussians smaller than this fraction of the scene extent, and splits "
+        "larger ones.",
+        least=0.0,
+        metavar="F",
+    )
+    prune_opacity: float = setting(
+        0.005, "Gaussians with a lower opacity are removed.", least=0.0, below=1.0
+    )
+    # A forward-facing scene has a small extent compared to its depth, so that most of its Gaussians
+    # would be removed.
+    prune_world_size: float = setting(
+        0.1,
+        "Gaussians with a larger scale, in units of the scene extent, are removed; 0 disables "
+        "this. Pruning by size begins after step `opacity_reset_interval`; if that is 0, never.",
+        least=0.0,
+    )
+    prune_screen_size: float = setting(
+        20.0,
+        "Gaussians with a larger 3σ radius, in pixels, are removed; 0 disables this.",
+        least=0.0,
+    )
+    # Most random points lie in empty space, where they get the colour of the background instead of
+    # becoming transparent. Without the reset, 100,000 of them can remain as a cloud of that colour.
+    reset_random_start: bool = setting(
+        True,
+        "Whether to reset opacity also at `densify_from`, if training started from random points "
+        "and at least 500 steps are left.",
+    )
+
+    def control(self, count: int, **state: Any) -> AdaptiveDensityControl:
+        """The initial state for ``count`` Gaussians; see `DensityConfig.control`."""
+        from snowsplat.training.density.adaptive import AdaptiveDensityControl
+
+        return AdaptiveDensityControl.begin(self, count, **state)
+
+
+@dataclass(frozen=True)
+class McmcDensity(Settings):
+    """MCMC density control; the defaults are those of its paper. See `density.mcmc`."""
+
+    abs_grad: ClassVar[bool] = False  # there are no statistics of gradients
+
+    max_gaussians: int = same(
+        AdaptiveDensity,
+        "max_gaussians",
+        1_000_000,
+        help="Maximum number of Gaussians.",
+        least=1,
+        allowed="a whole number of at least 1, because MCMC density control needs a limit",
+    )
+    densify_interval: int = same(AdaptiveDensity, "densify_interval", 100)
+    densify_from: When = same(AdaptiveDensity, "densify_from", 500)
+    densify_until: When = same(AdaptiveDensity, "densify_until", 25_000)
+    growth: float = setting(
+        0.05,
+        "Fraction by which the number of Gaussians grows at each relocation, up to the limit.",
+        least=0.0,
+    )
+    prune_opacity: float = setting(
+        0.005,
+        "Gaussians of this opacity or less are dead; they are relocated.",
+        least=0.0,
+        below=1.0,
+    )
+    noise: float = setting(
+        5e5, "Scale of the noise on the positions, in units of their learning rate.", least=0.0
+    )
+    noise_until: When = setting(1.0, "Last step with noise.", least=0)
+    opacity_regularizer: float = setting(0.01, "Weight of the mean opacity in the loss.", least=0.0)
+    scale_regularizer: float = setting(0.01, "Weight of the mean scale in the loss.", least=0.0)
+
+    def control(self, count: int, **state: Any) -> McmcDensityControl:
+        """The initial state; see `DensityConfig.control`."""
+        from snowsplat.training.density.mcmc import McmcDensityControl
+
+        return McmcDensityControl.begin(self, **state)
+
+
+#: The settings class of every density control, by its name. Checkpoints contain this name.
+DENSITY_CONTROLS: dict[str, type[DensityConfig]] = {
+    "AdaptiveDensity": AdaptiveDensity,
+    "McmcDensity": McmcDensity,
+}
+
+
+def register_density(kind: _Kind) -> _Kind:
+    """Add a settings class to `DENSITY_CONTROLS`, under its name; usable as a decorator."""
+    DENSITY_CONTROLS[kind.__name__] = kind
+    return kind
+
+
+#: What the trainer reads of every density control.
+_REQUIRED = ("max_gaussians", "abs_grad", "densify_from", "densify_until", "densify_interval")
+
+
+def check_density(density: Any) -> str | None:
+    """What is wrong with the settings of a density control; None: nothing.
+
+    Raises:
+        SettingError: one of the settings that all density controls have is invalid.
+    """
+    if isinstance(density, type) or not is_dataclass(density):
+        return "is not an object of a dataclass; use e.g. AdaptiveDensity()"
+    missing = [name for name in (*_REQUIRED, "control") if not hasattr(density, name)]
+    if missing:
+        return f"has no {missing[0]}; see DensityConfig"
+    if not isinstance(density, Settings):  # a plain dataclass has not checked its values
+        for name, hint, declared in declarations(AdaptiveDensity):
+            if name in _REQUIRED:
+                checked(name, getattr(density, name), hint, declared)
+    return None
+
+
+def owner(name: str) -> str | None:
+    """The name of a registered density control that has the setting ``name``."""
+    for kind in DENSITY_CONTROLS.values():
+        if name in {each.name for each in fields(kind)}:
+            return kind.__name__
+    return None

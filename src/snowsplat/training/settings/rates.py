@@ -1,0 +1,122 @@
+"""`LearningRates` of Adam and their schedules; `DecayRates` of opacities and scales."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+from snowsplat.training.settings.declare import Settings, When, setting
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.step_schedule import Schedule
+
+
+@dataclass(frozen=True)
+class LearningRates(Settings):
+    """Adam's learning rate for each parameter; the defaults are those of the paper.
+
+    The rates of all parameters except the positions are constant until ``anneal_from``.
+    """
+
+    prefix: ClassVar[str] = "lr_"
+
+    # The schedule interpolates the logarithms of these two rates.
+    means: float = setting(
+        1.6e-4,
+        "Learning rate of the positions at the first step, in units of the scene extent.",
+        above=0.0,
+        allowed="a number above 0, e.g. 1e-12",
+        metavar="F",
+        aliases=("--position-lr-init",),
+    )
+    means_final: float = setting(
+        1.6e-6,
+        "Learning rate of the positions from step `lr_means_steps` on, in the same units.",
+        above=0.0,
+        allowed="a number above 0, e.g. 1e-12",
+        metavar="F",
+        aliases=("--position-lr-final",),
+    )
+    means_steps: When = setting(
+        30_000,
+        "Step at which the learning rate of the positions reaches its final value. A value with a "
+        "decimal point (1.0) is a fraction of all steps.",
+        least=0,
+        largest_fraction=math.inf,
+        metavar="N|F",
+        aliases=("--position-lr-max-steps",),
+    )
+    log_scales: float = setting(
+        5e-3, "Learning rate of the scales.", least=0.0, metavar="F", aliases=("--scaling-lr",)
+    )
+    quats: float = setting(
+        1e-3, "Learning rate of the rotations.", least=0.0, metavar="F", aliases=("--rotation-lr",)
+    )
+    opacity_logits: float = setting(
+        0.05, "Learning rate of the opacities.", least=0.0, metavar="F", aliases=("--opacity-lr",)
+    )
+    sh_dc: float = setting(2.5e-3, "Learning rate of the base colours.", least=0.0, metavar="F")
+    sh_rest: float = setting(
+        2.5e-3 / 20, "Learning rate of the view-dependent colours.", least=0.0, metavar="F"
+    )
+    anneal: float = setting(
+        1.0,
+        "Factor of all these rates but that of the positions at the last step. With a factor below "
+        "1, the parameters converge, instead of following the view of the last steps.",
+        above=0.0,
+    )
+    anneal_from: float = setting(
+        0.6,
+        "Fraction of all steps, from which on these rates are interpolated log-linearly.",
+        least=0.0,
+        below=1.0,
+    )
+
+    def scaled(self, factor: float) -> LearningRates:
+        """These rates, multiplied by ``factor`` except ``means_final``; for short training runs."""
+        rates = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+        return replace(self, **{name: factor * getattr(self, name) for name in rates})
+
+    def at(self, step: int, schedule: Schedule, extent: float) -> dict[str, float]:
+        """The learning rate of each parameter at ``step``; that of the means is in world units.
+
+        means(t) = extent · means^(1 − t) · means_final^t, t = step / means_steps, at most 1.
+        The other rates are multiplied by anneal^u, where u increases from 0 at ``anneal_from`` to 1
+        at the last step.
+        """
+        t = schedule.share(step, self.means_steps)
+        means = math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
+        u = (schedule.share(step) - self.anneal_from) / (1.0 - self.anneal_from)
+        factor = self.anneal ** max(0.0, u)
+        return {
+            "means": means * extent,
+            "log_scales": factor * self.log_scales,
+            "quats": factor * self.quats,
+            "opacity_logits": factor * self.opacity_logits,
+            "sh_dc": factor * self.sh_dc,
+            "sh_rest": factor * self.sh_rest,
+        }
+
+
+@dataclass(frozen=True)
+class DecayRates(Settings):
+    """The rates of `snowsplat.training.parts.decay`; the defaults, 0, disable it."""
+
+    prefix: ClassVar[str] = "decay_"
+
+    opacity: float = setting(
+        0.0,
+        "Fraction of its opacity that a Gaussian loses per epoch. With fewer than 50 views, it is "
+        "larger.",
+        least=0.0,
+    )
+    scale: float = setting(
+        0.0, "Fraction of its scales that a Gaussian loses per epoch.", least=0.0
+    )
+    until: When = setting(
+        0.9,
+        "Last moment of the decay. Afterwards, the remaining Gaussians regain the opacity that the "
+        "photos require.",
+        least=0,
+    )

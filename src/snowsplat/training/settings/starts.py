@@ -1,0 +1,64 @@
+"""`STARTS`: where the first Gaussians come from, by name; a start is registered here.
+
+A start is a function that returns points; `initial_gaussians` makes one Gaussian of each. Those of
+the package are in `snowsplat.training.starts`, which is imported when one of them is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from snowsplat.training.settings.declare import suggestion
+
+if TYPE_CHECKING:
+    import torch
+
+    from snowsplat.data.dataset import Dataset, Points
+    from snowsplat.data.image_loader import Photos
+
+    #: dataset, its photos, maximum number of points, random generator on the CPU -> points in the
+    #: world frame, on the CPU; there may be none.
+    Start: TypeAlias = Callable[[Dataset, Photos, int, torch.Generator], Points]
+
+
+@dataclass(frozen=True)
+class _OfPackage:
+    """A function of `snowsplat.training.starts`, which is imported at the first call."""
+
+    function: str
+
+    def __call__(self, *arguments: Any) -> Any:
+        return getattr(import_module("snowsplat.training.starts"), self.function)(*arguments)
+
+
+STARTS: dict[str, Start] = {
+    "points": _OfPackage("dataset_points"),
+    "random": _OfPackage("random_points"),
+    "carve": _OfPackage("carved_points"),
+    "depth": _OfPackage("depth_points"),
+    "sweep": _OfPackage("swept_points"),
+}
+
+
+def register_start(name: str, start: Start) -> None:
+    """Add a start under a name for ``TrainConfig.init``.
+
+    Raises:
+        ValueError: the name contains "+", which joins names.
+    """
+    if "+" in name:
+        raise ValueError(f"{name!r}: a name must not contain +")
+    STARTS[name] = start
+
+
+def check_starts(names: str) -> str | None:
+    """What is wrong with names of starts, joined by "+"; None: nothing."""
+    for name in names.split("+"):
+        if name not in STARTS:
+            which = "" if name == names else f" ({name!r})"
+            advice = suggestion(name, list(STARTS)) or f"; use one of {', '.join(STARTS)}"
+            return f"is unknown{which}{advice}"
+    return None
