@@ -5,6 +5,7 @@ Forward: `project(gaussians, view)` → `Splats2D` → `rasterize` → `photomet
 parameters and updates them.
 """
 
+from snowsplat.ops.activated import project_activated, with_centres
 from snowsplat.ops.adam import AdamRates, Moments, adam_step
 from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
@@ -39,8 +40,10 @@ __all__ = [
     "photometric_loss",
     "plane_sweep",
     "project",
+    "project_activated",
     "rasterize",
     "resolve_device",
     "set_num_threads",
     "ssim",
+    "with_centres",
 ]

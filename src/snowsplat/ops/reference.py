@@ -5,6 +5,7 @@ and are differentiable by autograd, but are much slower than the native kernels.
 kernels with these functions in float64. From top to bottom, this file describes the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
+    project_activated   the same, for scales, opacities and colours after their activations
     rasterize       2D splats → image            α, T, C             Kerbl et al. 2023, §6, eq. 2–3
     count_blended   the number of blended splats per pixel
     photometric_loss, ssim                       L1, D-SSIM          Kerbl et al. 2023, eq. 7;
@@ -27,6 +28,8 @@ Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -250,6 +253,48 @@ def camera_gradient(
         # At the zoom 1, the derivative by the zoom is that by its logarithm.
         d_pose, d_zoom = torch.autograd.grad(splats.packed, (pose, zoom), gradient.packed)
     return d_pose, d_zoom
+
+
+def project_activated(
+    means: Tensor,
+    scales: Tensor,
+    quats: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    view: View,
+    *,
+    far: float = 1e10,
+    radius_clip: float = 0.0,
+) -> tuple[Splats2D, Tensor]:
+    """`project` of scales (N, 3), opacities (N,) and colours after their activations.
+
+    colors are (N, C), any numbers, or (N, K, 3) coefficients of spherical harmonics. Splats of a
+    depth beyond `far`, or of a radius up to `radius_clip`, are removed. Also returns the centres of
+    the splats (M, 2).
+    """
+    harmonics = colors.dim() == 3
+    constants = colors[:, :1] if harmonics else torch.zeros_like(means)[:, None]
+    rest = colors[:, 1:] if harmonics else means.new_zeros(len(means), 0, 3)
+    logits = torch.logit(opacities, eps=1e-15)
+    gaussians = SimpleNamespace(
+        means=means,
+        log_scales=scales.log(),
+        quats=quats,
+        opacity_logits=logits,
+        sh_dc=constants,
+        sh_rest=rest,
+    )
+    splats = project(gaussians, view if harmonics else replace(view, sh_degree=0))
+    assert splats.ids is not None
+    kept = (splats.depths <= far) & (splats.radii > radius_clip)
+    packed, ids = splats.packed[kept], splats.ids[kept]
+    splats = Splats2D(packed, ids, 3)
+    if not harmonics:
+        s = splats
+        splats = Splats2D.pack(
+            s.means2d, s.conics, s.opacities, s.depths, colors[ids.long()], s.radii, ids
+        )
+    return splats, splats.means2d
 
 
 # -------------------------------------------------------------------------------------- rasterize

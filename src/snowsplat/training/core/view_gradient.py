@@ -40,8 +40,14 @@ class ViewGradient:
     nonfinite_rows: Tensor | None = None
 
     @property
+    def packed_grad(self) -> Tensor:
+        """(M, 16): the gradient of ``splats.packed``."""
+        assert self.splats.packed.grad is not None
+        return self.splats.packed.grad
+
+    @property
     def of_splats(self) -> SplatGradient:
-        """The gradient of ``splats.packed``."""
+        """The gradient of the splats as an argument of the operations."""
         return SplatGradient.of(self.splats)
 
     def view(self, gaussians: Gaussians) -> View:
