@@ -14,7 +14,7 @@ from snowsplat.ops.check import check_float, check_tensor
 from snowsplat.ops.params import CameraParams, GaussianGradients, GaussianTensors
 from snowsplat.ops.projection import project_vjp, visible_splats
 from snowsplat.ops.splats import COLORS, DEPTHS, MEANS2D, OPACITIES, RADII, Splats2D, packed_width
-from snowsplat.ops.view import View
+from snowsplat.ops.view import View, camera_params
 
 #: Splats beyond this depth are removed: the default of gsplat.
 FAR = 1e10
@@ -67,7 +67,7 @@ def project_activated(
         raise ValueError(
             f"{op}: colors has too few coefficients ({colors.shape[1]}) for degree {view.sh_degree}"
         )
-    camera = view.camera_params(means)
+    camera = camera_params(view, means)
     limits = far, radius_clip
     packed, means2d, ids = _ProjectActivated.apply(
         view.sh_degree,

@@ -19,7 +19,7 @@ from snowsplat.ops.native import launch
 from snowsplat.ops.params import AdamStepParams, AdamTensor
 from snowsplat.ops.projection import rows_expected
 from snowsplat.ops.splats import SplatGradient
-from snowsplat.ops.view import View
+from snowsplat.ops.view import View, camera_params
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def adam_step(
             splats=len(ids),
             ids=ids,
             grad_packed=grad_packed,
-            camera=view.camera_params(means),
+            camera=camera_params(view, means),
             sh_rest_rows=tensors["sh_rest"].shape[1],
             sh_degree=view.sh_degree,
             **updated,

@@ -18,7 +18,7 @@ from snowsplat.ops.params import GaussianGradients, ProjectBackwardParams, SizeQ
 from snowsplat.ops.projection import pose_gradient, rows_expected
 from snowsplat.ops.splats import SplatGradient
 from snowsplat.ops.sums import sum_of_rows
-from snowsplat.ops.view import View
+from snowsplat.ops.view import View, camera_params
 from snowsplat.util.native_layout import POSE_SUMS
 
 #: In double, (t + _ROUNDING) − _ROUNDING is t rounded to a multiple of 2⁻⁴⁰. Sums of such numbers
@@ -61,7 +61,7 @@ def camera_gradient(
     tensors = checked_parameters(op, gaussians, view.sh_degree)
     means, ids = tensors["means"], gradient.ids
     grad_packed = gradient.checked(op, means)
-    camera = view.camera_params(means)
+    camera = camera_params(view, means)
     blocks = launch("project_pose_blocks", SizeQueryParams(n=len(ids)), device=ids.device)
     sums = torch.empty(blocks, POSE_SUMS, dtype=torch.float64, device=ids.device)
     done = launch(

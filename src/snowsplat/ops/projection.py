@@ -31,7 +31,7 @@ from snowsplat.ops.params import (
 )
 from snowsplat.ops.splats import SplatGradient, Splats2D, packed_width
 from snowsplat.ops.sums import sum_of_rows
-from snowsplat.ops.view import View
+from snowsplat.ops.view import View, camera_params
 from snowsplat.util.native_layout import POSE_SUMS
 
 
@@ -59,7 +59,7 @@ def project(gaussians: GaussianParameters, view: View) -> Splats2D:
     Raises ValueError if shapes, dtypes or devices do not match.
     """
     tensors = checked_parameters("project", gaussians, view.sh_degree)
-    camera = view.camera_params(gaussians.means)
+    camera = camera_params(view, gaussians.means)
     packed, ids = _Project.apply(view.sh_degree, camera, camera.cam_from_world, *tensors.values())
     return Splats2D(packed, ids, 3)
 
@@ -93,7 +93,7 @@ def add_project_gradients(
             n=len(gradient.ids),
             ids=gradient.ids,
             gaussians=gaussian_tensors(tensors, view.sh_degree),
-            camera=view.camera_params(means),
+            camera=camera_params(view, means),
             grad_packed=gradient.checked(op, means),
             grads=GaussianGradients(**{name: grads[name] for name in PARAMETERS}),
             pose=None,

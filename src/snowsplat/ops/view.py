@@ -61,17 +61,18 @@ class View:
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"View: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
 
-    def camera_params(self, like: Tensor) -> CameraParams:
-        """The camera as a parameter of native functions, its pose in the dtype of `like`."""
-        pose = self.cam_from_world.to(like.device, like.dtype, non_blocking=True)
-        return CameraParams(
-            cam_from_world=pose.contiguous(),
-            width=float(self.width),
-            height=float(self.height),
-            fx=float(self.fx),
-            fy=float(self.fy),
-            cx=float(self.cx),
-            cy=float(self.cy),
-            near=float(self.near),
-            antialiased=self.antialiased,
-        )
+
+def camera_params(view: View, like: Tensor) -> CameraParams:
+    """The camera as a parameter of native functions, its pose in the dtype of `like`."""
+    pose = view.cam_from_world.to(like.device, like.dtype, non_blocking=True)
+    return CameraParams(
+        cam_from_world=pose.contiguous(),
+        width=float(view.width),
+        height=float(view.height),
+        fx=float(view.fx),
+        fy=float(view.fy),
+        cx=float(view.cx),
+        cy=float(view.cy),
+        near=float(view.near),
+        antialiased=view.antialiased,
+    )
