@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from workloads import Workload
 from snowsplat import ops
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import view_of
 
 #: Gaussians, width, height: from one of each to a few thousand, not multiples of block sizes.
 SIZES = ((0, 1, 1), (1, 5, 3), (33, 17, 31), (999, 95, 53), (4099, 161, 99))
@@ -91,16 +93,14 @@ def random_scene(count: int, width: int, height: int) -> Workload:
 def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
     camera = scene.camera
     size = camera.width, camera.height
-    view = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    params = {
-        name: p.to(device, dtype, copy=True).requires_grad_()
-        for name, p in scene.gaussians.parameters().items()
-    }
+    gaussians = scene.gaussians.map(lambda p: p.to(device, dtype, copy=True).requires_grad_())
+    params = gaussians.parameters()
     pose = camera.cam_from_world.to(device, dtype, copy=True).requires_grad_()
+    view = view_of(gaussians, replace(camera, cam_from_world=pose))
     background = torch.rand(3, device=device, dtype=dtype).requires_grad_()
 
     # Gradients down to the parameters and the pose; depth is a second group of channels.
-    splats = ops.project(**params, cam_from_world=pose, **view, sh_degree=3)
+    splats = ops.project(gaussians, view)
     image, alpha, depth = ops.rasterize(splats, *size, background, with_depth=True)
     assert depth is not None
     photo = torch.rand(3, camera.height, camera.width, device=device, dtype=dtype).permute(1, 2, 0)
@@ -110,7 +110,8 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
 
     # As in a training step: the gradient of the splats, at a lower degree.
     with torch.no_grad():
-        splats = ops.project(**params, cam_from_world=pose.detach(), **view, sh_degree=1)
+        view = replace(view, cam_from_world=pose.detach(), sh_degree=1)
+        splats = ops.project(gaussians, view)
         splats.packed.requires_grad_()
         splats.abs_grad = torch.zeros(len(splats), 2, device=device, dtype=dtype)
         with torch.enable_grad():
@@ -130,15 +131,11 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
             (True, None, splats.ids[rows], gradient[rows]),
         ):
             ops.adam_step(
-                params,
-                *moments,
-                ids,
-                grad,
-                pose.detach(),
-                **view,
-                sh_degree=1,
-                lr=dict.fromkeys(params, 1e-3),
-                step=1,
+                gaussians,
+                ops.Moments(*moments),
+                ops.SplatGradient(ids, grad),
+                view,
+                ops.AdamRates(dict.fromkeys(params, 1e-3), 1),
                 visible_only=visible_only,
                 valid=valid,
             )

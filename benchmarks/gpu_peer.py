@@ -21,6 +21,7 @@ from workloads import Workload
 
 from snowsplat import ops
 from snowsplat.evaluation.metrics import psnr
+from snowsplat.scene.render import project
 
 
 def build() -> None:
@@ -109,17 +110,12 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
         optimizer.step()
 
     capacity = step.trainer.runner.capacity
-    parameters = {
-        name: p.clone().requires_grad_() for name, p in step.trainer.gaussians.parameters().items()
-    }
+    gaussians = step.trainer.gaussians.map(lambda p: p.clone().requires_grad_())
 
     def our_gradient() -> None:
-        for p in parameters.values():
+        for p in gaussians.parameters().values():
             p.grad = None
-        view = {k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
-        splats = ops.project(
-            **parameters, cam_from_world=camera.cam_from_world, **view, sh_degree=3
-        )
+        splats = project(gaussians, camera)
         image, _, _ = ops.rasterize(splats, camera.width, camera.height, capacity=capacity)
         ops.photometric_loss(image, photo).backward()
 
@@ -140,8 +136,6 @@ def compare(scene: Workload, size: str, repeats: int) -> None:
 
 @torch.no_grad()
 def _our_image(step: Step) -> Tensor:
-    from snowsplat.scene.render import project
-
     camera = step.camera
     splats = project(step.trainer.gaussians, camera)
     return ops.rasterize(

@@ -18,9 +18,9 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
-from snowsplat.ops import native, reference
-from snowsplat.ops.adam import PARAMETERS
-from snowsplat.ops.scratch import take_rows
+from snowsplat.ops import AdamRates, Moments, SplatGradient, native, reference
+from snowsplat.ops.gaussian_parameters import PARAMETERS
+from snowsplat.scene.render import view_of
 from snowsplat.util.process import single_threaded
 
 #: Native functions by stage. Functions without one appear under their own name.
@@ -102,20 +102,15 @@ class Iteration:
         self.visible_only = visible_only
         self.use_reference = use_reference
         self.ops = reference if use_reference else ops
-        self.parameters = workload.gaussians.parameters()
         count = len(workload.gaussians)
         # Parameters are rows of larger tensors, as after density control in a training run.
         rows = torch.arange(count)
-        self.exp_avg, self.exp_avg_sq = (
-            {name: take_rows(torch.zeros_like(p), rows) for name, p in self.parameters.items()}
-            for _ in range(2)
-        )
-        self.rates = dict.fromkeys(PARAMETERS, 0.0)
+        zeros = workload.gaussians.map(torch.zeros_like)
+        m, v = zeros.select(rows), zeros.select(rows)
+        self.moments = Moments(m.parameters(), v.parameters())
+        self.rates = AdamRates(dict.fromkeys(PARAMETERS, 0.0), step=1000)
         self.statistics = torch.zeros(3, count)
-        camera = workload.camera
-        self.intrinsics = {
-            name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
-        }
+        self.view = view_of(workload.gaussians, workload.camera, 3)
         self.background = torch.zeros(3)
         self.target = self._photo()
 
@@ -130,10 +125,7 @@ class Iteration:
         return planes.clamp(0, 255).to(torch.uint8).permute(1, 2, 0)
 
     def _project(self, module: Any) -> ops.Splats2D:
-        pose = self.workload.camera.cam_from_world
-        return module.project(
-            **self.parameters, cam_from_world=pose, **self.intrinsics, sh_degree=3
-        )
+        return module.project(self.workload.gaussians, self.view)
 
     @torch.no_grad()
     def run(
@@ -142,7 +134,7 @@ class Iteration:
         inspect: Callable[[ops.Splats2D, Tensor], None] | None = None,
     ) -> None:
         """One iteration. ``inspect`` is called with the splats and the image before backward."""
-        step, camera, module = 1000, self.workload.camera, self.ops
+        camera, module = self.workload.camera, self.ops
         splats = self._project(module)
         with torch.enable_grad():
             splats.packed.requires_grad_()
@@ -151,20 +143,13 @@ class Iteration:
                 inspect(splats, image)
             loss = module.photometric_loss(image, self.target)
             loss.backward()
-        assert splats.ids is not None
-        assert splats.packed.grad is not None
         module.accumulate_screen_statistics(splats, camera.width, camera.height, *self.statistics)
         module.adam_step(
-            self.parameters,
-            self.exp_avg,
-            self.exp_avg_sq,
-            splats.ids,
-            splats.packed.grad,
-            camera.cam_from_world,
-            **self.intrinsics,
-            sh_degree=3,
-            lr=self.rates,
-            step=step,
+            self.workload.gaussians,
+            self.moments,
+            SplatGradient.of(splats),
+            self.view,
+            self.rates,
             visible_only=self.visible_only,
         )
 

@@ -26,9 +26,9 @@ from processes import GRADIENT, SPLAT, measure, ranks, write_photos
 from workloads import SIZES, workload
 
 from snowsplat import ops
-from snowsplat.ops.adam import PARAMETERS
 from snowsplat.ops.splats import Splats2D
 from snowsplat.pipeline.run import processes
+from snowsplat.scene.render import view_of
 from snowsplat.training.processes.process_shards import ProcessShards
 from snowsplat.util.process import single_threaded
 
@@ -105,23 +105,17 @@ def measured_costs(size: str, threads: int, repeats: int) -> Costs:
     iteration.measure(2, threads)
     laps = iteration.measure(repeats, threads)["wall"]
     stages = {name: statistics.median(times) for name, times in laps.items()}
-    camera, parameters = scene.camera, scene.gaussians.parameters()
-    view = {
-        "width": camera.width,
-        "height": camera.height,
-        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
-        "sh_degree": 3,
-    }
+    gaussians, view = scene.gaussians, view_of(scene.gaussians, scene.camera, 3)
     with single_threaded():
         ops.set_num_threads(threads)
-        splats = ops.project(*parameters.values(), camera.cam_from_world, **view)
-        sums = {name: torch.zeros_like(parameters[name]) for name in PARAMETERS}
-        gradient = torch.ones_like(splats.packed)
+        splats = ops.project(gaussians, view)
+        assert splats.ids is not None
+        sums = {name: torch.zeros_like(p) for name, p in gaussians.parameters().items()}
+        gradient = ops.SplatGradient(splats.ids, torch.ones_like(splats.packed))
         times = []
         for _ in range(repeats + 2):
             begin = time.perf_counter()
-            pose = camera.cam_from_world
-            ops.add_project_gradients(parameters, sums, splats.ids, gradient, pose, **view)
+            ops.add_project_gradients(gaussians, sums, gradient, view)
             times.append(time.perf_counter() - begin)
         backward = statistics.median(times)
     cull, forward, adam = (

@@ -20,6 +20,7 @@ from snowsplat.formats.lod import read_index
 from snowsplat.ops import native, reference
 from snowsplat.ops.cuda.launches import KERNELS, launch_by
 from snowsplat.ops.native import LAUNCHERS
+from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from . import fork_server
@@ -104,12 +105,7 @@ def test_pairs_are_those_of_the_reference(monkeypatch):
 
     scene = workloads.workload("tiny")
     camera = scene.camera
-    splats = ops.project(
-        **scene.gaussians.parameters(),
-        cam_from_world=camera.cam_from_world,
-        **{k: getattr(camera, k) for k in ("width", "height", "fx", "fy", "cx", "cy")},
-        sh_degree=3,
-    )
+    splats = project(scene.gaussians, camera)
     splats.packed.requires_grad_()
     image, _, _ = ops.rasterize(splats, camera.width, camera.height)
     frame = pairs.frame_of(image)
@@ -752,23 +748,12 @@ def test_comparison_with_a_peer(fake_gpu, capsys, monkeypatch):
         sh_degree, packed,
     ):  # fmt: skip
         assert viewmats.shape == (1, 4, 4)
-        splats = reference.project(
-            means,
-            scales.log(),
-            quats,
-            opacities.logit(),
-            colors[:, :1],
-            colors[:, 1:],
-            viewmats[0, :3],
-            width=width,
-            height=height,
-            fx=float(Ks[0, 0, 0]),
-            fy=float(Ks[0, 1, 1]),
-            cx=float(Ks[0, 0, 2]),
-            cy=float(Ks[0, 1, 2]),
-            sh_degree=sh_degree,
-            near=near_plane,
+        gaussians = Gaussians(
+            means, scales.log(), quats, opacities.logit(), colors[:, :1], colors[:, 1:]
         )
+        (fx, _, cx), (_, fy, cy), _ = Ks[0].tolist()
+        view = ops.View(viewmats[0, :3], width, height, fx, fy, cx, cy, sh_degree, near_plane)
+        splats = reference.project(gaussians, view)
         image, alpha, _ = reference.rasterize(splats, width, height)
         return image[None], alpha[None, :, :, None], {}
 

@@ -86,11 +86,11 @@ def test_a_checkpoint_of_gsplat_becomes_a_scene(tmp_path, monkeypatch):
         assert torch.equal(read.parameters()[name], parameter), name
 
 
-def test_an_image_with_the_camera_matrices_of_gsplat(tmp_path, monkeypatch, capsys):
+def test_the_call_of_gsplat(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_gaussians("garden.ply", random_scene())
     run(GSPLAT[1])
-    assert capsys.readouterr().out.split("\n")[0] == "(240, 320, 3) (240, 320)"
+    assert capsys.readouterr().out.split("\n")[0] == "(1, 240, 320, 4) (1, 240, 320, 1)"
 
 
 def random_scene() -> Gaussians:

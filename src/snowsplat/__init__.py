@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.videos import VideoOptions, render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
+    from snowsplat.scene.rasterization import rasterization
     from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.part import Part
     from snowsplat.training.settings.config import TrainConfig, parts_of
@@ -102,6 +103,7 @@ _MODULES = {
     "plan_blocks": "pipeline.blocks.plan",
     "train_blocks": "pipeline.blocks.train",
     "publish": "pipeline.publish",
+    "rasterization": "scene.rasterization",
     "read_gaussians": "formats",
     "recipe": "training.settings.recipes",
     "refine_photo": "extras.lift.refine_photo",
@@ -155,6 +157,7 @@ __all__ = [
     "parts_of",
     "plan_blocks",
     "publish",
+    "rasterization",
     "read_gaussians",
     "recipe",
     "refine_photo",

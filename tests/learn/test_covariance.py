@@ -12,9 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from snowsplat import Camera
+from snowsplat import Camera, Gaussians
 from snowsplat.ops import reference
 from snowsplat.ops.reference import LOW_PASS
+from snowsplat.scene.render import view_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -133,14 +134,12 @@ def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
     log_scales, quats = normal(n, 3, seed=1) * 0.3 - 2, normal(n, 4, seed=2)
     logits, colors = normal(n, seed=3) + 1, normal(n, 3, seed=4).sigmoid()
     pose = torch.eye(3, 4, dtype=torch.float64)
-    view = {"width": 40, "height": 30, "fx": 30.0, "fy": 32.0, "cx": 20.0, "cy": 14.0}
+    camera = Camera(40, 30, 30.0, 32.0, 20.0, 14.0, pose)
     dc = (colors - 0.5)[:, None] / reference.C0
     rest = torch.zeros(n, 0, 3, dtype=torch.float64)
-    expected = reference.project(
-        means, log_scales, quats, logits, dc, rest, pose, **view, sh_degree=0
-    )
+    gaussians = Gaussians(means, log_scales, quats, logits, dc, rest)
+    expected = reference.project(gaussians, view_of(gaussians, camera))
     M = experiment.rotation_and_scales([log_scales, quats])
-    camera = Camera(**view, cam_from_world=pose)
     found = experiment.project(means, M, logits.sigmoid(), colors, camera)
     rows = expected.ids.long()
     assert len(rows) > 5

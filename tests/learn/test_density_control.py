@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from snowsplat import Gaussians
-from snowsplat.ops import reference
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops import Splats2D, View, reference
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_schedule import Schedule
@@ -49,11 +48,8 @@ def test_the_measure():
     """τ is the norm of the gradient in a screen that spans [-1, 1]."""
     pose = torch.eye(3, 4, dtype=torch.float64)
     pose[2, 3] = 3.0
-    splats = reference.project(
-        *gaussians([-2.0], [0.5]).map(torch.Tensor.double).parameters().values(),
-        pose,
-        width=32, height=24, fx=30, fy=30, cx=16, cy=12, sh_degree=0,
-    )  # fmt: skip
+    scene = gaussians([-2.0], [0.5]).map(torch.Tensor.double)
+    splats = reference.project(scene, View(pose, 32, 24, 30.0, 30.0, 16.0, 12.0))
     packed = splats.packed.detach().requires_grad_()
     packed.grad = torch.zeros_like(packed)
     packed.grad[0, :2] = torch.tensor([0.3, -0.4])

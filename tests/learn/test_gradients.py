@@ -1,16 +1,16 @@
 """The formulas of docs/learn/gradients.md: each is compared with automatic differentiation."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from snowsplat.ops import reference
+from snowsplat.ops import View, reference
 from snowsplat.ops.splats import CONICS, DEPTHS, MEANS2D, OPACITIES, Splats2D
 
 FX, FY = 40.0, 42.0
-VIEW = {"width": 24, "height": 20, "fx": FX, "fy": FY, "cx": 12.0, "cy": 10.0, "sh_degree": 2}
 
 
 def normal(*shape: int, seed: int) -> Tensor:
@@ -35,6 +35,7 @@ POSE[:, :3] *= torch.linalg.det(POSE[:, :3])
 if POSE[2, 2] < 0:  # the camera looks in the direction of the Gaussians
     POSE[1:, :3] *= -1
 POSE[:, 3] = torch.tensor([0.05, -0.1, 0.2])
+VIEW = View(POSE, 24, 20, FX, FY, 12.0, 10.0, sh_degree=2)
 
 
 def sym(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -43,10 +44,10 @@ def sym(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 def test_image_to_splats():
     """Steps 2 and 3: the gradients of colour, mean, conic and opacity from sums over pixels."""
-    splats = reference.project(**parameters(5), cam_from_world=POSE, **VIEW)
+    splats = reference.project(SimpleNamespace(**parameters(5)), VIEW)
     packed = splats.packed.detach().requires_grad_()
     splats = Splats2D(packed, None, 3)
-    w, h = VIEW["width"], VIEW["height"]
+    w, h = VIEW.width, VIEW.height
     background = normal(3, seed=7).sigmoid()
     image, _, _ = reference.rasterize(splats, w, h, background)
     g = normal(h, w, 3, seed=8)
@@ -98,7 +99,7 @@ def test_splats_to_parameters():
     """Steps 4 to 8, for one Gaussian at a time."""
     n = 4
     values = parameters(n)
-    splats = reference.project(**values, cam_from_world=POSE, **VIEW)
+    splats = reference.project(SimpleNamespace(**values), VIEW)
     assert len(splats) == n
     upstream = normal(*splats.packed.shape, seed=9)
     upstream[:, DEPTHS] = 0
@@ -171,7 +172,7 @@ def test_finite_differences():
     values = {name: value.detach() for name, value in parameters(4).items()}
 
     def loss(means: Tensor) -> Tensor:
-        splats = reference.project(**{**values, "means": means}, cam_from_world=POSE, **VIEW)
+        splats = reference.project(SimpleNamespace(**{**values, "means": means}), VIEW)
         return reference.rasterize(splats, 24, 20)[0].square().sum()
 
     x = values["means"].clone().requires_grad_()

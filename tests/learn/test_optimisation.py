@@ -1,11 +1,12 @@
 """The formulas of docs/learn/optimisation.md."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from snowsplat import Gaussians, Points, TrainConfig
+from snowsplat import Gaussians, Points, TrainConfig, ops
 from snowsplat.ops import reference
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.rates import LearningRates
@@ -52,8 +53,7 @@ def test_adam():
     m_all = {name: torch.zeros_like(p) for name, p in parameters.items()}
     v_all = {name: torch.zeros_like(p) for name, p in parameters.items()}
     rates = dict.fromkeys(parameters, lr)
-    view = {"width": 16, "height": 16, "fx": 16, "fy": 16, "cx": 8, "cy": 8, "sh_degree": 0}
-    pose = torch.eye(3, 4, dtype=torch.float64)
+    view = ops.View(torch.eye(3, 4), 16, 16, 16.0, 16.0, 8.0, 8.0)
     x = m = v = 0.0
     torch_x = torch.zeros(1, dtype=torch.float64, requires_grad=True)
     adam = torch.optim.Adam([torch_x], lr=lr, eps=1e-15)
@@ -72,9 +72,12 @@ def test_adam():
         packed = torch.zeros(1, 16, dtype=torch.float64)
         packed[:, 5] = g / (o * (1 - o))
         reference.adam_step(
-            parameters, m_all, v_all, torch.zeros(1, dtype=torch.int32), packed, pose,
-            **view, lr=rates, step=t,
-        )  # fmt: skip
+            SimpleNamespace(**parameters),
+            ops.Moments(m_all, v_all),
+            ops.SplatGradient(torch.zeros(1, dtype=torch.int32), packed),
+            view,
+            ops.AdamRates(rates, t),
+        )
         assert torch_x.item() == pytest.approx(x)
         assert float(parameters["opacity_logits"]) == pytest.approx(x)
 

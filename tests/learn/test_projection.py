@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from snowsplat.ops import reference
+from snowsplat import Gaussians
+from snowsplat.ops import View, reference
 from snowsplat.ops.reference import LOW_PASS
 
 FX, FY, CX, CY, WIDTH, HEIGHT = 60.0, 62.0, 33.0, 22.0, 64, 48
@@ -36,22 +37,15 @@ def rotation(seed: int) -> Tensor:
 
 def project(means: Tensor, log_scales: Tensor, quats: Tensor, pose: Tensor):
     n = len(means)
-    return reference.project(
+    gaussians = Gaussians(
         means,
         log_scales,
         quats,
         torch.zeros(n, dtype=torch.float64),
         torch.zeros(n, 1, 3, dtype=torch.float64),
         torch.zeros(n, 0, 3, dtype=torch.float64),
-        pose,
-        width=WIDTH,
-        height=HEIGHT,
-        fx=FX,
-        fy=FY,
-        cx=CX,
-        cy=CY,
-        sh_degree=0,
     )
+    return reference.project(gaussians, View(pose, WIDTH, HEIGHT, FX, FY, CX, CY))
 
 
 def test_the_jacobian():

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.ops import reference
+from snowsplat import Gaussians
+from snowsplat.ops import View, reference
 from snowsplat.scene.edit import sh_rotation
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "learn" / "spherical-harmonics.md"
@@ -88,11 +89,15 @@ def test_the_colour_is_that_of_the_code():
     mean = torch.tensor([[0.3, -0.2, 0.1]], dtype=torch.float64)
     pose = torch.eye(3, 4, dtype=torch.float64)
     pose[:, 3] = torch.tensor([0.2, 0.1, 3.0])
-    splats = reference.project(
-        mean, torch.full((1, 3), -2.0).double(), torch.eye(1, 4).double(),
-        torch.zeros(1).double(), h[:, :1], h[:, 1:], pose,
-        width=32, height=32, fx=30, fy=30, cx=16, cy=16, sh_degree=3,
-    )  # fmt: skip
+    scene = Gaussians(
+        mean,
+        torch.full((1, 3), -2.0).double(),
+        torch.eye(1, 4).double(),
+        torch.zeros(1).double(),
+        h[:, :1],
+        h[:, 1:],
+    )
+    splats = reference.project(scene, View(pose, 32, 32, 30.0, 30.0, 16.0, 16.0, sh_degree=3))
     u = mean[0] + pose[:, 3]  # W = I: the camera is at −t
     Y = reference.sh_basis((u / u.norm())[None], 3)[0]
     assert torch.allclose(splats.colors[0], (0.5 + Y @ h[0]).clamp(min=0))

@@ -11,7 +11,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest import mock
 
@@ -19,8 +19,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from snowsplat.ops import reference
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops import AdamRates, Splats2D, reference
 
 from .extreme_sweeps import check_plane_sweep, sweeps
 from .scenes import (
@@ -30,6 +29,7 @@ from .scenes import (
     as_float32,
     generator,
     normal,
+    take_step,
     tilted_pose,
     uniform,
     view_of,
@@ -67,16 +67,16 @@ class Extreme:
     def scene(self) -> Scene:
         g = generator(self.seed)
         width, height = self.size
-        view = view_of(width, height, self.focal * max(width, height), self.degree)
         pose = tilted_pose()
+        view = view_of(pose, width, height, self.focal * max(width, height), self.degree)
         kinds = list(zip(*self.gaussians, strict=True)) or [()] * 5
         count = len(self.gaussians)
         plain = uniform(g, 1.0, 6.0, count)
-        x = (uniform(g, -0.2, 1.2, count) * width - view["cx"]) / view["fx"]
-        y = (uniform(g, -0.2, 1.2, count) * height - view["cy"]) / view["fy"]
+        x = (uniform(g, -0.2, 1.2, count) * width - view.cx) / view.fx
+        y = (uniform(g, -0.2, 1.2, count) * height - view.cy) / view.fy
         in_camera = torch.stack([x, y, torch.ones(count)], dim=1) * plain[:, None]
         means = world_points(pose, _placed(kinds[0], in_camera, g))
-        scales = _scales(kinds[1], math.log(2.0 / view["fx"]) + plain.log(), g)
+        scales = _scales(kinds[1], math.log(2.0 / view.fx) + plain.log(), g)
         quats = normal(g, count, 4)
         factors = {"zero": 0.0, "1e-30": 1e-30, "1e15": 1e15}
         for i, kind in enumerate(kinds[2]):
@@ -96,7 +96,7 @@ class Extreme:
                 dc[i] = -100.0
         values = (means, scales, quats, logits, dc, rest)
         params = {n: as_float32(v) for n, v in zip(PARAMETERS, values, strict=True)}
-        return Scene(params, pose, view)
+        return Scene(params, view)
 
 
 def extremes(most: int = 6) -> st.SearchStrategy[Extreme]:
@@ -221,9 +221,7 @@ class Compared:
 
 def _every_row(scene: Scene, params: Sequence[Tensor], pose: Tensor) -> tuple[Tensor, Tensor]:
     """(N, 16) the reference's row of each Gaussian, NaN if not visible; and which are visible."""
-    splats = reference.project(
-        **dict(zip(PARAMETERS, params, strict=True)), cam_from_world=pose, **scene.view
-    )
+    splats = scene.of_leaves(*params, pose).project(reference)
     assert splats.ids is not None
     rows = torch.full((len(params[0]), splats.packed.shape[1]), torch.nan, dtype=torch.float64)
     rows = rows.index_copy(0, splats.ids.long(), splats.packed)
@@ -304,17 +302,15 @@ def check_adam(variant: Variant, leaf: Scene, ids: Tensor, cotangent: Tensor) ->
     params = {name: p.detach().clone() for name, p in leaf.params.items()}
     m, v = ({name: torch.zeros_like(p) for name, p in params.items()} for _ in range(2))
     nonfinite_rows = torch.zeros(6, dtype=torch.int32)
-    variant.ops.adam_step(
-        params,
+    take_step(
+        variant.ops,
+        replace(leaf, params=params),
         m,
         v,
         ids.to(torch.int32),
         cotangent.to(variant.dtype)[ids],
-        leaf.cam_from_world.detach(),
-        lr=dict.fromkeys(PARAMETERS, 1e-3),
-        step=1,
+        AdamRates(dict.fromkeys(PARAMETERS, 1e-3), 1),
         nonfinite_rows=nonfinite_rows,
-        **leaf.view,
     )
     for i, name in enumerate(PARAMETERS):
         grad = leaf.params[name].grad
@@ -422,17 +418,8 @@ def check_harm(variant: Variant, extreme: Extreme, value: float, picks: Sequence
         splats.packed.backward(cotangent)
         state = leaf.to(variant.dtype, requires_grad=False)
         m, v = ({n: torch.zeros_like(p) for n, p in state.params.items()} for _ in range(2))
-        variant.ops.adam_step(
-            state.params,
-            m,
-            v,
-            splats.ids,
-            cotangent,
-            state.cam_from_world,
-            lr=dict.fromkeys(m, 1e-3),
-            step=1,
-            **state.view,
-        )
+        rates = AdamRates(dict.fromkeys(m, 1e-3), 1)
+        take_step(variant.ops, state, m, v, splats.ids, cotangent, rates)
         for name, tensor in (*m.items(), *v.items()):
             assert tensor.isfinite().all(), f"a moment of {name}"
         rows = {f"{n} after": t for n, t in state.params.items()}

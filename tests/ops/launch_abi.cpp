@@ -24,6 +24,18 @@ SNOW_ENTRY(record, RecordParams) {
   return p.nothing ? 0 : (int64_t(1) << 40) + p.n;
 }
 
+// As many fields as SNOW_FIELDS takes.
+struct ManyParams {
+  int64_t n, f1, f2, f3, f4, f5, f6, f7, f8, f9, f10, f11, f12, f13, f14, f15, f16, f17, f18, f19,
+      f20, f21, f22, f23, f24, f25, f26, f27, f28, f29, f30, f31, f32, f33, f34, f35, f36, f37, f38,
+      f39;
+  SNOW_FIELDS(n, f1, f2, f3, f4, f5, f6, f7, f8, f9, f10, f11, f12, f13, f14, f15, f16, f17, f18,
+              f19, f20, f21, f22, f23, f24, f25, f26, f27, f28, f29, f30, f31, f32, f33, f34, f35,
+              f36, f37, f38, f39)
+};
+
+SNOW_ENTRY(record_many, ManyParams) { return p.f20 + p.f39; }
+
 // A layout that differs from what Python expects.
 struct SwappedParams {
   int64_t n;

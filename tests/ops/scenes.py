@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import torch
@@ -17,8 +17,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from snowsplat import ops
-from snowsplat.ops import reference
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops import AdamRates, Moments, SplatGradient, Splats2D, View, reference
 
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 
@@ -62,8 +61,19 @@ class Scene:
     """Gaussians and a camera: the arguments of `project`."""
 
     params: dict[str, Tensor]
-    cam_from_world: Tensor  # (3, 4) float64 in every variant
-    view: dict[str, Any]  # width, height, fx, fy, cx, cy, sh_degree; antialiased or nothing
+    view: View  # its pose is float64 in every variant
+
+    @property
+    def gaussians(self) -> SimpleNamespace:
+        return SimpleNamespace(**self.params)
+
+    @property
+    def cam_from_world(self) -> Tensor:
+        return self.view.cam_from_world
+
+    def looking(self, **changes: Any) -> Scene:
+        """With another view."""
+        return replace(self, view=replace(self.view, **changes))
 
     def to(self, dtype: torch.dtype, requires_grad: bool = True) -> Scene:
         """New leaf tensors of another dtype."""
@@ -72,19 +82,18 @@ class Scene:
             for name, p in self.params.items()
         }
         pose = self.cam_from_world.detach().clone().requires_grad_(requires_grad)
-        return replace(self, params=params, cam_from_world=pose)
+        return replace(self, params=params).looking(cam_from_world=pose)
 
     def project(self, module: ModuleType, **changes: Any) -> Splats2D:
         """Its splats, without empty rows."""
-        view = {**self.view, **changes}
-        splats = module.project(**self.params, cam_from_world=self.cam_from_world, **view)
+        splats = module.project(self.gaussians, replace(self.view, **changes))
         seen = splats.ids >= 0
         if bool(seen.all()):
             return splats
         return Splats2D(splats.packed[seen], splats.ids[seen], splats.channels)
 
     def antialiased(self) -> Scene:
-        return replace(self, view=self.view | {"antialiased": True})
+        return self.looking(antialiased=True)
 
     def rows(self, rows: Sequence[int]) -> Scene:
         """Only these Gaussians."""
@@ -93,9 +102,14 @@ class Scene:
     def leaves(self) -> dict[str, Tensor]:
         return {**self.params, "cam_from_world": self.cam_from_world}
 
+    def of_leaves(self, *leaves: Tensor) -> Scene:
+        """With other tensors, in the order of `leaves()`."""
+        params = dict(zip(self.params, leaves[:-1], strict=True))
+        return replace(self, params=params).looking(cam_from_world=leaves[-1])
+
     @property
     def size(self) -> tuple[int, int]:
-        return self.view["width"], self.view["height"]
+        return self.view.width, self.view.height
 
 
 def generator(seed: int) -> torch.Generator:
@@ -116,19 +130,29 @@ def as_float32(values: Tensor) -> Tensor:
     return values.float().double()
 
 
-def view_of(width: int, height: int, focal: float | None = None, sh_degree: int = 3) -> dict:
+def take_step(
+    module: ModuleType,
+    scene: Scene,
+    m: dict[str, Tensor],
+    v: dict[str, Tensor],
+    ids: Tensor,
+    packed_grad: Tensor | None,
+    rates: AdamRates,
+    **options: Any,
+) -> None:
+    """`adam_step` of a scene."""
+    gradient = SplatGradient(ids, packed_grad)
+    module.adam_step(scene.gaussians, Moments(m, v), gradient, scene.view, rates, **options)
+
+
+def view_of(
+    pose: Tensor, width: int, height: int, focal: float | None = None, sh_degree: int = 3
+) -> View:
     """An asymmetric camera: fx ≠ fy, the principal point is not at the centre."""
     focal = focal or 0.9 * max(width, height)
     focal = float(torch.tensor(focal).float())
-    return {
-        "width": width,
-        "height": height,
-        "fx": focal,
-        "fy": focal * 1.125,
-        "cx": width / 2 + 0.25,
-        "cy": height / 2 - 0.375,
-        "sh_degree": sh_degree,
-    }
+    cx, cy = width / 2 + 0.25, height / 2 - 0.375
+    return View(pose, width, height, focal, focal * 1.125, cx, cy, sh_degree)
 
 
 def tilted_pose() -> Tensor:
@@ -162,12 +186,13 @@ def random_scene(
     Some lie behind the camera, some outside of the image, and some are too transparent.
     """
     g = generator(seed)
-    view, pose = view_of(width, height, sh_degree=sh_degree), tilted_pose()
+    pose = tilted_pose()
+    view = view_of(pose, width, height, sh_degree=sh_degree)
     depth = uniform(g, 1.0, 6.0, count)
     depth[6::11] *= -1
-    x = (uniform(g, -0.2, 1.2, count) * width - view["cx"]) / view["fx"] * depth
-    y = (uniform(g, -0.2, 1.2, count) * height - view["cy"]) / view["fy"] * depth
-    size = math.log(pixels / view["fx"]) + depth.abs().log()
+    x = (uniform(g, -0.2, 1.2, count) * width - view.cx) / view.fx * depth
+    y = (uniform(g, -0.2, 1.2, count) * height - view.cy) / view.fy * depth
+    size = math.log(pixels / view.fx) + depth.abs().log()
     params = {
         "means": world_points(pose, torch.stack([x, y, depth], dim=1)),
         "log_scales": as_float32(size[:, None] + 0.6 * normal(g, count, 3)),
@@ -177,7 +202,7 @@ def random_scene(
         "sh_rest": as_float32(0.3 * normal(g, count, rest, 3)),
     }
     params["opacity_logits"][8::13] = -6.0
-    return Scene(params, pose, view)
+    return Scene(params, view)
 
 
 def smooth_scene(seed: int = 0, sh_degree: int = 3) -> Scene:
@@ -188,7 +213,8 @@ def smooth_scene(seed: int = 0, sh_degree: int = 3) -> Scene:
     Jacobian is clamped.
     """
     g = generator(seed)
-    view, pose = view_of(5, 4, focal=5.0, sh_degree=sh_degree), tilted_pose()
+    pose = tilted_pose()
+    view = view_of(pose, 5, 4, focal=5.0, sh_degree=sh_degree)
     in_camera = [[-0.3, 0.2, 1.5], [0.4, -0.3, 2.0], [0.1, 0.4, 2.6], [5.0, 0.3, 3.0]]
     params = {
         "means": world_points(pose, torch.tensor(in_camera, dtype=torch.float64)),
@@ -199,7 +225,7 @@ def smooth_scene(seed: int = 0, sh_degree: int = 3) -> Scene:
         "sh_rest": uniform(g, -0.05, 0.05, 4, 15, 3),
     }
     params["log_scales"][3] += 1.25
-    return Scene(params, pose, view)
+    return Scene(params, view)
 
 
 def random_splats(

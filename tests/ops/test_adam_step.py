@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import reference
+from snowsplat.ops import AdamRates, reference
 
 from .scenes import (
     PARAMETERS,
@@ -24,6 +25,7 @@ from .scenes import (
     normal,
     one_line,
     random_scene,
+    take_step,
     uniform,
 )
 
@@ -67,16 +69,16 @@ class Optimised:
     def step(
         self, packed_grad: Tensor, step: int = 1, ids: Tensor | None = None, **options: Any
     ) -> None:
-        arguments = {**self.scene.view, "lr": RATES, **options}
-        self.variant.ops.adam_step(
-            self.params,
+        rates = {k: options.pop(k) for k in ("lr", "betas", "eps") if k in options}
+        take_step(
+            self.variant.ops,
+            self.scene,
             self.m,
             self.v,
             self.visible() if ids is None else ids,
             packed_grad.to(self.variant.dtype),
-            self.scene.cam_from_world,
-            step=step,
-            **arguments,
+            AdamRates(**{"lr": RATES, "step": step, **rates}),
+            **options,
         )
 
 
@@ -247,7 +249,7 @@ def test_rows_of_inactive_degrees_stay_unchanged(variant: Variant, degree: int) 
     state = Optimised(variant, random_scene(4, 20, sh_degree=degree))
     state.params["sh_rest"].grad = torch.ones_like(state.params["sh_rest"])
     before = state.copy()
-    state.step(packed_grads(0, len(state.visible())), sh_degree=degree)
+    state.step(packed_grads(0, len(state.visible())))
     active = (degree + 1) ** 2 - 1
     for name in ("sh_rest", "m of sh_rest", "v of sh_rest"):
         tensor = state.tensors()[name]
@@ -345,19 +347,18 @@ def test_zero_moments_and_gradients_change_nothing(variant: Variant) -> None:
     assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
 
 
-def arguments() -> dict[str, Any]:
+def step_with(change: dict[str, Any]) -> None:
+    """`adam_step` of four Gaussians with some arguments, or items of arguments, replaced."""
     scene = random_scene(1, 4).to(torch.float32, requires_grad=False)
-    return {
-        "params": scene.params,
-        "exp_avg": {n: torch.zeros_like(p) for n, p in scene.params.items()},
-        "exp_avg_sq": {n: torch.zeros_like(p) for n, p in scene.params.items()},
-        "ids": torch.arange(2, dtype=torch.int32),
-        "packed_grad": torch.zeros(2, 16),
-        "cam_from_world": scene.cam_from_world,
-        **scene.view,
-        "lr": RATES,
-        "step": 1,
-    }
+    params = scene.params | change.get("params", {})
+    zeros = {n: torch.zeros_like(p) for n, p in scene.params.items()}
+    m, v = ({**zeros, **change.get(name, {})} for name in ("exp_avg", "exp_avg_sq"))
+    for moment in (m, v):
+        moment.pop(change.get("missing", ""), None)
+    ids = change.get("ids", torch.arange(2, dtype=torch.int32))
+    grad = change.get("packed_grad", torch.zeros(2, 16))
+    rates = AdamRates(change.get("lr", RATES), change.get("step", 1))
+    take_step(ops, replace(scene, params=params), m, v, ids, grad, rates)
 
 
 WRONG = {
@@ -366,29 +367,19 @@ WRONG = {
     "gradient of another dtype": {"packed_grad": torch.zeros(2, 16).double()},
     "ids of another type": {"ids": torch.arange(2)},
     "no first step": {"step": 0},
-    "pose of another shape": {"cam_from_world": torch.eye(4, dtype=torch.float64)},
-    "degree beyond the rows": {"sh_degree": 4},
+    "degree beyond the rows": {"params": {"sh_rest": torch.zeros(4, 8, 3)}},
     "a rate is missing": {"lr": {"means": 0.1}},
-    "focal length NaN": {"fx": math.nan},
-    "no width": {"width": 0},
+    "a moment is missing": {"missing": "means"},
+    **{
+        f"{group} of another {what}": {group: {"means": wrong}}
+        for group in ("params", "exp_avg", "exp_avg_sq")
+        for what, wrong in (("shape", torch.zeros(4, 4)), ("dtype", torch.zeros(4, 3).double()))
+    },
 }
 
 
 @pytest.mark.parametrize("change", WRONG.values(), ids=WRONG.keys())
 def test_wrong_input(change: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="adam_step") as caught:
-        ops.adam_step(**{**arguments(), **change})
+    with pytest.raises(ValueError, match=r"^(adam_step|AdamRates): ") as caught:
+        step_with(change)
     assert one_line(caught.value)
-
-
-@pytest.mark.parametrize("group", ["params", "exp_avg", "exp_avg_sq"])
-def test_wrong_tensors(group: str) -> None:
-    """A wrong shape, a wrong dtype, or a missing name."""
-    for wrong in (torch.zeros(4, 4), torch.zeros(4, 3).double(), None):
-        given = arguments()
-        given[group] = {n: t for n, t in given[group].items() if n != "means"}
-        if wrong is not None:
-            given[group]["means"] = wrong
-        with pytest.raises(ValueError, match="adam_step") as caught:
-            ops.adam_step(**given)
-        assert one_line(caught.value)

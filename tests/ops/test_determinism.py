@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops.capacity import Capacity
+from snowsplat.ops import AdamRates, Capacity
 
 from .scenes import (
     Scene,
@@ -21,6 +21,7 @@ from .scenes import (
     normal,
     random_scene,
     random_splats,
+    take_step,
     uniform,
 )
 
@@ -192,17 +193,15 @@ def test_training_steps(dtype: torch.dtype, visible_only: bool) -> None:
             ops.photometric_loss(image, target).backward()
             assert splats.ids is not None
             assert splats.packed.grad is not None
-            ops.adam_step(
-                scene.params,
+            take_step(
+                ops,
+                scene,
                 m,
                 v,
                 splats.ids,
                 splats.packed.grad,
-                scene.cam_from_world,
-                lr=rates,
-                step=step,
+                AdamRates(rates, step),
                 visible_only=visible_only,
-                **scene.view,
             )
         moments = {f"m of {n}": t for n, t in m.items()} | {f"v of {n}": t for n, t in v.items()}
         results.append({**scene.params, **moments})

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops import AdamRates, Splats2D
 
 from .extremes import CHECKS, LONG, check_photometric
 from .scenes import (
@@ -27,6 +27,7 @@ from .scenes import (
     normal,
     random_scene,
     random_splats,
+    take_step,
     uniform,
 )
 
@@ -110,17 +111,8 @@ def step(
     stepped = scene.to(variant.dtype, requires_grad=False)
     m = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
     v = {name: torch.zeros_like(p) for name, p in stepped.params.items()}
-    variant.ops.adam_step(
-        stepped.params,
-        m,
-        v,
-        ids,
-        packed_grad,
-        stepped.cam_from_world,
-        lr=dict.fromkeys(m, 1e-3),
-        step=1,
-        **stepped.view,
-    )
+    rates = AdamRates(dict.fromkeys(m, 1e-3), 1)
+    take_step(variant.ops, stepped, m, v, ids, packed_grad, rates)
     return {**stepped.params, **{f"m of {name}": tensor for name, tensor in m.items()}}
 
 
@@ -298,18 +290,16 @@ def test_gradients_that_overflow_are_skipped(
         nonfinite_rows = torch.ones(6, dtype=torch.int32)
         broken = packed_grad is grad
         state.params["opacity_logits"].grad = extra if broken else torch.zeros_like(extra)
-        variant.ops.adam_step(
-            state.params,
+        take_step(
+            variant.ops,
+            state,
             m,
             v,
             ids,
             packed_grad.to(variant.dtype),
-            state.cam_from_world,
-            lr=dict.fromkeys(m, 1e-3),
-            step=1,
+            AdamRates(dict.fromkeys(m, 1e-3), 1),
             visible_only=visible_only,
             nonfinite_rows=nonfinite_rows,
-            **state.view,
         )
         for tensors in (state.params, m, v):
             assert_finite(dict(tensors))

@@ -2,7 +2,7 @@ import functools
 import os
 import subprocess
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -93,6 +93,22 @@ def test_torch_parameters_and_n_zero(recording):
     params = record_params(out=torch.nn.Parameter(torch.zeros(6, dtype=torch.float64)), n=0)
     assert native.launch("record", params) == 2**40
     assert params.out.abs().max() == 0
+
+
+ManyParams = make_dataclass(
+    "ManyParams",
+    [("n", int), *((f"f{i}", int) for i in range(1, 40))],
+    bases=(Params,),
+    slots=True,
+    kw_only=True,
+)
+
+
+def test_a_struct_of_40_fields(recording, monkeypatch):
+    """The limit of `SNOW_FIELDS`; the largest struct of the operations has half of them."""
+    monkeypatch.setattr(native, "ENTRIES", {"record_many": ManyParams})
+    params = ManyParams(n=0, **{f"f{i}": i for i in range(1, 40)})
+    assert native.launch("record_many", params, device=torch.device("cpu")) == 20 + 39
 
 
 def test_launch_costs_little(recording):

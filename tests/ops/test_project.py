@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from .scenes import (
 )
 
 IDENTITY = torch.eye(3, 4, dtype=torch.float64)
-VIEW = view_of(40, 30, focal=50.0, sh_degree=0)
+VIEW = view_of(IDENTITY, 40, 30, focal=50.0, sh_degree=0)
 
 
 def single(
@@ -53,7 +54,7 @@ def single(
         "sh_dc": tensor([[[0.5, -0.25, -9.0]]]),
         "sh_rest": torch.zeros(1, 0, 3, dtype=torch.float64),
     }
-    return Scene(params, IDENTITY, VIEW)
+    return Scene(params, VIEW)
 
 
 def covariance(conic: Tensor) -> Tensor:
@@ -69,9 +70,9 @@ def test_gaussian_on_the_axis(variant: Variant) -> None:
     assert splats.packed.shape == (1, 16)
     assert splats.packed.dtype == variant.dtype
     close = partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6, check_dtype=False)
-    close(splats.means2d[0], torch.tensor([VIEW["cx"], VIEW["cy"]]))
+    close(splats.means2d[0], torch.tensor([VIEW.cx, VIEW.cy]))
     # The variances are (f s / z)² + 0.3 and the depth axis of the Gaussian does not matter.
-    sxx, syy = (VIEW["fx"] * 0.1 / 2) ** 2 + 0.3, (VIEW["fy"] * 0.2 / 2) ** 2 + 0.3
+    sxx, syy = (VIEW.fx * 0.1 / 2) ** 2 + 0.3, (VIEW.fy * 0.2 / 2) ** 2 + 0.3
     close(splats.conics[0], torch.tensor([1 / sxx, 0, 1 / syy]))
     close(splats.opacities[0], torch.tensor(1 / (1 + math.exp(-1))))
     close(splats.depths[0], torch.tensor(2.0))
@@ -87,7 +88,7 @@ def test_an_antialiased_splat_keeps_its_integral(variant: Variant, size: float) 
     splats = scene.to(variant.dtype, requires_grad=False).project(variant.ops)
     a, b, c = splats.conics[0].double().tolist()
     integral = float(splats.opacities[0]) / math.sqrt(a * c - b * b)
-    sharp = VIEW["fx"] * VIEW["fy"] * (size / 2) ** 2 / (1 + math.exp(-2))
+    sharp = VIEW.fx * VIEW.fy * (size / 2) ** 2 / (1 + math.exp(-2))
     assert integral == pytest.approx(sharp, rel=1e-5)
 
 
@@ -112,11 +113,8 @@ def test_length_of_the_quaternion_does_not_matter(variant: Variant) -> None:
     scene = random_scene(3, 20).to(variant.dtype)
     expected = scene.project(variant.ops)
     for factor in (1e-3, 7.0, 1e4):
-        scaled = Scene(
-            {**scene.params, "quats": scene.params["quats"] * factor},
-            scene.cam_from_world,
-            scene.view,
-        )
+        quats = scene.params["quats"] * factor
+        scaled = replace(scene, params=scene.params | {"quats": quats})
         assert_close(scaled.project(variant.ops).packed, expected.packed, 1e-5)
 
 
@@ -133,11 +131,11 @@ def test_zero_quaternion_is_no_rotation(variant: Variant) -> None:
 def test_isotropic_gaussian_off_the_axis(variant: Variant) -> None:
     x, y, z, s = 0.3, -0.2, 2.0, 0.15
     splats = single((x, y, z), (s, s, s)).to(variant.dtype).project(variant.ops)
-    fx, fy = VIEW["fx"], VIEW["fy"]
+    fx, fy = VIEW.fx, VIEW.fy
     J = torch.tensor([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]]).double()
     expected = s**2 * J @ J.T + 0.3 * torch.eye(2)
     assert_close(covariance(splats.conics[0]), expected, 1e-5)
-    centre = torch.tensor([[fx * x / z + VIEW["cx"], fy * y / z + VIEW["cy"]]])
+    centre = torch.tensor([[fx * x / z + VIEW.cx, fy * y / z + VIEW.cy]])
     assert_close(splats.means2d, centre, 1e-6)
 
 
@@ -145,7 +143,7 @@ def test_jacobian_is_clamped_outside_of_the_image(variant: Variant) -> None:
     """The centre is at x/z = 1.5; the ratio in J is clamped 15% of the width beyond the border."""
     s, z = 1.0, 2.0
     splats = single((3.0, 0, z), (s, s, s)).to(variant.dtype).project(variant.ops)
-    fx, fy, cx = VIEW["fx"], VIEW["fy"], VIEW["cx"]
+    fx, fy, cx = VIEW.fx, VIEW.fy, VIEW.cx
     tx = (40 - cx + 0.15 * 40) / fx
     J = torch.tensor([[fx / z, 0, -fx * tx / z], [0, fy / z, 0]]).double()
     assert_close(covariance(splats.conics[0]), s**2 * J @ J.T + 0.3 * torch.eye(2), 1e-5)
@@ -154,7 +152,7 @@ def test_jacobian_is_clamped_outside_of_the_image(variant: Variant) -> None:
 
 def test_visibility(variant: Variant) -> None:
     """Near plane, opacity, and the box of the ellipse {α ≥ 1/255} against the pixel centres."""
-    cx, fx, z = VIEW["cx"], VIEW["fx"], 2.0
+    cx, fx, z = VIEW.cx, VIEW.fx, 2.0
     sigma = math.sqrt((fx * 0.1 / z) ** 2 + 0.3)
     opacity = 1 / (1 + math.exp(-1))
     reach = math.sqrt(2 * math.log(255 * opacity)) * sigma
@@ -178,7 +176,7 @@ def test_visibility(variant: Variant) -> None:
         (single(at_column(39.5 + reach + 0.01), scales), False),
     ]
     params = {n: torch.cat([scene.params[n] for scene, _ in cases]) for n in PARAMETERS}
-    splats = Scene(params, IDENTITY, VIEW).to(variant.dtype).project(variant.ops)
+    splats = Scene(params, VIEW).to(variant.dtype).project(variant.ops)
     assert splats.ids is not None
     assert splats.ids.dtype == torch.int32
     assert splats.ids.tolist() == [i for i, (_, visible) in enumerate(cases) if visible]
@@ -210,7 +208,8 @@ def test_moving_world_and_camera_together_changes_nothing(variant: Variant) -> N
         "means": scene.params["means"] @ rotation.T + shift,
         "quats": scene.params["quats"] @ product.T,
     }
-    moved = Scene(params, torch.cat([R_moved, (t - R_moved @ shift)[:, None]], dim=1), scene.view)
+    pose = torch.cat([R_moved, (t - R_moved @ shift)[:, None]], dim=1)
+    moved = replace(scene, params=params).looking(cam_from_world=pose)
     before, after = (s.to(variant.dtype).project(variant.ops) for s in (scene, moved))
     assert before.ids is not None
     assert after.ids is not None
@@ -241,7 +240,7 @@ def test_harmonics_of_degree_one_point_along_the_axes(variant: Variant) -> None:
     scene = single((0.4, -0.3, 2.0))
     scene.params["sh_dc"].zero_()
     scene.params["sh_rest"] = torch.eye(3, dtype=torch.float64)[None]  # one channel each
-    scene = replace(scene, cam_from_world=tilted_pose())
+    scene = scene.looking(cam_from_world=tilted_pose())
     R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
     direction = scene.params["means"][0] - torch.linalg.solve(R, -t)
     x, y, z = (direction / direction.norm()).tolist()
@@ -267,7 +266,7 @@ def test_finite_differences(double: Variant, degree: int) -> None:
     scene = scene.to(torch.float64)
 
     def columns(*leaves: Tensor) -> Tensor:
-        return differentiable_columns(double.ops.project(*leaves, **scene.view))
+        return differentiable_columns(scene.of_leaves(*leaves).project(double.ops))
 
     leaves = tuple(scene.leaves().values())
     assert len(columns(*leaves)) == 2
@@ -283,7 +282,7 @@ def test_finite_differences_if_antialiased(double: Variant, size: float) -> None
         scene.params["opacity_logits"] += 3.0
 
     def columns(*leaves: Tensor) -> Tensor:
-        return differentiable_columns(double.ops.project(*leaves, **scene.view))
+        return differentiable_columns(scene.of_leaves(*leaves).project(double.ops))
 
     leaves = tuple(scene.leaves().values())
     assert len(columns(*leaves)) == 3
@@ -324,7 +323,7 @@ def test_native_agrees_with_the_reference_for_long_thin_splats(
         scene = scene.antialiased()
     R, t = scene.cam_from_world[:, :3], scene.cam_from_world[:, 3]
     depth = (scene.params["means"] @ R.T + t)[:, 2].abs()
-    pixel = depth / scene.view["fx"]
+    pixel = depth / scene.view.fx
     long, thin = (length * pixel).log(), (0.01 * pixel).log()
     scales = [long, thin, long if shape == "disc" else thin]
     scene.params["log_scales"] = as_float32(torch.stack(scales, dim=1))
@@ -334,7 +333,7 @@ def test_native_agrees_with_the_reference_for_long_thin_splats(
 def compare(native: Variant, scene: Scene) -> None:
     """Values and gradients of every input, with a random cotangent on every column."""
     parameters = tuple(p.numpy().tobytes() for p in scene.params.values())
-    key = (parameters, "antialiased" in scene.view)
+    key = (parameters, scene.view.antialiased)
     if key not in _EXPECTED:
         _EXPECTED[key] = splats_and_gradients_of_the_reference(scene)
     (wanted, wanted_grads), actual = _EXPECTED[key], scene.to(native.dtype)
@@ -374,7 +373,7 @@ def test_only_requested_gradients_are_computed(native: Variant) -> None:
     for required in (*PARAMETERS, "cam_from_world"):
         leaves = {n: t.detach().clone() for n, t in scene.leaves().items()}
         leaves[required].requires_grad_()
-        splats = native.ops.project(**leaves, **scene.view)
+        splats = scene.of_leaves(*leaves.values()).project(native.ops)
         splats.packed.square().sum().backward()
         assert leaves[required].grad is not None
         assert leaves[required].grad.norm() > 0
@@ -397,7 +396,7 @@ def test_rows_of_invisible_gaussians_are_empty(native: Variant) -> None:
     On the CPU there are no such rows.
     """
     scene = random_scene(9, 130).to(native.dtype)
-    splats = native.ops.project(**scene.leaves(), **scene.view)
+    splats = native.ops.project(scene.gaussians, scene.view)
     expected = scene.to(torch.float64).project(reference).ids
     assert splats.ids is not None
     assert expected is not None
@@ -445,11 +444,24 @@ WRONG = {
     "opacity_logits is a column": {"opacity_logits": torch.zeros(4, 1)},
     "sh_dc without its middle": {"sh_dc": torch.zeros(4, 3)},
     "sh_rest of 7 rows": {"sh_rest": torch.zeros(4, 7, 3)},
-    "pose is 4 x 4": {"cam_from_world": torch.eye(4, dtype=torch.float64)},
     "mixed dtypes": {"quats": torch.zeros(4, 4, dtype=torch.float64)},
     "integers": {"means": torch.zeros(4, 3, dtype=torch.int32)},
     "half": {"means": torch.zeros(4, 3, dtype=torch.float16)},
     "another device": {"means": torch.zeros(4, 3, device="meta")},
+    "rows for degree 1, not 3": {"sh_rest": torch.zeros(4, 3, 3)},
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG.keys())
+def test_wrong_input(change: dict) -> None:
+    scene = random_scene(1, 4).to(torch.float32, requires_grad=False)
+    with pytest.raises(ValueError, match="^project: ") as caught:
+        ops.project(SimpleNamespace(**scene.params | change), scene.view)
+    assert one_line(caught.value)
+
+
+WRONG_VIEW = {
+    "pose is 4 x 4": {"cam_from_world": torch.eye(4, dtype=torch.float64)},
     "no width": {"width": 0},
     "negative height": {"height": -3},
     "focal length 0": {"fx": 0.0},
@@ -457,16 +469,13 @@ WRONG = {
     "principal point infinite": {"cx": math.inf},
     "degree 4": {"sh_degree": 4},
     "degree -1": {"sh_degree": -1},
-    "degree beyond the rows": {"sh_rest": torch.zeros(4, 3, 3), "sh_degree": 2},
     "near is not positive": {"near": 0.0},
     "near NaN": {"near": math.nan},
 }
 
 
-@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG.keys())
-def test_wrong_input(change: dict) -> None:
-    scene = random_scene(1, 4).to(torch.float32, requires_grad=False)
-    arguments = {**scene.leaves(), **scene.view, **change}
-    with pytest.raises(ValueError, match="project") as caught:
-        ops.project(**arguments)
+@pytest.mark.parametrize("change", WRONG_VIEW.values(), ids=WRONG_VIEW.keys())
+def test_wrong_view(change: dict) -> None:
+    with pytest.raises(ValueError, match="^View: ") as caught:
+        replace(VIEW, **change)
     assert one_line(caught.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import reference
+from snowsplat.ops import AdamRates, SplatGradient, reference
 
 from .scenes import (
     PARAMETERS,
@@ -22,6 +23,7 @@ from .scenes import (
     normal,
     one_line,
     random_scene,
+    take_step,
 )
 
 CASES = [(0, 0), (0, 15), (1, 3), (1, 15), (2, 8), (3, 15)]
@@ -42,9 +44,8 @@ def add(variant: Variant, scene: Scene, grads: dict[str, Tensor], seed: int) -> 
     """Add the gradient of one view."""
     ids = visible(variant, scene)
     grad = packed_grads(seed, len(ids)).to(variant.dtype)
-    variant.ops.add_project_gradients(
-        scene.params, grads, ids, grad, scene.cam_from_world, **scene.view
-    )
+    gradient = SplatGradient(ids, grad)
+    variant.ops.add_project_gradients(scene.gaussians, grads, gradient, scene.view)
 
 
 def added(variant: Variant, scene: Scene, *seeds: int) -> dict[str, Tensor]:
@@ -128,14 +129,14 @@ def test_rows_without_a_gaussian(native: Variant) -> None:
     every_grad = torch.full((130, 16), math.nan, dtype=native.dtype)
     every_grad[ids.long()] = packed_grads(1, len(ids)).to(native.dtype)
     grads = {name: torch.zeros_like(p) for name, p in scene.params.items()}
-    arguments = (scene.params, grads, every_id, every_grad, scene.cam_from_world)
+    arguments = (scene.gaussians, grads, SplatGradient(every_id, every_grad), scene.view)
     if native.engine == "native":
         with pytest.raises(ValueError, match="add_project_gradients") as caught:
-            native.ops.add_project_gradients(*arguments, **scene.view)
+            native.ops.add_project_gradients(*arguments)
         assert one_line(caught.value)
         assert not any(grad.any() for grad in grads.values())
         return
-    native.ops.add_project_gradients(*arguments, **scene.view)
+    native.ops.add_project_gradients(*arguments)
     for name, wanted in added(native, scene_of(130), 1).items():
         assert torch.equal(grads[name], wanted), name
 
@@ -156,17 +157,8 @@ def test_a_step_with_the_sum_is_a_step_with_the_gradient(
                 params[name].grad = total
             grad = None
         moments = [{n: torch.full_like(p, 0.1) for n, p in params.items()} for _ in range(2)]
-        variant.ops.adam_step(
-            params,
-            *moments,
-            ids,
-            grad,
-            scene.cam_from_world,
-            **scene.view,
-            lr=dict.fromkeys(PARAMETERS, 0.01),
-            step=3,
-            visible_only=visible_only,
-        )
+        rates = AdamRates(dict.fromkeys(PARAMETERS, 0.01), 3)
+        take_step(variant.ops, scene, *moments, ids, grad, rates, visible_only=visible_only)
         groups = zip(("", "m of ", "v of "), (params, *moments), strict=True)
         results.append({prefix + n: t for prefix, group in groups for n, t in group.items()})
     for name, wanted in results[0].items():
@@ -178,10 +170,8 @@ WRONG = {
     "ids of another type": {"ids": torch.arange(2)},
     "gradient of another width": {"packed_grad": torch.zeros(2, 32)},
     "gradient of another dtype": {"packed_grad": torch.zeros(2, 16).double()},
-    "pose of another shape": {"cam_from_world": torch.eye(4, dtype=torch.float64)},
-    "degree beyond the rows": {"sh_degree": 4},
-    "focal length NaN": {"fx": math.nan},
-    "no width": {"width": 0},
+    "no gradient": {"packed_grad": None},
+    "degree beyond the rows": {"params": {"sh_rest": torch.zeros(4, 8, 3)}},
     "sum of another shape": {"grads": {"means": torch.zeros(4, 4)}},
     "sum of another dtype": {"grads": {"means": torch.zeros(4, 3).double()}},
 }
@@ -191,16 +181,11 @@ WRONG = {
 def test_wrong_input(change: dict[str, Any]) -> None:
     scene = random_scene(1, 4).to(torch.float32, requires_grad=False)
     grads = {n: torch.zeros_like(p) for n, p in scene.params.items()}
-    arguments = {
-        "params": scene.params,
-        "ids": torch.arange(2, dtype=torch.int32),
-        "packed_grad": torch.zeros(2, 16),
-        "cam_from_world": scene.cam_from_world,
-        **scene.view,
-        **change,
-        "grads": grads | change.get("grads", {}),
-    }
-    with pytest.raises(ValueError, match="add_project_gradients") as caught:
-        ops.add_project_gradients(**arguments)
+    gaussians = SimpleNamespace(**scene.params | change.get("params", {}))
+    ids = change.get("ids", torch.arange(2, dtype=torch.int32))
+    gradient = SplatGradient(ids, change.get("packed_grad", torch.zeros(2, 16)))
+    grads |= change.get("grads", {})
+    with pytest.raises(ValueError, match="^add_project_gradients: ") as caught:
+        ops.add_project_gradients(gaussians, grads, gradient, scene.view)
     assert one_line(caught.value)
     assert not any(grad.any() for grad in grads.values())

@@ -251,7 +251,7 @@ def test_finite_differences_from_gaussian_to_pixel(double: Variant) -> None:
     scene = scene.to(torch.float64)
 
     def image(*leaves: Tensor) -> Tensor:
-        splats = double.ops.project(*leaves, **scene.view)
+        splats = scene.of_leaves(*leaves).project(double.ops)
         return double.ops.rasterize(splats, *scene.size)[0]
 
     check_gradients(double, image, tuple(scene.leaves().values()))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from snowsplat import ops
 from snowsplat.ops import reference
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
@@ -101,21 +102,11 @@ def test_a_step_equals_the_reference(visible_only):
     )
     splats = gradient.splats
     reference.adam_step(
-        expected,
-        means,
-        squares,
-        splats.ids,
-        splats.packed.grad,
-        some_camera().cam_from_world,
-        width=64,
-        height=48,
-        fx=50.0,
-        fy=60.0,
-        cx=30.0,
-        cy=25.0,
-        sh_degree=1,
-        lr=adam.rates_at(7),
-        step=7,
+        Gaussians(**expected),
+        ops.Moments(means, squares),
+        ops.SplatGradient.of(splats),
+        ops.View(some_camera().cam_from_world, 64, 48, 50.0, 60.0, 30.0, 25.0, sh_degree=1),
+        ops.AdamRates(adam.rates_at(7), 7),
         visible_only=visible_only,
     )
     adam.step(gaussians, [gradient], 7)

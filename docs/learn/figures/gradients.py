@@ -1,12 +1,11 @@
 """Figures of the page "Gradients"."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from drawing import Drawing
 
-from snowsplat.ops import reference
+from snowsplat import Gaussians
+from snowsplat.ops import View, reference
 
 
 def chain() -> None:
@@ -63,7 +62,7 @@ def chain() -> None:
     panel.save("gradients-chain", "Boxes of the intermediate results, connected by arrows")
 
 
-def scene(dtype: torch.dtype) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def scene(dtype: torch.dtype) -> tuple[dict[str, torch.Tensor], View]:
     random = torch.Generator().manual_seed(3)
     n = 6
 
@@ -79,26 +78,15 @@ def scene(dtype: torch.dtype) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         "sh_dc": normal(n, 1, 3),
         "sh_rest": normal(n, 3, 3) * 0.2,
     }
-    view = {
-        "width": 24,
-        "height": 20,
-        "fx": 26.0,
-        "fy": 26.0,
-        "cx": 12.0,
-        "cy": 10.0,
-        "sh_degree": 1,
-    }
+    view = View(torch.eye(3, 4), 24, 20, 26.0, 26.0, 12.0, 10.0, sh_degree=1)
     return {k: v.to(dtype) for k, v in parameters.items()}, view
 
 
-def images(
-    parameters: dict[str, torch.Tensor], view: dict[str, Any]
-) -> tuple[torch.Tensor, torch.Tensor]:
+def images(parameters: dict[str, torch.Tensor], view: View) -> tuple[torch.Tensor, torch.Tensor]:
     """The image of the small scene, and the number of blended splats per pixel."""
-    width, height, pose = view["width"], view["height"], torch.eye(3, 4)
-    splats = reference.project(**parameters, cam_from_world=pose, **view)
-    image = reference.rasterize(splats, width, height)[0]
-    return image, reference.count_blended(splats, width, height)
+    splats = reference.project(Gaussians(**parameters), view)
+    image = reference.rasterize(splats, view.width, view.height)[0]
+    return image, reference.count_blended(splats, view.width, view.height)
 
 
 def differences() -> None:

@@ -1,25 +1,34 @@
 """The numerical operations on tensors: native kernels, and a PyTorch reference in `reference`.
 
-Forward: `project` → `Splats2D` → `rasterize` → `photometric_loss`. `adam_step` propagates the
-gradient of the splats to the parameters and updates them.
+Forward: `project(gaussians, view)` → `Splats2D` → `rasterize` → `photometric_loss`.
+`adam_step(gaussians, moments, gradient, view, rates)` propagates the gradient of the splats to the
+parameters and updates them.
 """
 
-from snowsplat.ops.adam import adam_step
+from snowsplat.ops.activated import project_activated, with_centres
+from snowsplat.ops.adam import AdamRates, Moments, adam_step
 from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, resolve_device
+from snowsplat.ops.gaussian_parameters import GaussianParameters
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.projection import add_project_gradients, project
 from snowsplat.ops.rasterizer import count_blended, rasterize
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops.splats import SplatGradient, Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 from snowsplat.ops.sweep import plane_sweep
+from snowsplat.ops.view import View
 
 __all__ = [
+    "AdamRates",
     "Capacity",
+    "GaussianParameters",
+    "Moments",
+    "SplatGradient",
     "Splats2D",
+    "View",
     "accumulate_screen_statistics",
     "adam_step",
     "add_project_gradients",
@@ -31,8 +40,10 @@ __all__ = [
     "photometric_loss",
     "plane_sweep",
     "project",
+    "project_activated",
     "rasterize",
     "resolve_device",
     "set_num_threads",
     "ssim",
+    "with_centres",
 ]

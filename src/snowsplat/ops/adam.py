@@ -3,62 +3,86 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from snowsplat.ops.check import check_ids, check_tensor, variant
+from snowsplat.ops.check import check_ids, variant
+from snowsplat.ops.gaussian_parameters import (
+    PARAMETERS,
+    GaussianParameters,
+    check_each,
+    checked_parameters,
+)
 from snowsplat.ops.native import launch
 from snowsplat.ops.params import AdamStepParams, AdamTensor
-from snowsplat.ops.projection import camera_params, check_parameters
-from snowsplat.ops.splats import packed_width
+from snowsplat.ops.projection import rows_expected
+from snowsplat.ops.splats import SplatGradient
+from snowsplat.ops.view import View, camera_params
 
-PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+
+@dataclass(frozen=True)
+class Moments:
+    """The moments of Adam: a tensor for each of the six parameters, of the same name and shape."""
+
+    exp_avg: Mapping[str, Tensor]  # m
+    exp_avg_sq: Mapping[str, Tensor]  # v
+
+
+@dataclass(frozen=True)
+class AdamRates:
+    """The numbers of a step of Adam.
+
+    Attributes:
+        lr: the learning rate of each of the six parameters.
+        step: the number of this step, from 1 on (for the bias correction).
+        betas: β₁ and β₂.
+        eps: ε, inside the root.
+
+    Raises:
+        ValueError: a learning rate is missing, or the step is not at least 1.
+    """
+
+    lr: Mapping[str, float]
+    step: int
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-15
+
+    def __post_init__(self) -> None:
+        missing = [name for name in PARAMETERS if name not in self.lr]
+        if missing:
+            raise ValueError(f"AdamRates: lr has no {', '.join(missing)}")
+        if self.step < 1:
+            raise ValueError(f"AdamRates: step counts from 1, got {self.step}")
 
 
 @torch.no_grad()
 def adam_step(
-    params: Mapping[str, Tensor],
-    exp_avg: Mapping[str, Tensor],
-    exp_avg_sq: Mapping[str, Tensor],
-    ids: Tensor,
-    packed_grad: Tensor | None,
-    cam_from_world: Tensor,
+    gaussians: GaussianParameters,
+    moments: Moments,
+    gradient: SplatGradient,
+    view: View,
+    rates: AdamRates,
     *,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    sh_degree: int,
-    lr: Mapping[str, float],
-    step: int,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
     visible_only: bool = False,
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
-    antialiased: bool = False,
 ) -> None:
     """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
     The gradients of the parameters are never written to memory. This halves the time of this part
-    of a training step. The camera arguments, `sh_degree` and `antialiased` must be those passed to
-    `project`.
+    of a training step. `view` must be that passed to `project`.
 
     Args:
-        params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
-            `project`, contiguous. If `.grad` is not None (from a regulariser), it is added to the
-            gradient.
-        exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-        ids, packed_grad: `splats.ids` (M,), ascending, and `splats.packed.grad` (M, 16). On a GPU,
-            rows with id -1 may be present or removed. If `packed_grad` is None, the gradient is
-            only `.grad`, and `ids` are the visible rows.
-        lr: the learning rate of each parameter.
-        step: the number of this step, from 1 on (for the bias correction).
-        visible_only: whether rows that are not in `ids` keep their values and moments. If False,
-            their gradient is 0 (plus `.grad`), and their moments decay.
+        gaussians: those passed to `project`; their tensors are contiguous. If `.grad` of a tensor
+            is not None (from a regulariser), it is added to the gradient.
+        moments: m and v, changed in place.
+        gradient: of the splats. If `gradient.packed` is None, the gradient is only `.grad` of the
+            tensors, and `gradient.ids` are the visible rows.
+        rates: the learning rates, and the number of the step.
+        visible_only: whether rows that are not in `gradient.ids` keep their values and moments. If
+            False, their gradient is 0 (plus `.grad`), and their moments decay.
         valid: (1,) bool on the device; False skips the step. The CPU does not wait for the value.
             None means True.
         nonfinite_rows: (6,) int32 counts, in the order of the parameters; None disables counting.
@@ -66,76 +90,56 @@ def adam_step(
             unchanged, and its row is counted. So a non-finite gradient does not change the
             parameters.
 
-    Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
+    Rows of sh_rest beyond `view.sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²) (Kingma & Ba 2015, but with ε inside the root).
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
-    for what, given in (
-        ("params", params),
-        ("exp_avg", exp_avg),
-        ("exp_avg_sq", exp_avg_sq),
-        ("lr", lr),
-    ):
-        missing = [name for name in PARAMETERS if name not in given]
-        if missing:
-            raise ValueError(f"adam_step: {what} has no {', '.join(missing)}")
-    tensors = [params[name] for name in PARAMETERS]
-    check_parameters(
-        "adam_step", **dict(zip(PARAMETERS, tensors, strict=True)), sh_degree=sh_degree
-    )
-    means = tensors[0]
-    if packed_grad is not None:
-        check_tensor("adam_step", "packed_grad", packed_grad, (len(ids), packed_width(3)), means)
-        packed_grad = packed_grad.contiguous()
-    check_ids("adam_step", ids, means)
+    op = "adam_step"
+    tensors = checked_parameters(op, gaussians, view.sh_degree)
+    check_each(op, "exp_avg", moments.exp_avg, tensors)
+    check_each(op, "exp_avg_sq", moments.exp_avg_sq, tensors)
+    means, ids = tensors["means"], gradient.ids
+    check_ids(op, ids, means)
+    grad_packed = None if gradient.packed is None else gradient.checked(op, means)
     if nonfinite_rows is not None:
         fits = nonfinite_rows.shape == (len(PARAMETERS),) and nonfinite_rows.dtype == torch.int32
         if not (fits and nonfinite_rows.device == means.device and nonfinite_rows.is_contiguous()):
             raise ValueError(
-                f"adam_step: nonfinite_rows must be (6,) torch.int32 on {means.device}, "
+                f"{op}: nonfinite_rows must be (6,) torch.int32 on {means.device}, "
                 f"got {tuple(nonfinite_rows.shape)} {nonfinite_rows.dtype} "
                 f"on {nonfinite_rows.device}"
             )
-    if step < 1:
-        raise ValueError(f"adam_step: step counts from 1, got {step}")
-    tensor_params = {}
-    for name, value in zip(PARAMETERS, tensors, strict=True):
-        m, v = exp_avg[name], exp_avg_sq[name]
-        shape = tuple(value.shape)
-        check_tensor("adam_step", f"exp_avg[{name!r}]", m, shape, value)
-        check_tensor("adam_step", f"exp_avg_sq[{name!r}]", v, shape, value)
-        tensor_params[name] = AdamTensor(
+    beta1, beta2 = rates.betas
+    updated = {
+        name: AdamTensor(
             value=value.detach(),
-            m=m,
-            v=v,
+            m=moments.exp_avg[name],
+            v=moments.exp_avg_sq[name],
             extra=None if value.grad is None else value.grad.contiguous(),
-            rate=float(lr[name]) / (1 - betas[0] ** step),
+            rate=float(rates.lr[name]) / (1 - beta1**rates.step),
         )
-    pose = cam_from_world.to(means.device, means.dtype, non_blocking=True)
+        for name, value in tensors.items()
+    }
     done = launch(
         variant("adam_step", means),
         AdamStepParams(
             n=len(means),
             splats=len(ids),
             ids=ids,
-            grad_packed=packed_grad,
-            camera=camera_params(
-                *("adam_step", pose, width, height, fx, fy, cx, cy), antialiased=antialiased
-            ),
-            sh_rest_rows=tensors[5].shape[1],
-            sh_degree=sh_degree,
-            **tensor_params,
-            beta1=float(betas[0]),
-            beta2=float(betas[1]),
-            inv_correction2=1 / (1 - betas[1] ** step),
-            eps2=float(eps) * float(eps),
+            grad_packed=grad_packed,
+            camera=camera_params(view, means),
+            sh_rest_rows=tensors["sh_rest"].shape[1],
+            sh_degree=view.sh_degree,
+            **updated,
+            beta1=float(beta1),
+            beta2=float(beta2),
+            inv_correction2=1 / (1 - beta2**rates.step),
+            eps2=float(rates.eps) * float(rates.eps),
             visible_only=visible_only,
             valid=valid,
             nonfinite_rows=nonfinite_rows,
         ),
     )
     if done < 0:
-        raise ValueError(
-            "adam_step: on the CPU ids must be rows of the parameters; remove the splats of id -1"
-        )
+        raise rows_expected(op)

@@ -5,6 +5,7 @@ and are differentiable by autograd, but are much slower than the native kernels.
 kernels with these functions in float64. From top to bottom, this file describes the method:
 
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
+    project_activated   the same, for scales, opacities and colours after their activations
     rasterize       2D splats → image            α, T, C             Kerbl et al. 2023, §6, eq. 2–3
     count_blended   the number of blended splats per pixel
     photometric_loss, ssim                       L1, D-SSIM          Kerbl et al. 2023, eq. 7;
@@ -26,15 +27,20 @@ Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from snowsplat.ops.adam import AdamRates, Moments
 from snowsplat.ops.capacity import Capacity
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops.gaussian_parameters import PARAMETERS, GaussianParameters
+from snowsplat.ops.splats import SplatGradient, Splats2D
 from snowsplat.ops.sweep_reference import plane_sweep as plane_sweep
+from snowsplat.ops.view import View
 from snowsplat.util.native_layout import TILE
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre
@@ -44,8 +50,6 @@ ALPHA_MAX = 0.99  # so that 1 − α, and with it the transmittance, is never 0
 TRANSMITTANCE_MIN = 1e-4  # a splat that would make T lower, and those behind it, are not blended
 JACOBIAN_MARGIN = 0.15  # fraction of the image size; J is clamped beyond this margin
 QUAT_EPS = 1e-12
-
-PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 
 # Real spherical harmonics, by degree, with the sign convention of 3DGS scene files.
 C0 = 0.28209479177387814  # ½ √(1/π)
@@ -63,74 +67,52 @@ C3 = (
 # ---------------------------------------------------------------------------------------- project
 
 
-def project(
-    means: Tensor,
-    log_scales: Tensor,
-    quats: Tensor,
-    opacity_logits: Tensor,
-    sh_dc: Tensor,
-    sh_rest: Tensor,
-    cam_from_world: Tensor,
-    *,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    sh_degree: int,
-    near: float = 0.2,
-    antialiased: bool = False,
-) -> Splats2D:
-    """Projects N Gaussians to splats on a camera's image plane, without the invisible ones.
+def project(gaussians: GaussianParameters, view: View) -> Splats2D:
+    """Projects N Gaussians to splats on the image plane of a view, without the invisible ones.
 
-    means (N, 3) in world units; log_scales (N, 3); quats (N, 4) wxyz, not necessarily normalised
-    (zero: no rotation); opacity_logits (N,); sh_dc (N, 1, 3); sh_rest (N, K, 3), whose first
-    (sh_degree + 1)² − 1 rows are used; cam_from_world (3, 4); fx, fy, cx, cy in pixels; near > 0 in
-    world units. If `antialiased`, the low-pass filter does not change the integral of a splat.
+    gaussians: means (N, 3) in world units; log_scales (N, 3); quats (N, 4) wxyz, not necessarily
+    normalised (zero: no rotation); opacity_logits (N,); sh_dc (N, 1, 3); sh_rest (N, K, 3), whose
+    first (view.sh_degree + 1)² − 1 rows are used. If `view.antialiased`, the low-pass filter does
+    not change the integral of a splat.
 
-    A Gaussian is visible if it lies beyond `near`, the opacity of its splat is ≥ 1/255, and the
-    bounding box of its ellipse {α ≥ 1/255} overlaps the rectangle of the pixel centres. A Gaussian
-    whose 2D covariance overflows the dtype is not visible.
+    A Gaussian is visible if it lies beyond `view.near`, the opacity of its splat is ≥ 1/255, and
+    the bounding box of its ellipse {α ≥ 1/255} overlaps the rectangle of the pixel centres. A
+    Gaussian whose 2D covariance overflows the dtype is not visible.
     """
-    if sh_rest.shape[1] < (sh_degree + 1) ** 2 - 1:
+    parameters = [getattr(gaussians, name) for name in PARAMETERS]
+    means, sh_rest = gaussians.means, gaussians.sh_rest
+    if sh_rest.shape[1] < (view.sh_degree + 1) ** 2 - 1:
         raise ValueError(
-            f"project: sh_rest has too few rows ({sh_rest.shape[1]}) for degree {sh_degree}"
+            f"project: sh_rest has too few rows ({sh_rest.shape[1]}) for degree {view.sh_degree}"
         )
-    parameters = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
-    cam_from_world = cam_from_world.to(means)
-    view = (cam_from_world, width, height, fx, fy, cx, cy, sh_degree, antialiased)
+    pose = view.cam_from_world.to(means)
     with torch.no_grad():
-        depths = means @ cam_from_world[2, :3] + cam_from_world[2, 3]
-        ids = torch.nonzero(depths > near)[:, 0]
-        splats, variances = _project_rows([p[ids] for p in parameters], *view)
+        depths = means @ pose[2, :3] + pose[2, 3]
+        ids = torch.nonzero(depths > view.near)[:, 0]
+        splats, variances = _project_rows([p[ids] for p in parameters], pose, view)
         half_extent = _half_extents(variances, splats.opacities)
-        last = torch.tensor([width - 0.5, height - 0.5]).to(means)
+        last = torch.tensor([view.width - 0.5, view.height - 0.5]).to(means)
         touches = (splats.means2d + half_extent >= 0.5) & (splats.means2d - half_extent <= last)
         ids = ids[touches.all(dim=1)]  # comparisons with NaN are false: not visible
     # Computed again for the visible rows only: otherwise the other rows could give NaN gradients.
-    splats, _ = _project_rows([p[ids] for p in parameters], *view)
+    splats, _ = _project_rows([p[ids] for p in parameters], pose, view)
     return Splats2D(splats.packed, ids.to(torch.int32), splats.channels)
 
 
 def _project_rows(
-    parameters: list[Tensor],
+    parameters: Sequence[Tensor],
     cam_from_world: Tensor,
-    width: int,
-    height: int,
-    fx: float | Tensor,
-    fy: float | Tensor,
-    cx: float,
-    cy: float,
-    sh_degree: int,
-    antialiased: bool,
+    view: View,
+    zoom: float | Tensor = 1.0,
 ) -> tuple[Splats2D, Tensor]:
-    """Projects every row of `parameters` (in the order of `project`), visible or not.
+    """Projects every row of `parameters` (in the order of `PARAMETERS`), visible or not.
 
+    `cam_from_world` (3, 4) replaces the pose of the view; `zoom` multiplies both focal lengths.
     Also returns Σ'xx and Σ'yy (M, 2), NaN where det Σ' overflows.
     """
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = parameters
     W, t = cam_from_world[:, :3], cam_from_world[:, 3]  # (3, 3), (3,): the viewing transformation
+    fx, fy, cx, cy = zoom * view.fx, zoom * view.fy, view.cx, view.cy
 
     # The centre. (M, 3) in camera space, then (M, 2) in pixels.
     x, y, z = (means @ W.T + t).unbind(dim=1)
@@ -142,15 +124,15 @@ def _project_rows(
     # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). It
     # is unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin
     # around it. (M, 2, 3)
-    x_margin, y_margin = JACOBIAN_MARGIN * width, JACOBIAN_MARGIN * height
-    tx = (fx * x / z).clamp(-(cx + x_margin), width - cx + x_margin) / fx
-    ty = (fy * y / z).clamp(-(cy + y_margin), height - cy + y_margin) / fy
+    x_margin, y_margin = JACOBIAN_MARGIN * view.width, JACOBIAN_MARGIN * view.height
+    tx = (fx * x / z).clamp(-(cx + x_margin), view.width - cx + x_margin) / fx
+    ty = (fy * y / z).clamp(-(cy + y_margin), view.height - cy + y_margin) / fy
     zero = torch.zeros_like(z)
     J_rows = [fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z]
     J = torch.stack(J_rows, dim=1).reshape(-1, 2, 3)
 
     # Σ' = J W Σ Wᵀ Jᵀ (eq. 5) plus the low-pass filter: Σ' = U Uᵀ + d I with U = J W R S.
-    d = MIP_LOW_PASS if antialiased else LOW_PASS
+    d = MIP_LOW_PASS if view.antialiased else LOW_PASS
     u0, u1 = (J @ W @ RS).unbind(dim=1)  # (M, 3) each
     xx, xy, yy = (u0 * u0).sum(dim=1), (u0 * u1).sum(dim=1), (u1 * u1).sum(dim=1)
     # det Σ' = |u0 × u1|² + d (xx + yy) + d². The formula xx·yy − xy² is inaccurate for thin splats.
@@ -166,14 +148,14 @@ def _project_rows(
     # The view-dependent colour. The position of the camera in the world is −Wᵀ t.
     directions = means + W.T @ t
     directions = directions / directions.norm(dim=1, keepdim=True)
-    count = (sh_degree + 1) ** 2
+    count = (view.sh_degree + 1) ** 2
     coefficients = torch.cat([sh_dc, sh_rest], dim=1)[:, :count]  # (M, count, 3)
-    basis = sh_basis(directions, sh_degree)  # (M, count)
+    basis = sh_basis(directions, view.sh_degree)  # (M, count)
     colors = (0.5 + (basis[:, :, None] * coefficients).sum(dim=1)).clamp(min=0)
 
     # The 2D mip filter (Yu et al. 2024, eq. 10): the low-pass filter keeps the splat's integral.
     opacities = torch.sigmoid(opacity_logits)
-    if antialiased:
+    if view.antialiased:
         opacities = opacities * (undilated_det / det).sqrt()
     radii = 3 * major.detach().sqrt()
     return Splats2D.pack(means2d, conics, opacities, z, colors, radii), variances
@@ -232,80 +214,87 @@ def _half_extents(variances: Tensor, opacities: Tensor) -> Tensor:
 
 @torch.no_grad()
 def add_project_gradients(
-    params: Mapping[str, Tensor],
+    gaussians: GaussianParameters,
     grads: Mapping[str, Tensor],
-    ids: Tensor,
-    packed_grad: Tensor,
-    cam_from_world: Tensor,
-    *,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    sh_degree: int,
-    antialiased: bool = False,
+    gradient: SplatGradient,
+    view: View,
 ) -> None:
     """Propagates the gradient of splats through `project`, and adds the result to ``grads``.
 
-    Args:
-        params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
-            `project`.
-        grads: tensors of the same names and shapes; changed in place.
-        ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns).
+    `gaussians` and `view` are those of `project`; `grads` are tensors of the names and shapes of
+    the six parameters, changed in place; `gradient` is that of the splats.
     """
-    rows = ids.long()
+    assert gradient.packed is not None
+    rows = gradient.ids.long()
     with torch.enable_grad():
-        selected = [params[name].detach()[rows].requires_grad_() for name in PARAMETERS]
-        view = (
-            cam_from_world.to(packed_grad),
-            width,
-            height,
-            fx,
-            fy,
-            cx,
-            cy,
-            sh_degree,
-            antialiased,
-        )
-        splats, _ = _project_rows(selected, *view)
-        of_rows = torch.autograd.grad(splats.packed, selected, packed_grad)
+        selected = [getattr(gaussians, name).detach()[rows].requires_grad_() for name in PARAMETERS]
+        splats, _ = _project_rows(selected, view.cam_from_world.to(gradient.packed), view)
+        of_rows = torch.autograd.grad(splats.packed, selected, gradient.packed)
     for name, grad in zip(PARAMETERS, of_rows, strict=True):
         grads[name][rows] += grad
 
 
 @torch.no_grad()
 def camera_gradient(
-    params: Mapping[str, Tensor],
-    ids: Tensor,
-    packed_grad: Tensor,
-    cam_from_world: Tensor,
-    *,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    sh_degree: int,
-    antialiased: bool = False,
+    gaussians: GaussianParameters, gradient: SplatGradient, view: View
 ) -> tuple[Tensor, Tensor]:
     """Propagates the gradient of splats through `project` to the camera.
 
-    params, ids and packed_grad are those of `add_project_gradients`. Returns the gradients with
-    respect to `cam_from_world`, (3, 4), and to the logarithm of a factor of fx and fy, ().
+    The arguments are those of `add_project_gradients`. Returns the gradients with respect to
+    `view.cam_from_world`, (3, 4), and to the logarithm of a factor of fx and fy, ().
     """
-    pose = cam_from_world.to(packed_grad)
+    assert gradient.packed is not None
     with torch.enable_grad():
-        pose = pose.clone().requires_grad_()
-        factor = pose.new_ones((), requires_grad=True)
-        selected = [params[name].detach()[ids.long()] for name in PARAMETERS]
-        view = (width, height, factor * fx, factor * fy, cx, cy, sh_degree, antialiased)
-        splats, _ = _project_rows(selected, pose, *view)
-        # At the factor 1, the derivative by the factor is that by its logarithm.
-        d_pose, d_factor = torch.autograd.grad(splats.packed, (pose, factor), packed_grad)
-    return d_pose, d_factor
+        pose = view.cam_from_world.to(gradient.packed, copy=True).requires_grad_()
+        zoom = pose.new_ones((), requires_grad=True)
+        rows = gradient.ids.long()
+        selected = [getattr(gaussians, name).detach()[rows] for name in PARAMETERS]
+        splats, _ = _project_rows(selected, pose, view, zoom)
+        # At the zoom 1, the derivative by the zoom is that by its logarithm.
+        d_pose, d_zoom = torch.autograd.grad(splats.packed, (pose, zoom), gradient.packed)
+    return d_pose, d_zoom
+
+
+def project_activated(
+    means: Tensor,
+    scales: Tensor,
+    quats: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    view: View,
+    *,
+    far: float = 1e10,
+    radius_clip: float = 0.0,
+) -> tuple[Splats2D, Tensor]:
+    """`project` of scales (N, 3), opacities (N,) and colours after their activations.
+
+    colors are (N, C), any numbers, or (N, K, 3) coefficients of spherical harmonics. Splats of a
+    depth beyond `far`, or of a radius up to `radius_clip`, are removed. Also returns the centres of
+    the splats (M, 2).
+    """
+    harmonics = colors.dim() == 3
+    constants = colors[:, :1] if harmonics else torch.zeros_like(means)[:, None]
+    rest = colors[:, 1:] if harmonics else means.new_zeros(len(means), 0, 3)
+    logits = torch.logit(opacities, eps=1e-15)
+    gaussians = SimpleNamespace(
+        means=means,
+        log_scales=scales.log(),
+        quats=quats,
+        opacity_logits=logits,
+        sh_dc=constants,
+        sh_rest=rest,
+    )
+    splats = project(gaussians, view if harmonics else replace(view, sh_degree=0))
+    assert splats.ids is not None
+    kept = (splats.depths <= far) & (splats.radii > radius_clip)
+    packed, ids = splats.packed[kept], splats.ids[kept]
+    splats = Splats2D(packed, ids, 3)
+    if not harmonics:
+        s = splats
+        splats = Splats2D.pack(
+            s.means2d, s.conics, s.opacities, s.depths, colors[ids.long()], s.radii, ids
+        )
+    return splats, splats.means2d
 
 
 # -------------------------------------------------------------------------------------- rasterize
@@ -538,92 +527,64 @@ def accumulate_screen_statistics(
 
 @torch.no_grad()
 def adam_step(
-    params: Mapping[str, Tensor],
-    exp_avg: Mapping[str, Tensor],
-    exp_avg_sq: Mapping[str, Tensor],
-    ids: Tensor,
-    packed_grad: Tensor | None,
-    cam_from_world: Tensor,
+    gaussians: GaussianParameters,
+    moments: Moments,
+    gradient: SplatGradient,
+    view: View,
+    rates: AdamRates,
     *,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    sh_degree: int,
-    lr: Mapping[str, float],
-    step: int,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-15,
     visible_only: bool = False,
     valid: Tensor | None = None,
     nonfinite_rows: Tensor | None = None,
-    antialiased: bool = False,
 ) -> None:
     """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
     Args:
-        params: means, log_scales, quats, opacity_logits, sh_dc, sh_rest, with the shapes of
-            `project`. If `.grad` is not None (from a regulariser), it is added to the gradient.
-        exp_avg, exp_avg_sq: the moments m and v, of the same names and shapes.
-        ids, packed_grad: `splats.ids` (M,) and `splats.packed.grad` (M, columns). If `packed_grad`
-            is None, the gradient is only `.grad`, and `ids` are the visible rows.
-        lr: the learning rate of each parameter.
-        step: the number of this step, from 1 on.
-        visible_only: whether rows that are not in `ids` keep their values and moments. If False,
-            their gradient is 0 (plus `.grad`), and their moments decay.
+        gaussians, view: those of `project`. If `.grad` of a parameter is not None (from a
+            regulariser), it is added to the gradient.
+        moments: m and v, of the names and shapes of the parameters.
+        gradient: of the splats. If `gradient.packed` is None, the gradient is only `.grad`, and
+            `gradient.ids` are the visible rows.
+        rates: the learning rate of each parameter, β₁, β₂, ε, and the number of this step, from 1.
+        visible_only: whether rows that are not in `gradient.ids` keep their values and moments. If
+            False, their gradient is 0 (plus `.grad`), and their moments decay.
         valid: (1,) bool; False: nothing is changed.
         nonfinite_rows: (6,) int32 counts, one per parameter. If the step would make a value
             infinite or NaN, the value and its moments stay unchanged, and its row is counted.
 
-    Rows of sh_rest beyond `sh_degree` keep their values and moments. The step is
+    Rows of sh_rest beyond `view.sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²); the paper has the denominator √v̂ + eps. The steps with
     these two denominators agree for v̂ ≫ eps² and for m̂ = v̂ = 0. √(v̂ + eps²) is used because it
     needs only one reciprocal square root.
     """
     if valid is not None and not valid:
         return
-    rows = ids.long()
-    grads = {name: torch.zeros_like(params[name]) for name in PARAMETERS}
-    if packed_grad is not None:
-        add_project_gradients(
-            params,
-            grads,
-            ids,
-            packed_grad,
-            cam_from_world,
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            sh_degree=sh_degree,
-            antialiased=antialiased,
-        )
+    params = {name: getattr(gaussians, name) for name in PARAMETERS}
+    grads = {name: torch.zeros_like(p) for name, p in params.items()}
+    if gradient.packed is not None:
+        add_project_gradients(gaussians, grads, gradient, view)
 
-    beta1, beta2 = betas
+    beta1, beta2 = rates.betas
     for i, (name, grad) in enumerate(grads.items()):
-        p = params[name]
+        p, exp_avg, exp_avg_sq = params[name], moments.exp_avg[name], moments.exp_avg_sq[name]
         if p.grad is not None:
             grad += p.grad
-        m = beta1 * exp_avg[name] + (1 - beta1) * grad
-        v = beta2 * exp_avg_sq[name] + (1 - beta2) * grad * grad
-        m_hat, v_hat = m / (1 - beta1**step), v / (1 - beta2**step)
-        new_value = p - lr[name] * m_hat / (v_hat + eps**2).sqrt()
+        m = beta1 * exp_avg + (1 - beta1) * grad
+        v = beta2 * exp_avg_sq + (1 - beta2) * grad * grad
+        m_hat, v_hat = m / (1 - beta1**rates.step), v / (1 - beta2**rates.step)
+        new_value = p - rates.lr[name] * m_hat / (v_hat + rates.eps**2).sqrt()
 
         updated = torch.ones_like(p, dtype=torch.bool)
         if visible_only:
             updated[:] = False
-            updated[rows] = True
+            updated[gradient.ids.long()] = True
         if name == "sh_rest":
-            updated[:, (sh_degree + 1) ** 2 - 1 :] = False
+            updated[:, (view.sh_degree + 1) ** 2 - 1 :] = False
         nonfinite = updated & ~(v.isfinite() & new_value.isfinite())
         if nonfinite_rows is not None:
             by_row = nonfinite.reshape(len(p), -1) if p.numel() else nonfinite.new_zeros(0, 1)
             nonfinite_rows[i] += by_row.any(dim=1).sum()
         updated &= ~nonfinite
         p.copy_(torch.where(updated, new_value, p))
-        exp_avg[name].copy_(torch.where(updated, m, exp_avg[name]))
-        exp_avg_sq[name].copy_(torch.where(updated, v, exp_avg_sq[name]))
+        exp_avg.copy_(torch.where(updated, m, exp_avg))
+        exp_avg_sq.copy_(torch.where(updated, v, exp_avg_sq))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from snowsplat.ops.check import check_ids, check_tensor
 from snowsplat.util.native_layout import PACKED_HEADER, PACKED_STRIDE
 
 # Columns of a packed row. The C colours begin at COLORS. Zeros pad the row to a multiple of
@@ -166,6 +167,42 @@ class Splats2D:
         scalars = [opacities, depths, radii.detach()]
         columns = [means2d, conics, torch.stack(scalars, dim=1), colors, padding]
         return cls(torch.cat(columns, dim=1), ids, channels)
+
+
+@dataclass(frozen=True, eq=False)
+class SplatGradient:
+    """The gradient of a loss with respect to the splats that `project` returned.
+
+    Attributes:
+        ids: (M,) int32, ascending: `splats.ids`. On a GPU, rows with id -1 may be present or
+            removed.
+        packed: (M, 16): `splats.packed.grad`. None: there is no gradient (for `adam_step`).
+    """
+
+    ids: Tensor
+    packed: Tensor | None
+
+    @classmethod
+    def of(cls, splats: Splats2D) -> SplatGradient:
+        """The gradient of splats, after the backward pass.
+
+        Raises ValueError if the splats have no gradient, or are not those of 3D Gaussians.
+        """
+        if splats.ids is None or splats.packed.grad is None:
+            raise ValueError("SplatGradient: the splats need ids, and packed.grad")
+        return cls(splats.ids, splats.packed.grad)
+
+    def checked(self, op: str, means: Tensor) -> Tensor:
+        """`packed`, contiguous.
+
+        Raises ValueError unless it is a gradient of splats of Gaussians with these means.
+        """
+        if self.packed is None:
+            raise ValueError(f"{op}: gradient.packed must not be None")
+        shape = (len(self.ids), packed_width(3))
+        check_tensor(op, "gradient.packed", self.packed, shape, means)
+        check_ids(op, self.ids, means)
+        return self.packed.contiguous()
 
 
 def radii_of_conics(conics: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import Splats2D
+from snowsplat.ops import Splats2D, View
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 
@@ -31,26 +31,29 @@ class RenderOutput:
 Renderer = Callable[[Gaussians, Camera, Tensor, int | None], RenderOutput]
 
 
-def project(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) -> Splats2D:
-    """The 2D splats of the Gaussians in the image of the camera: the first half of `render`."""
+def view_of(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) -> View:
+    """The camera as an argument of the numerical operations on these Gaussians.
+
+    Args:
+        sh_degree: the largest SH degree to use; None uses all degrees of the Gaussians.
+    """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    return ops.project(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quats,
-        gaussians.opacity_logits,
-        gaussians.sh_dc,
-        gaussians.sh_rest,
+    return View(
         camera.cam_from_world,
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
+        camera.width,
+        camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
         sh_degree=degree,
         antialiased=gaussians.antialiased,
     )
+
+
+def project(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) -> Splats2D:
+    """The 2D splats of the Gaussians in the image of the camera: the first half of `render`."""
+    return ops.project(gaussians, view_of(gaussians, camera, sh_degree))
 
 
 def render(

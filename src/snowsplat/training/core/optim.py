@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import scratch
+from snowsplat.ops import AdamRates, Moments, SplatGradient, scratch
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
@@ -76,37 +76,28 @@ class Adam:
         Args:
             gradients: those of the views of the batch, at least one.
         """
-        parameters = gaussians.parameters()
-        gradient = gradients[-1]
-        camera, ids = gradient.camera, gradient.splats.ids
-        packed_grad: Tensor | None = gradient.packed_grad
+        last = gradients[-1]
         if len(gradients) > 1:
-            ids, packed_grad = _add_up(gaussians, gradients), None
-        assert ids is not None
+            gradient = SplatGradient(_add_up(gaussians, gradients), None)
+        else:
+            gradient = last.of_splats
         batch = self.schedule.batch
-        ops.adam_step(
-            parameters,
-            self.exp_avg,
-            self.exp_avg_sq,
-            ids,
-            packed_grad,
-            camera.cam_from_world,
-            width=camera.width,
-            height=camera.height,
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            sh_degree=gradient.sh_degree,
-            lr={name: math.sqrt(batch) * rate for name, rate in self.rates_at(step).items()},
-            step=self.schedule.update_of(step),
-            betas=(BETAS[0] ** batch, BETAS[1] ** batch),
-            visible_only=self.visible_only,
-            valid=gradient.valid,
-            nonfinite_rows=gradient.nonfinite_rows,
-            antialiased=gaussians.antialiased,
+        rates = AdamRates(
+            {name: math.sqrt(batch) * rate for name, rate in self.rates_at(step).items()},
+            self.schedule.update_of(step),
+            (BETAS[0] ** batch, BETAS[1] ** batch),
         )
-        for parameter in parameters.values():
+        ops.adam_step(
+            gaussians,
+            Moments(self.exp_avg, self.exp_avg_sq),
+            gradient,
+            last.view(gaussians),
+            rates,
+            visible_only=self.visible_only,
+            valid=last.valid,
+            nonfinite_rows=last.nonfinite_rows,
+        )
+        for parameter in gaussians.parameters().values():
             parameter.grad = None
 
     def select(self, index: Tensor, fresh: Tensor) -> None:

@@ -33,8 +33,8 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import LoadedImage
-from snowsplat.ops.adam import PARAMETERS
 from snowsplat.ops.capacity import Capacity
+from snowsplat.ops.gaussian_parameters import PARAMETERS
 from snowsplat.ops.readback import Readback
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera

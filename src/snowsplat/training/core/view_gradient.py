@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops import SplatGradient, Splats2D, View
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import view_of
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,15 @@ class ViewGradient:
         assert self.splats.packed.grad is not None
         return self.splats.packed.grad
 
+    @property
+    def of_splats(self) -> SplatGradient:
+        """The gradient of the splats as an argument of the operations."""
+        return SplatGradient.of(self.splats)
+
+    def view(self, gaussians: Gaussians) -> View:
+        """The view that ``gaussians`` were projected to."""
+        return view_of(gaussians, self.camera, self.sh_degree)
+
     def ignore(self, rows: Tensor) -> None:
         """Set the gradient of some Gaussians to zero, in place, also in ``splats.abs_grad``.
 
@@ -58,23 +68,7 @@ class ViewGradient:
 
     def add_to(self, gaussians: Gaussians, grads: Mapping[str, Tensor]) -> None:
         """Add the gradient with respect to the parameters of the Gaussians to ``grads``."""
-        assert self.splats.ids is not None
-        camera = self.camera
-        ops.add_project_gradients(
-            gaussians.parameters(),
-            grads,
-            self.splats.ids,
-            self.packed_grad,
-            camera.cam_from_world,
-            width=camera.width,
-            height=camera.height,
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            sh_degree=self.sh_degree,
-            antialiased=gaussians.antialiased,
-        )
+        ops.add_project_gradients(gaussians, grads, self.of_splats, self.view(gaussians))
 
     def add_statistics(
         self,

@@ -175,25 +175,15 @@ class PoseRefinement(Part):
 
     def _gradient(self, run: Run, view: int, gradient: ViewGradient) -> tuple[Tensor, Tensor]:
         """(6,) with respect to (ω, τ), to first order, and () with respect to log f; finite."""
-        camera, splats = gradient.camera, gradient.splats
-        assert splats.ids is not None
+        camera = gradient.camera
 
         def over_processes(sums: Tensor) -> Tensor:
             return run.shards.table(sums).sum(0)
 
         d_pose, d_focal = camera_gradient(
-            run.gaussians.parameters(),
-            splats.ids,
-            gradient.packed_grad,
-            camera.cam_from_world,
-            width=camera.width,
-            height=camera.height,
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            sh_degree=gradient.sh_degree,
-            antialiased=run.gaussians.antialiased,
+            run.gaussians,
+            gradient.of_splats,
+            gradient.view(run.gaussians),
             over_processes=over_processes if run.shards.size > 1 else None,
         )
         motion = self._units[view] @ self._state["motions"][view]
