@@ -1,6 +1,6 @@
-"""The walk-throughs of CONTRIBUTING.md as data: files that they create and change, and commands.
+"""The walk-throughs of docs/extend as data: files that they create and change, and commands.
 
-A walk-through is a section whose title begins with "Add". Its code blocks are commands (`sh`), the
+A walk-through is a page whose title begins with "Add". Its code blocks are commands (`sh`), the
 content of a new file (after "Create `path`:"), or changes of a file (`diff`, after "Change
 `path`:"). A diff is applied by its text, without line numbers: the lines that it keeps and removes
 must occur exactly once.
@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "docs" / "extend"
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"(Create|Change)\s+`([^`]+)`:\s*$")
 
@@ -23,7 +24,7 @@ class Mismatch(Exception):
 
 @dataclass
 class WalkThrough:
-    """One section: new files and changes in their order, then the commands in theirs.
+    """One page: new files and changes in their order, then the commands in theirs.
 
     Attributes:
         edits: (path, kind, text); the kind is "diff" or the language of a new file.
@@ -50,30 +51,29 @@ class WalkThrough:
                 path.write_text(text, encoding="utf-8")
 
 
-def walk_throughs(markdown: str) -> list[WalkThrough]:
-    """The walk-throughs of a document.
+def walk_throughs() -> list[WalkThrough]:
+    """The walk-throughs of docs/extend, in the order of their file names.
 
     Raises:
         Mismatch: no file is named before a block, or a new file is a diff.
     """
-    found = []
-    for section in re.split(r"^## ", markdown, flags=re.MULTILINE)[1:]:
-        title = section.partition("\n")[0]
-        if not title.startswith("Add "):
+    pages = (page.read_text(encoding="utf-8") for page in sorted(FOLDER.glob("*.md")))
+    return [walk_through(page) for page in pages if page.startswith("# Add ")]
+
+
+def walk_through(page: str) -> WalkThrough:
+    """The walk-through of a page, or a `Mismatch` as in `walk_throughs`."""
+    walk = WalkThrough(page.partition("\n")[0].removeprefix("# "))
+    for block in _BLOCK.finditer(page):
+        kind, text = block.groups()
+        if kind == "sh":
+            walk.commands += text.splitlines()
             continue
-        walk = WalkThrough(title)
-        for block in _BLOCK.finditer(section):
-            kind, text = block.groups()
-            if kind == "sh":
-                walk.commands += text.splitlines()
-                continue
-            before = section[: block.start()]
-            named = _FILE.search(before)
-            if named is None or (named[1] == "Change") != (kind == "diff"):
-                raise Mismatch(f"{title}: no file is named before a block in {kind}:\n{text}")
-            walk.edits.append((named[2], kind, text))
-        found.append(walk)
-    return found
+        named = _FILE.search(page[: block.start()])
+        if named is None or (named[1] == "Change") != (kind == "diff"):
+            raise Mismatch(f"{walk.title}: no file is named before a block in {kind}:\n{text}")
+        walk.edits.append((named[2], kind, text))
+    return walk
 
 
 def patched(name: str, content: str, diff: str) -> str:

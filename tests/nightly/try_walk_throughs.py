@@ -1,4 +1,4 @@
-"""Follows each walk-through of CONTRIBUTING.md in a copy of the project, command by command.
+"""Follows each walk-through of docs/extend in a copy of the project, command by command.
 
     python tests/nightly/try_walk_throughs.py                    all four
     python tests/nightly/try_walk_throughs.py "a loss" --keep    one; keep the copy
@@ -33,7 +33,7 @@ def main() -> int:
     parser.add_argument("only", nargs="*", help="parts of titles (default: all walk-throughs)")
     parser.add_argument("--keep", action="store_true", help="keep the copies")
     flags = parser.parse_args()
-    walks = walk_throughs((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    walks = walk_throughs()
     chosen = [w for w in walks if not flags.only or any(part in w.title for part in flags.only)]
     if not chosen:
         parser.error(f"no walk-through has such a title; there are {[w.title for w in walks]}")

@@ -1,26 +1,18 @@
-"""The walk-throughs of CONTRIBUTING.md fit the code. nightly/try_walk_throughs.py follows them."""
+"""The walk-throughs of docs/extend fit the code. nightly/try_walk_throughs.py follows them."""
 
 import re
 import shutil
 
 import pytest
 
-from .walk_throughs import ROOT, Mismatch, WalkThrough, patched, walk_throughs
-
-TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+from .walk_throughs import FOLDER, ROOT, Mismatch, WalkThrough, patched, walk_through, walk_throughs
 
 
-def test_there_are_four_walk_throughs():
-    titles = [walk.title for walk in walk_throughs(TEXT)]
-    assert titles == [
-        "Add a scene format",
-        "Add a loss",
-        "Add a density control",
-        "Add an operation",
-    ]
+def test_every_page_is_a_walk_through_except_for_the_index():
+    assert len(walk_throughs()) == len(list(FOLDER.glob("*.md"))) - 1 >= 4
 
 
-@pytest.mark.parametrize("walk", walk_throughs(TEXT), ids=lambda walk: walk.title)
+@pytest.mark.parametrize("walk", walk_throughs(), ids=lambda walk: walk.title)
 def test_every_change_applies_to_the_present_code(tmp_path, walk):
     assert walk.commands
     for name, kind, _ in walk.edits:
@@ -38,12 +30,13 @@ def test_every_change_applies_to_the_present_code(tmp_path, walk):
             assert max(map(len, text.splitlines())) <= 100, name
 
 
-def test_files_named_exist():
-    prose = re.sub(r"^```.*?^```$", "", TEXT, flags=re.MULTILINE | re.DOTALL)
-    links = re.findall(r"\]\(([^):#]+)", prose)
-    assert links
-    for link in links:
-        assert (ROOT / link).exists(), link
+def test_the_files_in_the_table_of_places_exist():
+    (table,) = re.findall(r"^\| new .*?\n\n", (FOLDER / "index.md").read_text("utf-8"), re.M | re.S)
+    names = set(re.findall(r"`([\w/]+(?:\.\w+|/))`", table))
+    assert len(names) > 40
+    for name in names:
+        if "NAME" not in name:
+            assert any((ROOT / folder / name).exists() for folder in ("src/snowsplat", ".")), name
 
 
 def test_a_change_that_does_not_fit_is_an_error():
@@ -53,7 +46,7 @@ def test_a_change_that_does_not_fit_is_an_error():
         patched("a", "x\nx\n", " x\n+y\n")
     assert patched("a", "x\n\ny\nz\n", " x\n\n-y\n+w\n@@\n z\n+v\n") == "x\n\nw\nz\nv\n"
     with pytest.raises(Mismatch, match="no file is named"):
-        walk_throughs("## Add it\n\nCreate this:\n\n```python\nx\n```\n")
+        walk_through("# Add it\n\nCreate this:\n\n```python\nx\n```\n")
 
 
 def test_a_new_file_must_be_new(tmp_path):
