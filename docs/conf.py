@@ -68,4 +68,6 @@ nitpick_ignore_regex = [
         r"(torch|np|numpy|PIL|Image|collections|datetime|typing|contextlib|os|pathlib)\..*|Path|Tensor",
     ),
     ("py:class", r".*\._\w+|Color|Depth|Split"),
+    # types of snowsplat that are not public: the API pages describe the public names only
+    ("py:class", r"snowsplat\..*|Alignment|DepthKind|LivePage|Moment"),
 ]

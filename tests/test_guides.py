@@ -42,13 +42,11 @@ ROTATIONS = re.findall(
 def test_every_python_example_is_executed_here():
     (readme,) = examples("README.md")
     assert PYTHON[0].startswith(readme)
-    assert len(PYTHON) == len(GSPLAT) == 2
-    assert sum(len(examples(page)) for page in TEXTS) == 5
+    assert sum(len(examples(page)) for page in TEXTS) == 1 + len(PYTHON) + len(GSPLAT)
 
 
 @pytest.mark.slow
 def test_photos_to_scene_from_python(tmp_path, monkeypatch, capsys):
-    assert len(PYTHON[0].split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=60))
     scenes.write_photos(tmp_path / "photos", 7)
@@ -63,7 +61,6 @@ def test_photos_to_scene_from_python(tmp_path, monkeypatch, capsys):
 
 
 def test_training_step_by_step_from_python(tmp_path, monkeypatch, capsys):
-    assert len(PYTHON[1].split("\n\n")[1].splitlines()) == 5  # "in five lines"
     monkeypatch.chdir(tmp_path)
     write_toy_dataset(tmp_path / "garden", n_views=9, width=48, height=36, n_points=300)
     quick, changes = re.subn("iterations=[0-9]+", "iterations=40", PYTHON[1])
@@ -166,22 +163,18 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("flag", sorted(OTHERS["docs/guides/reference-implementation.md"]))
-def test_flags_named_as_rejected_are_rejected(flag, capsys):
-    with pytest.raises(SystemExit):
-        cli.parse(["train", "garden", "-o", "out", flag, "1"])
-    assert "Unrecognized options" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("page", TEXTS)
+@pytest.mark.parametrize("page", ["README.md", "README.zh-CN.md"])
 def test_linked_files_exist(page):
-    for link in re.findall(r"\]\(([^):#]+)[#)]", TEXTS[page]):
-        assert (ROOT / page).parent.joinpath(link).exists(), link
+    """`make docs` checks the links of the pages of the site, which the READMEs are not part of."""
+    links = re.findall(r"\]\(([^):#]+)[#)]", (ROOT / page).read_text(encoding="utf-8"))
+    assert len(links) > 20
+    for link in links:
+        assert (ROOT / link).exists(), link
 
 
 def test_environment_variables_are_used():
     source = "".join(file.read_text() for file in (ROOT / "src" / "snowsplat").rglob("*.py"))
     names = re.findall(r"`(SNOWSPLAT_\w+)=", TEXTS["docs/environment-variables.md"])
-    assert len(names) == 3
+    assert names
     for name in names:
         assert name in source

@@ -1,4 +1,4 @@
-"""The Chinese pages: the check in the documentation build, and whether they are complete."""
+"""The Chinese pages: the check in the documentation build, and their code and formulas."""
 
 import re
 import sys
@@ -113,13 +113,7 @@ def formulas(text: str) -> tuple[list[str], set[str]]:
     return alone, {" ".join(formula.split()) for formula in inline}
 
 
-def outline(text: str) -> list[str]:
-    """The kinds of the lines that have one: levels of headings, tables, lists, answers."""
-    text = FENCE.sub("", text)
-    return re.findall(r"^(#+ |\||[-] |\d+\. |</?details>)", text, re.MULTILINE)
-
-
-def test_every_chinese_page_contains_what_the_english_page_contains(translations):
+def test_code_and_formulas_of_every_chinese_page_are_those_of_the_english_page(translations):
     pages = list(translations.pairs(ROOT / "docs"))
     assert len(pages) >= 17
     for english, chinese in pages:
@@ -128,14 +122,3 @@ def test_every_chinese_page_contains_what_the_english_page_contains(translations
         assert blocks(translated) == blocks(original), chinese
         assert formulas(translated)[0] == formulas(original)[0], chinese
         assert formulas(translated)[1] == formulas(original)[1], chinese
-        if english.name != "README.md":  # has a separate table of Chinese pages
-            assert outline(translated) == outline(original), chinese
-        assert len(re.findall(r"[\u4e00-\u9fff]", translated)) > 400, chinese
-
-
-def test_links_of_the_chinese_readme_lead_to_files():
-    text = (ROOT / "README.zh-CN.md").read_text(encoding="utf-8")
-    links = re.findall(r"\]\(([^):#]+)[#)]", text)
-    assert len(links) > 20
-    for link in links:
-        assert (ROOT / link).exists(), link

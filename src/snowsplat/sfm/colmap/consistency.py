@@ -1,6 +1,6 @@
 """Finds the photos that have a wrong pose in a model, from their verified matches.
 
-docs/cameras.md describes the method with examples.
+docs/cameras.md describes the method, docs/measurements/2026-11-23-checking-poses.md an example.
 
 The mapper registers a photo if some of its matches agree with the points of the model. If two
 places look alike, it may register a photo, and then all following photos, at the wrong place. The

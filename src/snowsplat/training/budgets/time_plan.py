@@ -1,7 +1,7 @@
 """Plans a training run for a given time on this machine: photo size, number of Gaussians, steps.
 
 If there is more time, first the number of steps is increased, then the size of the photos, then the
-number of Gaussians: see "Training in a given time" in docs/performance.md.
+number of Gaussians: see docs/measurements/2026-11-22-time-budgets.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MIN_DENSIFICATIONS = 15
 _MIN_DENSIFY_INTERVAL = 25
 #: Seconds before the first step, for preparation and for decoding the first photos.
 _SETUP_SECONDS = 0.5
-#: Seconds for a million pixels of depth maps, on the machine of docs/performance.md.
+#: Seconds for a million pixels of depth maps, on the machine of docs/measurements/2026-11-25-kernels.md.
 _SECONDS_PER_MAP_MEGAPIXEL = 0.4
 #: If depth maps would need more than this share of the time, there is no dense initialisation.
 _MAX_SHARE_OF_MAPS = 0.25
