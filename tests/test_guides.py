@@ -42,7 +42,8 @@ ROTATIONS = re.findall(
 def test_every_python_example_is_executed_here():
     (readme,) = examples("README.md")
     assert PYTHON[0].startswith(readme)
-    assert sum(len(examples(page)) for page in TEXTS) == 1 + len(PYTHON) + len(GSPLAT)
+    others = [page for page in TEXTS if page != "docs/guides/research.md"]  # has its own test
+    assert sum(len(examples(page)) for page in others) == 1 + len(PYTHON) + len(GSPLAT)
 
 
 @pytest.mark.slow
