@@ -12,9 +12,9 @@ from snowsplat.training.settings.config import TrainConfig
 if TYPE_CHECKING:
     from snowsplat.data import Dataset
 
-# Seconds of a step on the machine of docs/measurements/2026-11-25-kernels.md. Only their proportions
-# matter: the time on this machine with this scene, divided by these seconds, is measured. It is the
-# `time_ratio`.
+# Seconds of a step on the machine of docs/measurements/2026-11-25-kernels.md. Only their
+# proportions matter: the time on this machine with this scene, divided by these seconds, is
+# measured. It is the `time_ratio`.
 _SECONDS_PER_STEP = 0.001
 _SECONDS_PER_MEGAPIXEL = 0.035
 _SECONDS_PER_MILLION_GAUSSIANS = 0.07

@@ -41,7 +41,7 @@ _MIN_DENSIFICATIONS = 15
 _MIN_DENSIFY_INTERVAL = 25
 #: Seconds before the first step, for preparation and for decoding the first photos.
 _SETUP_SECONDS = 0.5
-#: Seconds for a million pixels of depth maps, on the machine of docs/measurements/2026-11-25-kernels.md.
+#: Seconds for a million pixels of depth maps, on the machine of `step_cost`.
 _SECONDS_PER_MAP_MEGAPIXEL = 0.4
 #: If depth maps would need more than this share of the time, there is no dense initialisation.
 _MAX_SHARE_OF_MAPS = 0.25
