@@ -6,36 +6,36 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from torch import Tensor
+
+from snowsplat.data import Dataset
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
+from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.time_budget import TimeBudget
+from snowsplat.pipeline.run.train_result import TrainResult
+from snowsplat.pipeline.run.training_run import TrainingRun
+from snowsplat.training.core import checkpoint
+from snowsplat.training.core.checkpoint import Checkpoint
+from snowsplat.training.core.run import Loss
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.part import Part
+from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.settings.config import TrainConfig, parts_of
 from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from snowsplat.data import Dataset
-    from snowsplat.pipeline.run.live_page import LivePage
-    from snowsplat.pipeline.run.train_result import TrainResult
-    from snowsplat.training.core.checkpoint import Checkpoint
-    from snowsplat.training.core.run import Loss
-    from snowsplat.training.core.step_schedule import Schedule
-    from snowsplat.training.core.trainer import Trainer
-    from snowsplat.training.parts.part import Part
-    from snowsplat.training.processes.shards import Shards
-    from snowsplat.training.settings.config import TrainConfig
 
 # Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
@@ -220,9 +220,6 @@ class _Job:
         parts: Sequence[Part],
         loss: Loss | None,
     ) -> None:
-        from snowsplat.training.core import trainer  # noqa: F401 (before the memory is measured)
-        from snowsplat.training.processes.shards import ALONE
-
         self.out, self.options, self.observer, self.page = out, options, observer, page
         self.started = started
         self.parts, self.loss = parts, loss
@@ -298,9 +295,6 @@ class _Job:
         schedule: Schedule | None = None,
         state: dict[str, Tensor] | None = None,
     ) -> Trainer:
-        from snowsplat.training.core.trainer import Trainer
-        from snowsplat.training.settings.config import parts_of
-
         return Trainer(
             dataset,
             config,
@@ -327,8 +321,6 @@ class _Job:
         time_ratio: float,
         memory: MemoryUse,
     ) -> TrainResult:
-        from snowsplat.pipeline.run.training_run import TrainingRun
-
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(
@@ -343,8 +335,6 @@ class _Job:
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:
         """The newest checkpoint; None if there is none, so that training starts at step 0."""
-        from snowsplat.training.core import checkpoint
-
         out = self.out
         newest = checkpoint.latest(out.checkpoints)
         if newest is not None:

@@ -20,6 +20,7 @@ from snowsplat.training.settings.density import (
     DENSITY_CONTROLS,
     AdaptiveDensity,
     DensityConfig,
+    DensitySettings,
     McmcDensity,
     register_density,
 )
@@ -29,13 +30,17 @@ __all__ = [
     "AdaptiveDensity",
     "DensityConfig",
     "DensityControl",
+    "DensitySettings",
     "McmcDensity",
     "register_density",
 ]
 
 
 class DensityControl(Protocol):
-    """The state of a density control: statistics with one row per Gaussian, and two hooks."""
+    """The state of a density control: statistics with one row per Gaussian, and two hooks.
+
+    A class that inherits from this one overrides what it needs; the others do nothing.
+    """
 
     def after_backward(self, step: int, gaussians: Gaussians, gradient: ViewGradient) -> None:
         """Called before the optimiser: accumulates statistics, or adds gradients of regularisers.
@@ -56,11 +61,11 @@ class DensityControl(Protocol):
         Raises:
             Diverged: the parameters are not finite in a step that densifies.
         """
-        ...
+        return gaussians
 
     def state_tensors(self) -> dict[str, Tensor]:
         """The statistics by name, for a checkpoint. The tensors are not copied."""
-        ...
+        return {}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Copy what `state_tensors` returned."""

@@ -7,7 +7,7 @@ resume such a training from a checkpoint, the class is registered:
 
     @register_density
     @dataclass(frozen=True)
-    class MyDensity: ...
+    class MyDensity(DensitySettings): ...
 """
 
 from __future__ import annotations
@@ -178,6 +178,17 @@ class AdaptiveDensity(Settings):
         from snowsplat.training.density.adaptive import AdaptiveDensityControl
 
         return AdaptiveDensityControl.begin(self, count, **state)
+
+
+@dataclass(frozen=True)
+class DensitySettings(Settings):
+    """A base class for the settings of another density control: what each of them has."""
+
+    max_gaussians: int = same(AdaptiveDensity, "max_gaussians", 0)
+    abs_grad: bool = same(AdaptiveDensity, "abs_grad", False)
+    densify_interval: int = same(AdaptiveDensity, "densify_interval", 100)
+    densify_from: When = same(AdaptiveDensity, "densify_from", 0)
+    densify_until: When = same(AdaptiveDensity, "densify_until", 1.0)
 
 
 @dataclass(frozen=True)
