@@ -259,11 +259,10 @@ def test_the_example_of_the_documentation() -> None:
     count = len(meta["gaussian_ids"])
     assert 0 < count < 100
     assert (means[meta["gaussian_ids"], 2] > 0.01).all()
-    for name, columns in (
-        *(("means2d", (2,)), ("conics", (3,)), ("radii", (2,)), ("depths", ())),
-        *(("opacities", ()), ("camera_ids", ()), ("batch_ids", ())),
-    ):
-        assert meta[name].shape == (count, *columns), name
+    for name, columns in (("means2d", 2), ("conics", 3), ("radii", 2)):
+        assert meta[name].shape == (count, columns), name
+    for name in ("depths", "opacities", "camera_ids", "batch_ids"):
+        assert meta[name].shape == (count,), name
     assert (meta["radii"] > 0).all()
     torch.testing.assert_close(meta["depths"], means[meta["gaussian_ids"], 2])
     torch.testing.assert_close(meta["opacities"], opacities[meta["gaussian_ids"]])

@@ -129,7 +129,7 @@ class _ProjectActivated(torch.autograd.Function):
         # The mip filter multiplies the opacity of a Gaussian.
         ctx.factors = packed[:, OPACITIES] / opacities[ids] if camera.antialiased else None
         ctx.set_materialize_grads(False)
-        return packed, packed[:, MEANS2D].clone(), ids
+        return packed, _empty(packed[:, MEANS2D]).copy_(packed[:, MEANS2D]), ids
 
     @staticmethod
     @once_differentiable
@@ -147,7 +147,7 @@ class _ProjectActivated(torch.autograd.Function):
             grad_packed[:, MEANS2D] = grad_means2d
         harmonics = colors.dim() == 3
         d_means, d_log_scales, d_quats, d_logits, d_constants, d_colors = (
-            torch.zeros_like(t) for t in (means, scales, quats, opacities, means, colors)
+            _empty(t).zero_() for t in (means, scales, quats, opacities, means, colors)
         )
         d_pose = project_vjp(
             ctx.gaussians,
@@ -191,20 +191,20 @@ def _tensors(
     any number, because the colour that is computed from it is replaced.
     """
     harmonics = colors.dim() == 3
-
-    def empty(like: Tensor) -> Tensor:
-        return scratch.empty(tuple(like.shape), like.dtype, like.device)
-
     return GaussianTensors(
         means=means,
-        log_scales=torch.log(scales, out=empty(scales)),
+        log_scales=torch.log(scales, out=_empty(scales)),
         quats=quats,
-        opacity_logits=torch.logit(opacities, out=empty(opacities)),
-        sh_dc=empty(means).copy_(colors[:, 0]) if harmonics else means,
+        opacity_logits=torch.logit(opacities, out=_empty(opacities)),
+        sh_dc=_empty(means).copy_(colors[:, 0]) if harmonics else means,
         sh_rest=colors.view(-1)[3:] if harmonics else colors.view(-1)[:0],
         sh_rest_rows=colors.shape[1] if harmonics else 0,
         sh_degree=sh_degree if harmonics else 0,
     )
+
+
+def _empty(like: Tensor) -> Tensor:
+    return scratch.empty(tuple(like.shape), like.dtype, like.device)
 
 
 def _with_colors(packed: Tensor, colors: Tensor) -> Tensor:

@@ -165,11 +165,11 @@ def _rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations (M, 3, 3) of quaternions (M, 4) wxyz of any length. Zero: the identity."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp(min=QUAT_EPS)).unbind(dim=1)
     rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=1),
     ]
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+    return torch.stack(rows, dim=1)  # (M, 3, 3)
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
