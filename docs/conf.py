@@ -22,6 +22,7 @@ extensions = [
     "drawings",
     "local_mathjax",
     "repository_links",
+    "settings_table",
     "subcommand_help",
     "translations",
 ]
