@@ -21,7 +21,7 @@ def small(monkeypatch) -> None:
     photos = functools.partial(
         snowsplat.synthetic.write_synthetic_photos, n_views=14, width=320, height=240
     )
-    monkeypatch.setattr(snowsplat.synthetic, "write_synthetic_photos", photos)
+    monkeypatch.setattr(demo, "write_synthetic_photos", photos)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=30))
     monkeypatch.setattr(demo, "_OPTIONS", MakeOptions("draft", compute=Compute(threads=1)))
     monkeypatch.setattr(demo, "MAX_DEGREES", 3.0)
@@ -69,7 +69,7 @@ def test_after_ctrl_c_the_command_that_resumes_is_printed(run, tmp_path, monkeyp
     def interrupted(folder, report):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(snowsplat.synthetic, "write_synthetic_photos", interrupted)
+    monkeypatch.setattr(demo, "write_synthetic_photos", interrupted)
     stopped = run("demo", "-o", tmp_path / "a b", "--open")
     assert stopped.code == 130
     assert stopped.out.splitlines()[-1] == (

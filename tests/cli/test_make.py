@@ -185,7 +185,7 @@ def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
     """On a slow machine; the same command again repeats nothing and keeps the plan."""
     monkeypatch.setattr(make_module, "_MIN_SECONDS", 1.0)
     monkeypatch.setattr(make_plan, "_FEWEST", 6)
-    monkeypatch.setattr(cost, "measure_speed", lambda threads: cost.Speed(50.0, 1.0))
+    monkeypatch.setattr(make_module, "measure_speed", lambda threads: cost.Speed(50.0, 1.0))
     photos = scenes.write_photos(tmp_path / "many", 12)
     command = ("make", photos, "-o", tmp_path / "out", "--minutes", 0.1, "--threads", 2)
     result = run(*command)

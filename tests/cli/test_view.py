@@ -64,7 +64,7 @@ def test_a_real_browser_at_the_printed_address(start, out):
 @pytest.fixture
 def served(run, monkeypatch):
     """Run `view` until it waits: its result, the opened addresses, the arguments of the site."""
-    from snowsplat.viewer.web import scene as static_scene
+    from snowsplat.pipeline import view as viewing
 
     def served(*arguments: object, environment: Sequence[str] = ()):
         for name in ("SSH_CONNECTION", "SSH_TTY", "DISPLAY", "WAYLAND_DISPLAY"):
@@ -72,9 +72,9 @@ def served(run, monkeypatch):
         for name in environment:
             monkeypatch.setenv(name, ":0")
         opened, sites, done = [], [], threading.Event()
-        site = static_scene.site
+        site = viewing.site
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
-        monkeypatch.setattr(static_scene, "site", lambda *a: (sites.append(a), site(*a))[1])
+        monkeypatch.setattr(viewing, "site", lambda *a: (sites.append(a), site(*a))[1])
         interrupted = SimpleNamespace(wait=lambda _: done.wait(0.3) or True)
         monkeypatch.setattr(view, "interrupts", lambda: nullcontext(interrupted))
         result = run("view", *arguments)
