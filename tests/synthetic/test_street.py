@@ -11,6 +11,8 @@ from snowsplat.synthetic import light
 
 from ..scenes.street_dataset import walk_along, write_street_dataset
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

@@ -189,6 +189,7 @@ def test_residuals_of_the_same_places_in_other_views():
 # The masks
 
 
+@pytest.mark.slow
 def test_what_moves_is_found(trained):
     transients = trained.part(Transients)
     found = indexed(trained)
@@ -224,6 +225,7 @@ def test_the_scene_behind_what_moves(busy, still, trained):
     assert error(trained) < 0.9 * error(unmasked)
 
 
+@pytest.mark.slow
 def test_a_static_scene_changes_no_bit(still):
     step = CONFIG.iterations // 2  # after all moments
     masked, unmasked = (run(still, replace(CONFIG, transients=t), step) for t in ("auto", "off"))
@@ -232,6 +234,7 @@ def test_a_static_scene_changes_no_bit(still):
     assert_identical(masked.gaussians, unmasked.gaussians)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("moving", "compared"), [(True, 4), (False, 2)])
 def test_if_nothing_moves_the_photos_are_not_compared_again(
     busy, still, moving, compared, monkeypatch
@@ -250,6 +253,7 @@ def test_if_nothing_moves_the_photos_are_not_compared_again(
     assert found == steps[:compared]
 
 
+@pytest.mark.slow
 def test_the_mask_of_the_user_remains(trained):
     size = (HEIGHT, WIDTH)
 
@@ -271,6 +275,7 @@ def test_the_mask_of_the_user_remains(trained):
     assert torch.equal(half, found[::2, ::2])
 
 
+@pytest.mark.slow
 def test_masks_as_pictures(busy, trained):
     pictures = trained.part(Transients).pictures()
     assert set(pictures) == set(trained.part(Transients).shares())
