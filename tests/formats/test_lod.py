@@ -23,7 +23,7 @@ from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
 
 SMALL = LodSizes(leaf=100, file=400, coarsest=50)
-COUNT = 1500
+COUNT = 700
 
 
 def surface(count: int) -> Gaussians:

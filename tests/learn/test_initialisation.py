@@ -403,7 +403,7 @@ def test_starts_do_not_know_the_targets(experiment, monkeypatch):
 @pytest.mark.slow
 def test_the_studies_run_with_few_restarts(experiment):
     """Each study yields rows with the settings that the figures select."""
-    studies = experiment("run").studies(restarts=2, steps=60, seeds=1)
+    studies = experiment("run").studies(restarts=2, steps=10, seeds=1)
     for name in ("two targets", "failures", "rules", "images"):
         rows = list(studies[name])
         published = results(name.replace(" ", "_"))

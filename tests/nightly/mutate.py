@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from queue import SimpleQueue
 
 from mutation.equivalents import EQUIVALENTS
@@ -58,7 +59,7 @@ PARTS = {
     "config": Part(("training/core/config.py",), ("tests/training/test_config.py",)),
     "losses": Part(("training/core/losses.py",), ("tests/training/test_losses.py",)),
     "trainer": Part(
-        tuple(f"training/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
+        tuple(f"training/core/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
         ("tests/training/test_trainer.py", "tests/training/test_step_runner.py"),
     ),
     "scene": Part(("scene/*.py",), ("tests/scene",)),
@@ -98,10 +99,10 @@ def main() -> int:
     tallies = {}
     stale = 0
     for name in flags.parts or PARTS:
+        paths = [path for source in PARTS[name].sources for path in _files(source)]
         mutants = [
             mutant
-            for pattern in PARTS[name].sources
-            for path in sorted(PACKAGE.glob(pattern))
+            for path in paths
             for mutant in mutants_of(str(path.relative_to(PACKAGE)), path.read_bytes())
         ]
         stale += report_stale(mutants)
@@ -124,6 +125,14 @@ def main() -> int:
         )
     print_table(tallies, flags.seed)
     return 1 if stale or any(tally.share < REQUIRED for tally in tallies.values()) else 0
+
+
+def _files(pattern: str) -> list[Path]:
+    """The source files of a pattern, which may not be one of files that have been moved."""
+    paths = sorted(PACKAGE.glob(pattern))
+    if not paths:
+        sys.exit(f"mutate: {pattern} is no source file; change PARTS")
+    return paths
 
 
 def report_stale(mutants: list[Mutant]) -> int:

@@ -193,9 +193,10 @@ def pixels_off(found: list[View], true: list[View], dataset: Dataset) -> float:
     return float(own.norm(dim=1).mean())
 
 
+@pytest.mark.slow
 def test_perturbed_poses_come_back(dataset: Dataset) -> None:
     wrong = perturbed(dataset)
-    settings = recipe("default", iterations=400, max_gaussians=1500, test_iterations=())
+    settings = recipe("default", iterations=250, max_gaussians=1500, test_iterations=())
     psnr, pixels = {}, {}
     for on in (False, True):
         trainer = Trainer(wrong, replace(settings, refine_poses=on))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +13,7 @@ import torch
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.processes.shards import ALONE, share
 
+from .. import fork_server
 from ..ports import unused_port
 
 WORKER = Path(__file__).with_name("shards_worker.py")
@@ -58,9 +57,14 @@ def trained(folder: Path, processes: int) -> list[dict]:
         "GLOO_SOCKET_IFNAME": "lo",
     }
     output = folder / f"{processes}.pt"
-    command = [sys.executable, WORKER, folder / "dataset", output, json.dumps(RUNS)]
+    environment = fork_server.ENVIRONMENT | shared
     running = [
-        subprocess.Popen(command, env=os.environ | shared | {"RANK": str(rank)})
+        fork_server.popen(
+            *(WORKER, folder / "dataset", output, json.dumps(RUNS)),
+            env=environment | {"RANK": str(rank)},
+            stdout=sys.__stdout__.fileno(),
+            stderr=sys.__stderr__.fileno(),
+        )
         for rank in range(processes)
     ]
     try:
@@ -85,11 +89,9 @@ def alone(folder: Path) -> list[dict]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the network interface has another name")
-@pytest.mark.parametrize("processes", [2, 4])
-def test_several_processes_give_the_same_bits(
-    folder: Path, alone: list[dict], processes: int
-) -> None:
-    together = trained(folder, processes)
+def test_several_processes_give_the_same_bits(folder: Path, alone: list[dict]) -> None:
+    """With an uneven number: the shares of rows and of views are not equal."""
+    together = trained(folder, 3)
     for one, several in zip(alone, together, strict=True):
         assert len(one["state"]["gaussians.means"]) > 300
         assert several["losses"] == one["losses"]

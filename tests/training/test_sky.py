@@ -160,12 +160,12 @@ def test_what_is_before_the_sky_is_known(outdoors):
 
 def test_a_wire_before_the_sky_is_kept(tmp_path):
     """It is thinner than a cell, so it hardly changes the colour of one."""
-    data = dataset(tmp_path, size=512)
+    data = dataset(tmp_path, size=256)
     wire = torch.tensor([[1.0, -3.0, 9.0]])
     for view in data.train:
         pixel, depth = view.camera.project(wire.double())
         x, y = pixel[0].long().tolist()
-        if depth > 0 and 0 <= x < 512 and 0 <= y < 512:
+        if depth > 0 and 0 <= x < 256 and 0 <= y < 256:
             with Image.open(view.image.path) as file:
                 pixels = np.array(file)
             pixels[:, x] -= np.minimum(pixels[:, x], 150)

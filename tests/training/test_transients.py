@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,9 +31,14 @@ CONFIG = recipe("default", iterations=250, transients="auto")
 
 
 @pytest.fixture(scope="module")
-def still(tmp_path_factory) -> Dataset:
+def photos(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("still")
-    return load_dataset(write_toy_dataset(folder, "colmap-bin", COUNT, WIDTH, HEIGHT, n_points=800))
+    return write_toy_dataset(folder, "colmap-bin", COUNT, WIDTH, HEIGHT, n_points=800)
+
+
+@pytest.fixture(scope="module")
+def still(photos) -> Dataset:
+    return load_dataset(photos)
 
 
 def painted(path: Path, box: tuple[int, int, int, int]) -> None:
@@ -43,11 +49,8 @@ def painted(path: Path, box: tuple[int, int, int, int]) -> None:
 
 
 @pytest.fixture(scope="module")
-def busy(tmp_path_factory) -> Dataset:
-    folder = write_toy_dataset(
-        tmp_path_factory.mktemp("busy"), "colmap-bin", COUNT, WIDTH, HEIGHT, n_points=800
-    )
-    dataset = load_dataset(folder)
+def busy(photos, tmp_path_factory) -> Dataset:
+    dataset = load_dataset(shutil.copytree(photos, tmp_path_factory.mktemp("busy") / "photos"))
     for i, box in BOXES.items():
         painted(dataset.train[i].image.path, box)
     return dataset
@@ -186,6 +189,7 @@ def test_residuals_of_the_same_places_in_other_views():
 # The masks
 
 
+@pytest.mark.slow
 def test_what_moves_is_found(trained):
     transients = trained.part(Transients)
     found = indexed(trained)
@@ -203,6 +207,7 @@ def test_what_moves_is_found(trained):
         assert (~mask).sum() <= 2.0 * inside.sum(), i
 
 
+@pytest.mark.slow
 def test_the_scene_behind_what_moves(busy, still, trained):
     """Where the boxes are, the rendering is compared with photos without them."""
 
@@ -220,13 +225,16 @@ def test_the_scene_behind_what_moves(busy, still, trained):
     assert error(trained) < 0.9 * error(unmasked)
 
 
+@pytest.mark.slow
 def test_a_static_scene_changes_no_bit(still):
-    masked, unmasked = (run(still, replace(CONFIG, transients=t)) for t in ("auto", "off"))
+    step = CONFIG.iterations // 2  # after all moments
+    masked, unmasked = (run(still, replace(CONFIG, transients=t), step) for t in ("auto", "off"))
     assert masked.part(Transients).shares() == {}
     assert unmasked.part(Transients) is None
     assert_identical(masked.gaussians, unmasked.gaussians)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("moving", "compared"), [(True, 4), (False, 2)])
 def test_if_nothing_moves_the_photos_are_not_compared_again(
     busy, still, moving, compared, monkeypatch
@@ -245,6 +253,7 @@ def test_if_nothing_moves_the_photos_are_not_compared_again(
     assert found == steps[:compared]
 
 
+@pytest.mark.slow
 def test_the_mask_of_the_user_remains(trained):
     size = (HEIGHT, WIDTH)
 
@@ -266,6 +275,7 @@ def test_the_mask_of_the_user_remains(trained):
     assert torch.equal(half, found[::2, ::2])
 
 
+@pytest.mark.slow
 def test_masks_as_pictures(busy, trained):
     pictures = trained.part(Transients).pictures()
     assert set(pictures) == set(trained.part(Transients).shares())
@@ -323,7 +333,7 @@ def test_with_few_photos_or_steps_nothing_is_masked(busy, mode, views, steps):
     config = replace(CONFIG, iterations=steps, transients=mode)
     trainer = Trainer(few, config)
     trainer.part(Transients)._compute = None  # is not called
-    trainer.run(until=steps // 2)
+    trainer.run(until=steps // 4)
     assert trainer.part(Transients).shares() == {}
 
 

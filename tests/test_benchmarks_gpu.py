@@ -1,0 +1,390 @@
+"""`benchmarks/gpu.py` and its parts run on the CPU, where the emulation replaces the GPU."""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat import Gaussians, ops
+from snowsplat.ops import reference
+from snowsplat.ops.cuda.launches import KERNELS, launch_by
+from snowsplat.ops.native import LAUNCHERS
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+
+from . import fork_server
+
+ROOT = Path(__file__).resolve().parents[1]
+BENCHMARKS = ROOT / "benchmarks"
+#: A sleep duration that no other process uses, which identifies the children of these tests.
+LONG = 70 + os.getpid() * 1e-7
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def gpu_modules(monkeypatch):
+    """The modules beside gpu.py, which can then be imported by name."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setenv("SNOWSPLAT_GARDEN", "none")
+
+
+def run_jobs(folder, *jobs, seconds=60.0, width=4):
+    import gpu_jobs
+
+    found, log = [], folder / "log"
+    log.write_bytes(b"")
+    runner = gpu_jobs.Runner(
+        folder,
+        log,
+        time.monotonic() + seconds,
+        width,
+        lambda job, one: found.append((job, one)),
+        say=lambda line: None,
+    )
+    runner.run(jobs)
+    return {outcome.job: outcome for outcome in runner.outcomes}, found, log.read_text()
+
+
+def job(name, code, limit=30.0, **more):
+    import gpu_jobs
+
+    return gpu_jobs.Job(name, [sys.executable, "-c", code], limit, **more)
+
+
+def test_without_a_gpu_it_prints_one_line(tmp_path):
+    environment = fork_server.ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": ""}
+    run = fork_server.run(BENCHMARKS / "gpu.py", "--out", tmp_path / "out", env=environment)
+    assert run.returncode == 2
+    assert run.stdout.startswith("gpu: nothing was measured: ")
+    assert len(run.stdout.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_job_that_crashes_or_hangs_does_not_affect_others(gpu_modules, tmp_path):
+    report = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
+    outcomes, found, log = run_jobs(
+        tmp_path,
+        job("a child of its own", f"import subprocess; subprocess.run(['sleep', '{LONG}'])", 1.0),
+        job("crash", report + "import os; print('last words', flush=True); os.abort()"),
+        job("error", report + "raise ValueError('what was wrong')"),
+        job("normal", report + "print('@@ not json'); print('@@ {\"half', end='')"),
+    )
+    assert {name: outcome.state for name, outcome in outcomes.items()} == {
+        "a child of its own": "late",
+        "crash": "failed",
+        "error": "failed",
+        "normal": "done",
+    }
+    assert outcomes["crash"].reason == "SIGABRT; last words"
+    assert outcomes["error"].reason == "ValueError: what was wrong"
+    # Their earlier findings are not lost.
+    assert sorted(name for name, _ in found) == ["crash", "error", "normal"]
+    assert "===== crash: failed" in log
+    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
+    assert f"sleep {LONG}" not in running
+
+
+def test_timed_jobs_run_alone_and_no_job_starts_too_late(gpu_modules, tmp_path):
+    note = (
+        "import time, pathlib; p = pathlib.Path(r'{}'); a = time.time(); time.sleep(0.4); "
+        "f = p.open('a'); f.write(f'{} {{a}} {{time.time()}}\\n')"
+    )
+    path = tmp_path / "times"
+    together = [job(f"together {i}", note.format(path, f"t{i}")) for i in range(3)]
+    alone = job("alone", note.format(path, "a"), alone=True)
+    outcomes, _, _ = run_jobs(tmp_path, *together, alone, job("never", "", least=1000.0))
+    lines = map(str.split, path.read_text().splitlines())
+    spans = {name: (float(a), float(b)) for name, a, b in lines}
+    begin, end = spans.pop("a")
+    assert all(b <= begin or a >= end for a, b in spans.values())
+    assert max(a for a, _ in spans.values()) < min(b for _, b in spans.values())
+    assert outcomes["never"].state == "not run"
+
+
+def test_the_jobs_of_a_run(gpu_modules, tmp_path):
+    """All parts are included, timed jobs run alone, and `gpu_parts.py` accepts all flags."""
+    import gpu
+    import gpu_parts
+
+    flags = argparse.Namespace(
+        datasets=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
+    )
+    planned = gpu.jobs(flags, tmp_path)
+    names = [job.name for job in planned]
+    assert {"device", "stages 1m", "memcheck", "tests/ops/test_rasterize.py"} <= set(names)
+    first_alone = next(i for i, job in enumerate(planned) if job.alone and i > 0)
+    assert all(job.alone for job in planned[first_alone:])
+    for job in planned:
+        gpu_parts.parse(list(job.command[2:]))
+
+
+def part(name, *arguments, limit=100.0, **environment):
+    import gpu_jobs
+
+    paths = os.pathsep.join([str(ROOT / "src"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return gpu_jobs.Job(
+        name,
+        [sys.executable, str(BENCHMARKS / "gpu_parts.py"), *map(str, arguments)],
+        limit,
+        environment={"PYTHONPATH": paths, **environment},
+    )
+
+
+def test_tests_continue_in_a_new_process_after_a_lost_gpu(gpu_modules, tmp_path):
+    """The GPU is lost after a test; each new process can use it again."""
+    test = tmp_path / "test_them.py"
+    test.write_text(
+        "import pytest\n"
+        "pytestmark = pytest.mark.gpu\n"
+        "def test_a():\n"
+        "    import sys; sys.modules['__main__'].gpu_is_lost = lambda: True\n"
+        "    assert 1 == 2, 'one is not two'\n"
+        "def test_b(): pass\n"
+    )
+    arguments = ["tests", str(test), "--done", str(tmp_path / "done")]
+    outcomes, found, log = run_jobs(tmp_path, part("t", *arguments))
+    assert outcomes["t"].state == "done", log
+    last = [one for _, one in found if one["kind"] == "tests"][-1]
+    assert last == {"kind": "tests", "passed": 1, "failed": 1, "skipped": 0, "total": 2}
+    assert any(f["kind"] == "failure" and "one is not two" in f["line"] for _, f in found)
+
+
+def test_the_output_of_the_sanitizer(gpu_modules):
+    import gpu_parts
+
+    log = gpu_parts.SanitizerLog()
+    for line in (
+        "========= COMPUTE-SANITIZER\n",
+        "ops: 33 Gaussians\n",
+        "========= Invalid __global__ write of size 4 bytes\n",
+        "=========     at rasterize_bwd+0x1230\n",
+        "all ops ran\n",
+        "========= ERROR SUMMARY: 30 errors\n",
+    ):
+        log.read(line)
+    assert (log.errors, log.finished, log.last) == (30, True, "ops: 33 Gaussians")
+    assert log.first[0] == "Invalid __global__ write of size 4 bytes, at rasterize_bwd+0x1230"
+
+
+def test_a_training(gpu_modules, tmp_path):
+    with torch.random.fork_rng():
+        write_toy_dataset(tmp_path / "lego400", n_views=9, width=48, height=36, n_points=200)
+    flags = ("--device", "cpu", "--iterations", 30, "--seeds", 0)
+    training = part("train", "train", tmp_path / "none", tmp_path / "lego400", *flags)
+    outcomes, found, log = run_jobs(tmp_path, training)
+    assert outcomes["train"].state == "done", log
+    absent, run = [one for _, one in found]
+    assert absent == {"kind": "absent", "dataset": "none"}
+    assert (run["dataset"], run["seed"], run["device"]) == ("lego400", 0, "cpu")
+    assert 5 < run["psnr"] < 60
+    assert run["seconds"] > 0
+
+
+class FakeEvent:
+    """A GPU event that records the time of the CPU."""
+
+    def __init__(self, enable_timing=False):
+        self.time = 0.0
+
+    def record(self):
+        self.time = time.perf_counter()
+
+    def elapsed_time(self, other):
+        return 1e3 * (other.time - self.time)
+
+    def query(self):
+        return False
+
+    def synchronize(self):
+        pass
+
+
+@pytest.fixture
+def fake_gpu(gpu_modules, monkeypatch):
+    """The emulation replaces the GPU. The tests check that the parts run, not their speed."""
+    import gpu_peer
+    import gpu_step
+
+    from snowsplat.ops.cuda import driver
+
+    from .ops import emulation
+
+    def one_megabyte(*args):
+        return 1 << 20
+
+    monkeypatch.setattr(torch.cuda, "Event", FakeEvent)
+    for name in ("_sleep", "empty_cache"):
+        monkeypatch.setattr(torch.cuda, name, one_megabyte)
+    begun = []
+
+    def reset():
+        assert begun  # required by PyTorch
+
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: begun.append(True))
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset)
+    for name in ("memory_allocated", "max_memory_allocated"):
+        monkeypatch.setattr(torch.cuda, name, one_megabyte)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 20, 1 << 20))
+    card = argparse.Namespace(name="Card X", major=9, minor=0, multi_processor_count=2)
+    card.total_memory, card.L2_cache_size = 10**9, 10**6
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: card)
+    monkeypatch.setattr(driver, "run", emulation.execute)
+    for module in (gpu_step, gpu_peer):
+        monkeypatch.setattr(module, "GPU", torch.device("cpu"))
+    monkeypatch.setitem(LAUNCHERS, "cpu", lambda *args: launch_by(emulation.execute, *args))
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def found_in(text):
+    import gpu_jobs
+
+    lines = [line.partition(gpu_jobs.MARK) for line in text.splitlines()]
+    return [json.loads(rest) for _, marked, rest in lines if marked]
+
+
+@pytest.mark.emulated
+def test_the_sanitizer_program_runs_every_kernel(fake_gpu, monkeypatch):
+    import gpu_ops
+
+    from .ops import emulation
+
+    launched = set()
+
+    def execute(kernel, name, blocks, params):
+        launched.add(name)
+        emulation.execute(kernel, name, blocks, params)
+
+    monkeypatch.setitem(LAUNCHERS, "cpu", lambda *args: launch_by(execute, *args))
+    gpu_ops.every_op(torch.device("cpu"), gpu_ops.SMALL, wide=False, say=lambda line: None)
+    # This scene has more tiles than the emulation can process in a short time.
+    assert set(KERNELS) - {name.removesuffix("_f64") for name in launched} == {"tiles_start_u32"}
+
+
+@pytest.mark.emulated
+def test_the_measuring_parts_run(fake_gpu, capsys, tmp_path):
+    """Each stage of a step has a time, a lower bound and a row of the page."""
+    import gpu_floor
+    import gpu_ops
+    import gpu_parts
+    import gpu_table
+
+    torch.save(gpu_ops.random_scene(60, 40, 30), tmp_path / "1m.scene")
+    gpu_parts.device()
+    gpu_parts.stages("1m", tmp_path, repeats=1)
+    found = found_in(capsys.readouterr().out)
+    kinds = [one["kind"] for one in found]
+    assert kinds[:2] == ["device", "bandwidth"]
+    assert kinds[-6:] == ["frame", "memory", "step", "stages", "step", "stages"]
+    frame = found[kinds.index("frame")]
+    assert 0 < frame["seen"] < frame["gaussians"] == 60
+    assert 0 < frame["pairs"] <= frame["instances"] * 256
+    counts = {
+        name: frame[name] for name in ("gaussians", "seen", "instances", "pairs", "width", "height")
+    }
+    for one in found:
+        if one["kind"] == "stages":
+            in_order = one["in_order"]
+            works = gpu_floor.works(gpu_floor.Frame(**counts, in_order=in_order))
+            assert list(one["kernels"]) == list(works)
+            assert one["kernels"].keys() <= gpu_table.NAMES.keys()
+            assert ("splats_reduce" in one["kernels"]) == in_order
+            assert min(t for times in one["kernels"].values() for t in times.values()) > 0
+        elif one["kind"] == "step":
+            assert min(one["gpu"], one["host"], one["wall"]) > 0
+    findings = gpu_table.Findings()
+    for one in found:
+        findings.add("job", one)
+    page = gpu_table.page(findings, [], "2030-01-01", running=False)
+    assert f"60 Gaussians of random Gaussians, 40×30, {frame['seen']} visible" in page
+    for name in ("project: cull", "blend backward", "Adam", "reduce", "whole step"):
+        assert f"| {name} | " in page
+
+
+@pytest.mark.emulated
+def test_comparison_with_a_peer(fake_gpu, capsys, monkeypatch):
+    """The peer is our reference implementation, so the images are equal."""
+    import gpu_ops
+    import gpu_peer
+
+    gpu_peer.build()
+    (none,) = found_in(capsys.readouterr().out)
+    assert none["kind"] == "no peer"
+
+    def rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane,
+        sh_degree, packed,
+    ):  # fmt: skip
+        assert viewmats.shape == (1, 4, 4)
+        gaussians = Gaussians(
+            means, scales.log(), quats, opacities.logit(), colors[:, :1], colors[:, 1:]
+        )
+        (fx, _, cx), (_, fy, cy), _ = Ks[0].tolist()
+        view = ops.View(viewmats[0, :3], width, height, fx, fy, cx, cy, sh_degree, near_plane)
+        splats = reference.project(gaussians, view)
+        image, alpha, _ = reference.rasterize(splats, width, height)
+        return image[None], alpha[None, :, :, None], {}
+
+    peer = argparse.Namespace(rasterization=rasterization, __version__="9.9")
+    monkeypatch.setitem(sys.modules, "gsplat", peer)
+    gpu_peer.build()
+    gpu_peer.compare(gpu_ops.random_scene(60, 40, 30), "1m", repeats=1)
+    found = found_in(capsys.readouterr().out)
+    assert found[0] == {"kind": "peer", "version": "9.9"}
+    assert found[1]["kind"] == "peer image"
+    assert found[1]["psnr"] > 90
+    whats = [one["what"] for one in found[2:]]
+    assert whats == ["image", "image and gradient", "training step"]
+    assert all(min(one["ours"], one["theirs"]) > 0 for one in found[2:])
+
+
+FAKE_RUN = """
+import sys
+sys.path.insert(0, BENCHMARKS)
+import gpu, gpu_jobs
+report = "print('@@ {}', flush=True); "
+def job(name, code, **more):
+    return gpu_jobs.Job(name, [sys.executable, "-c", code], 30.0, **more)
+gpu.probe = lambda: {"kind": "gpu", "name": "Card X"}
+failure = report.format('{"kind": "failure", "test": "t", "line": "no"}')
+tests = report.format('{"kind": "tests", "passed": 1, "failed": 1, "skipped": 0, "total": 2}')
+gpu.jobs = lambda flags, scratch: [
+    job("tests", failure + tests),
+    job("train", "import os; os.abort()"),
+    job("slow", "import time; time.sleep(LONG)", alone=True),
+]
+sys.exit(gpu.main())
+"""
+
+
+def test_a_run_that_is_ended_writes_its_page(tmp_path):
+    code = FAKE_RUN.replace("BENCHMARKS", repr(str(BENCHMARKS))).replace("LONG", str(LONG))
+    run = fork_server.popen("-c", code, "--out", tmp_path)
+    page, until = tmp_path / "gpu.md", time.monotonic() + 60
+
+    def both_have_ended():
+        text = page.read_text() if page.exists() else ""
+        return "- train: failed" in text and "Done: tests" in text
+
+    while not both_have_ended():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    assert "(not finished)" in page.read_text()
+    run.terminate()
+    text, _ = run.communicate(timeout=60)
+    assert run.returncode == 143
+    assert text.endswith(page.read_text() + "\n")
+    assert "(not finished)" not in page.read_text()
+    assert "1 passed, 1 failed, 0 skipped, of 2 in 1 files" in page.read_text()
+    kinds = [one["kind"] for one in json.loads((tmp_path / "gpu.json").read_text())]
+    assert kinds == ["gpu", "failure", "tests"]
+    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
+    assert f"time.sleep({LONG})" not in running
