@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, ConfigFlags, RecipeName
 from snowsplat.cli.flags import flag, switch
-from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.train import TrainOptions
 from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.pipeline.train import TrainOptions
 
 
 @dataclass
@@ -98,6 +99,9 @@ class TrainFlags(ConfigFlags, JobFlags):
 
     def options(self) -> TrainOptions:
         """The options of `pipeline.train.train`. Raises: UserError: contradictory flags."""
+        from snowsplat.pipeline.compute import Compute
+        from snowsplat.pipeline.train import TrainOptions
+
         return TrainOptions(
             recipe=self.recipe,
             settings=self._settings(),

@@ -241,7 +241,9 @@ class _Job:
         plan = None
         if budget is not None:
             plan = budget.plan(
-                *(dataset, config, self.device),
+                dataset,
+                config,
+                self.device,
                 resize=options.resolution is None,
                 more_gaussians=options.settings.get("max_gaussians") is None,
                 more_often=all(
@@ -324,7 +326,14 @@ class _Job:
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(
-            *(self.out, settings, recipe, trainer, budget, pace, memory, self.observer),
+            self.out,
+            settings,
+            recipe,
+            trainer,
+            budget,
+            pace,
+            memory,
+            self.observer,
             save_iterations=self.options.save_iterations,
             checkpoint_seconds=self.options.checkpoint_seconds,
             page=self.page,
