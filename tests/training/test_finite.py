@@ -142,8 +142,8 @@ def test_an_invisible_nonfinite_gaussian_is_found_by_the_refinement(dataset, con
     assert trainer.step == 10
 
 
-@pytest.mark.parametrize("rate", [1e30, 1e38])
-def test_a_learning_rate_that_diverges(dataset: Dataset, rate: float) -> None:
+def test_a_learning_rate_that_diverges(dataset: Dataset) -> None:
+    rate = 1e38
     rates = replace(CALM.learning_rates, quats=rate, opacity_logits=rate)
     trainer = Trainer(dataset, replace(CALM, learning_rates=rates))
     with pytest.raises(Diverged, match="use lower learning rates"):
