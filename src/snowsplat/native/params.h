@@ -46,14 +46,16 @@ struct GaussianTensors {
   const T* log_scales;      // (N, 3)
   const T* quats;           // (N, 4) wxyz, not necessarily normalised
   const T* opacity_logits;  // (N,)
-  const T* sh_dc;           // (N, 1, 3)
-  const T* sh_rest;         // (N, sh_rest_rows, 3)
-  int64_t sh_rest_rows;     // rows of sh_rest as stored
-  int64_t sh_degree;        // 0 to 3: the first (sh_degree + 1)² − 1 rows are used
-  SNOW_FIELDS(means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_rest_rows, sh_degree)
+  const T* sh_dc;           // (N, 1, 3) of a tensor (N, sh_dc_rows, 3)
+  const T* sh_rest;         // (N, K, 3) of a tensor (N, sh_rest_rows, 3)
+  int64_t sh_rest_rows;     // at least K
+  int64_t sh_degree;        // 0 to 3: K = (sh_degree + 1)² − 1
+  int64_t sh_dc_rows = 1;   // more than 1 if sh_dc and sh_rest are parts of one tensor
+  SNOW_FIELDS(means, log_scales, quats, opacity_logits, sh_dc, sh_rest, sh_rest_rows, sh_degree,
+              sh_dc_rows)
 };
 
-// The gradients of these parameters, of the same shapes.
+// The gradients of these parameters, with the same shapes and rows.
 template <class T>
 struct GaussianGradients {
   T *means, *log_scales, *quats, *opacity_logits, *sh_dc, *sh_rest;

@@ -48,9 +48,9 @@ def project_activated(
 
     Returns:
         The splats, without empty rows (a GPU waits for their number), and their centres (M, 2), in
-        pixels. The gradient of the centres, if it is retained, is that of `splats.means2d`: pass
-        the centres, or a tensor that was computed from them, to `with_centres`. Gradients flow to
-        every tensor, including the pose of the view.
+        pixels, which are a view of the splats. The gradient of the centres, if it is retained, is
+        that of `splats.means2d`: pass the centres, or a tensor that was computed from them, to
+        `with_centres`. Gradients flow to every tensor, including the pose of the view.
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
@@ -122,14 +122,14 @@ class _ProjectActivated(torch.autograd.Function):
             kept = (ids >= 0) & (packed[:, DEPTHS] <= far) & (packed[:, RADII] > radius_clip)
             packed, ids = packed[kept], ids[kept]
         if colors.dim() == 2:
-            packed = _with_colors(packed, colors[ids])
+            packed = _with_colors(packed, colors, ids)
         ctx.mark_non_differentiable(ids)
         ctx.save_for_backward(cam_from_world, means, scales, quats, opacities, colors, ids)
         ctx.gaussians, ctx.camera = gaussians, camera
         # The mip filter multiplies the opacity of a Gaussian.
         ctx.factors = packed[:, OPACITIES] / opacities[ids] if camera.antialiased else None
         ctx.set_materialize_grads(False)
-        return packed, _empty(packed[:, MEANS2D]).copy_(packed[:, MEANS2D]), ids
+        return packed, packed[:, MEANS2D], ids
 
     @staticmethod
     @once_differentiable
@@ -146,9 +146,11 @@ class _ProjectActivated(torch.autograd.Function):
         elif grad_means2d.data_ptr() != grad_packed.data_ptr():
             grad_packed[:, MEANS2D] = grad_means2d
         harmonics = colors.dim() == 3
-        d_means, d_log_scales, d_quats, d_logits, d_constants, d_colors = (
-            _empty(t).zero_() for t in (means, scales, quats, opacities, means, colors)
+        d_means, d_log_scales, d_quats, d_logits, d_colors = (
+            _empty(t).zero_() for t in (means, scales, quats, opacities, colors)
         )
+        # Without harmonics, the kernel's gradients of the colours are not used.
+        d_dc, d_rest = _harmonics(d_colors) if harmonics else (_empty(means), d_colors)
         d_pose = project_vjp(
             ctx.gaussians,
             replace(ctx.camera, cam_from_world=cam_from_world),
@@ -159,20 +161,19 @@ class _ProjectActivated(torch.autograd.Function):
                 log_scales=d_log_scales,
                 quats=d_quats,
                 opacity_logits=d_logits,
-                sh_dc=d_constants,
-                sh_rest=d_colors.view(-1)[3:] if harmonics else d_colors.view(-1)[:0],
+                sh_dc=d_dc,
+                sh_rest=d_rest,
             ),
             with_pose=ctx.needs_input_grad[3],
         )
         rows = ids.long()
-        if harmonics:
-            d_colors[:, 0] = d_constants
-        else:
-            d_colors[rows] = grad_packed[:, COLORS : COLORS + colors.shape[1]]
+        if not harmonics:
+            d_colors.index_copy_(0, rows, grad_packed[:, COLORS : COLORS + colors.shape[1]])
         d_scales = d_log_scales.div_(scales.clamp_min(torch.finfo(scales.dtype).tiny))
-        # The derivative of the logit is inaccurate for opacities near 1, and 0 at 1.
-        d_opacities, d_rows = d_logits.zero_(), grad_packed[:, OPACITIES]
-        d_opacities[rows] = d_rows if ctx.factors is None else d_rows * ctx.factors
+        # The derivative of the logit is inaccurate for opacities near 1, and 0 at 1. The kernel adds
+        # only to the rows of the splats, which are all replaced.
+        d_opacities, d_rows = d_logits, grad_packed[:, OPACITIES]
+        d_opacities.index_copy_(0, rows, d_rows if ctx.factors is None else d_rows * ctx.factors)
         return None, None, None, d_pose, d_means, d_scales, d_quats, d_opacities, d_colors
 
 
@@ -186,32 +187,40 @@ def _tensors(
 ) -> GaussianTensors:
     """The parameters that the native functions read.
 
-    The rows of a Gaussian in `sh_rest` are those of `colors`, one row later; the row after the last
-    one that is read is the constant of the next Gaussian. Without harmonics, the constant can be
-    any number, because the colour that is computed from it is replaced.
+    Without harmonics, the constants can be any numbers, because the colours that are computed from
+    them are replaced.
     """
     harmonics = colors.dim() == 3
+    sh_dc, sh_rest = _harmonics(colors) if harmonics else (means, colors)
+    rows = colors.shape[1] if harmonics else 1
     return GaussianTensors(
         means=means,
         log_scales=torch.log(scales, out=_empty(scales)),
         quats=quats,
         opacity_logits=torch.logit(opacities, out=_empty(opacities)),
-        sh_dc=_empty(means).copy_(colors[:, 0]) if harmonics else means,
-        sh_rest=colors.view(-1)[3:] if harmonics else colors.view(-1)[:0],
-        sh_rest_rows=colors.shape[1] if harmonics else 0,
+        sh_dc=sh_dc,
+        sh_rest=sh_rest,
+        sh_rest_rows=rows,
         sh_degree=sh_degree if harmonics else 0,
+        sh_dc_rows=rows,
     )
+
+
+def _harmonics(colors: Tensor) -> tuple[Tensor, Tensor]:
+    """The arguments sh_dc and sh_rest of native functions, in the storage of `colors` (N, K, 3)."""
+    return colors, colors.view(-1)[3:]
 
 
 def _empty(like: Tensor) -> Tensor:
     return scratch.empty(tuple(like.shape), like.dtype, like.device)
 
 
-def _with_colors(packed: Tensor, colors: Tensor) -> Tensor:
-    """`packed` (M, 16) with other colours (M, C)."""
-    width = packed_width(colors.shape[1])
+def _with_colors(packed: Tensor, colors: Tensor, ids: Tensor) -> Tensor:
+    """`packed` (M, 16) with the rows `ids` of other colours (N, C)."""
+    channels = colors.shape[1]
+    end, width = COLORS + channels, packed_width(channels)
     if width > packed.shape[1]:
         packed = torch.nn.functional.pad(packed[:, :COLORS], (0, width - COLORS))
-    packed[:, COLORS : COLORS + colors.shape[1]] = colors
-    packed[:, COLORS + colors.shape[1] :] = 0.0
+    torch.index_select(colors, 0, ids, out=packed[:, COLORS:end])
+    packed[:, end : COLORS + 3] = 0.0  # the other colours that were there
     return packed

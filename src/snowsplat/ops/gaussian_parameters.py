@@ -59,5 +59,8 @@ def gaussian_tensors(tensors: Mapping[str, Tensor], sh_degree: int) -> GaussianT
     """The parameters, contiguous, as a parameter of native functions."""
     contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
     return GaussianTensors(
-        **contiguous, sh_rest_rows=tensors["sh_rest"].shape[1], sh_degree=sh_degree
+        **contiguous,
+        sh_rest_rows=tensors["sh_rest"].shape[1],
+        sh_degree=sh_degree,
+        sh_dc_rows=1,
     )

@@ -38,6 +38,7 @@ class GaussianTensors(Params):
     sh_rest: Tensor
     sh_rest_rows: int
     sh_degree: int
+    sh_dc_rows: int
 
 
 @dataclass(slots=True, kw_only=True)

@@ -241,6 +241,8 @@ def _refuse_unsupported(
 
 def _items(tensor: Tensor, dims: int) -> list[Tensor]:
     """The items, which have `dims` dimensions, of a batch of any dimensions."""
+    if tensor.dim() == dims:
+        return [tensor]
     items = tensor.reshape(-1, *tensor.shape[tensor.dim() - dims :])
     # The gradient of one of several items is a copy.
     return [items.squeeze(0)] if len(items) == 1 else list(items.unbind(0))
@@ -272,7 +274,7 @@ def _meta(
         indices = [divmod(i, of_views[-1]) for i in range(len(rows))]
         for name, j in (("batch_ids", 0), ("camera_ids", 1)):
             of_rows = zip(rows, indices, strict=True)
-            meta[name] = _joined([torch.full_like(own, index[j]) for own, index in of_rows])
+            meta[name] = _joined([own.new_full((), at[j]).expand(own.shape) for own, at in of_rows])
         meta["gaussian_ids"] = _joined(rows)
         if len(rows) == 1:
             return meta, [meta["means2d"]]

@@ -46,7 +46,7 @@ struct GaussianGroup {
   }
   SNOW_INLINE void load(const GaussianTensors<T>& g) {
     load_position(g), load_orientation(g);
-    gather_rows(g.sh_dc, 3, rows.row, 3, dc);
+    gather_rows(g.sh_dc, 3 * g.sh_dc_rows, rows.row, 3, dc);
     gather_rows(g.sh_rest, 3 * g.sh_rest_rows, rows.row, sh_columns(int(g.sh_degree)), rest);
   }
 };
@@ -56,7 +56,7 @@ struct GaussianGroup {
 template <class T>
 SNOW_INLINE void prefetch_row(const GaussianTensors<T>& g, int64_t row) {
   prefetch(g.means + 3 * row), prefetch(g.log_scales + 3 * row), prefetch(g.quats + 4 * row);
-  prefetch(g.opacity_logits + row), prefetch(g.sh_dc + 3 * row);
+  prefetch(g.opacity_logits + row), prefetch(g.sh_dc + 3 * g.sh_dc_rows * row);
   const T* rest = g.sh_rest + 3 * g.sh_rest_rows * row;
   for (int c = 0; c < sh_columns(int(g.sh_degree)); c += 16) prefetch(rest + c);
 }

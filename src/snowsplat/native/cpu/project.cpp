@@ -134,7 +134,7 @@ int64_t backward(const ProjectBackwardParams<T>& p) {
         add_rows(grads.log_scales, 3, g.rows, 3, d.shape.log_scale);
         add_rows(grads.quats, 4, g.rows, 4, d.shape.quat);
         add_rows(grads.opacity_logits, 1, g.rows, 1, &d.shape.opacity_logit);
-        add_rows(grads.sh_dc, 3, g.rows, 3, d.dc);
+        add_rows(grads.sh_dc, 3 * tensors.sh_dc_rows, g.rows, 3, d.dc);
         add_rows(grads.sh_rest, 3 * tensors.sh_rest_rows, g.rows, sh_columns(degree), d.rest);
       }
       if (pose) {

@@ -96,7 +96,7 @@ SNOW_INLINE void row_vjp(const GaussianTensors<T>& tensors, int64_t id, const Pi
                                     grad_splat[5],
                                     grad_splat[6]};
   T dc[3], d_color[3], d_mean[3];
-  for (int k = 0; k < 3; k++) dc[k] = tensors.sh_dc[3 * id + k];
+  for (int k = 0; k < 3; k++) dc[k] = tensors.sh_dc[3 * tensors.sh_dc_rows * id + k];
   for (int k = 0; k < 3; k++) d_color[k] = grad_splat[kPackedHeader + k];
   with_degree(int(tensors.sh_degree), [&](auto constant) {
     sh_color_vjp(constant.value, view_direction(g.mean, cam.position), dc, row, d_color,

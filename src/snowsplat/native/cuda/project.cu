@@ -54,7 +54,7 @@ SNOW_INLINE void forward(const ProjectForwardParams<T>& p) {
     GaussianShape<T> g;
     load_shape(tensors, id, g);
     T dc[3], *color = column + kPackedHeader;
-    for (int k = 0; k < 3; k++) dc[k] = tensors.sh_dc[3 * id + k];
+    for (int k = 0; k < 3; k++) dc[k] = tensors.sh_dc[3 * tensors.sh_dc_rows * id + k];
     with_degree(int(tensors.sh_degree), [&](auto constant) {
       sh_color(constant.value, view_direction(g.mean, cam.position), dc, row, color);
     });
@@ -112,7 +112,7 @@ SNOW_INLINE void backward(const ProjectBackwardParams<T>& p) {
     add_columns<3>(tile + kLogScaleColumn, 3, id_of, 3, grads.log_scales);
     add_columns<4>(tile + kQuatColumn, 4, id_of, 4, grads.quats);
     add_columns<1>(tile + kLogitColumn, 1, id_of, 1, grads.opacity_logits);
-    add_columns<3>(tile + kDcColumn, 3, id_of, 3, grads.sh_dc);
+    add_columns<3>(tile + kDcColumn, 3, id_of, 3 * tensors.sh_dc_rows, grads.sh_dc);
     if (degree > 0)
       add_columns<kRestBatch>(tile, sh_columns(degree), id_of, 3 * tensors.sh_rest_rows,
                               grads.sh_rest);
