@@ -38,6 +38,7 @@ def stage(
         "dataset": SimpleNamespace(train=[None] * views, points=colored),
         "device": torch.device("cpu"),
         "initial": None,
+        "resumed": False,
         "left_out": (),
         "sh_degree": 0,
         "render": None,

@@ -188,6 +188,89 @@ class Counted(Part):
         self.steps = int(tensors["steps"])
 
 
+class Renamed(Part):
+    """Has the name of a part of the package."""
+
+    name = "decay"
+
+
+class Rows(Part):
+    """Keeps rows by itself, for as long as no Gaussian is added or removed."""
+
+    def begin(self, run):
+        self.seen = torch.zeros(len(run.gaussians))
+
+    def after_step(self, run, step, batch):
+        self.seen += 1.0
+
+    def row_state(self):
+        return {"seen": self.seen}
+
+    def load(self, tensors):
+        self.seen = tensors["seen"].clone()
+
+
+def test_rows_of_a_part_are_loaded_again(dataset):
+    calm = replace(CONFIG, density=replace(CONFIG.density, densify_from=1000))
+    first = trainer_with(dataset, Rows(), config=calm)
+    first.run(until=7)
+    second = trainer_with(dataset, Rows(), config=calm, state=first.state_tensors())
+    assert torch.equal(second.part(Rows).seen, torch.full((len(second.gaussians),), 7.0))
+
+
+def test_a_state_that_cannot_be_loaded_names_its_part(dataset):
+    state = trainer_with(dataset, Counted()).state_tensors()
+    del state["Counted.steps"]
+    with pytest.raises(UserError, match="the state of the part 'Counted' cannot be loaded"):
+        trainer_with(dataset, Counted(), state=state)
+
+
+@pytest.mark.parametrize("name", ["rows", "gaussians", "a.b", ""])
+def test_reserved_names_are_rejected(dataset, name):
+    part = Counted()
+    part.name = name
+    with pytest.raises(UserError, match="cannot have the name"):
+        trainer_with(dataset, part)
+
+
+def test_a_regularizer_acts_on_gaussians_that_no_view_shows(dataset):
+    class Larger(Part):
+        def regularizer(self, run, gaussians):
+            return None if run.step == 0 else -gaussians.log_scales.sum()
+
+    assert CONFIG.visible_only
+    trainer = trainer_with(dataset, Larger())
+    trainer.run(until=1)
+    before = trainer.gaussians.log_scales.clone()
+    trainer.run(until=2)
+    assert (trainer.gaussians.log_scales != before).all()
+
+
+def test_a_regularizer_may_be_constant(dataset):
+    class Zero(Part):
+        def regularizer(self, run, gaussians):
+            return torch.zeros(())
+
+    trainer_with(dataset, Zero()).run(until=2)
+
+
+def test_mcmc_adds_its_gradient_to_that_of_a_part(dataset):
+    class Seven(Part):
+        def gradients(self, run, step, batch, gradients):
+            run.gaussians.opacity_logits.grad = torch.full_like(run.gaussians.opacity_logits, 7.0)
+
+    config = recipe("mcmc-short", iterations=40, max_gaussians=500)
+    trainer = trainer_with(dataset, Seven(), config=config)
+    seen = []
+    step = trainer.optimizer.step
+    trainer.optimizer.step = lambda gaussians, *rest: (
+        seen.append(gaussians.opacity_logits.grad.clone()),
+        step(gaussians, *rest),
+    )
+    trainer.step_once()
+    assert (seen[0] > 7.0).all()
+
+
 def charbonnier(image, photo, background):
     return ((image - photo.over(background)).square() + 1e-4).sqrt().mean()
 
@@ -219,11 +302,16 @@ def test_a_resumed_run_with_parts_and_a_loss_has_the_same_bits(dataset, tmp_path
         ({"loss": charbonnier}, {}, "made with the loss 'charbonnier'"),
         ({}, {"parts": [Entropy]}, "made without the part 'Entropy'"),
         ({}, {"loss": charbonnier}, "made without the loss 'charbonnier'"),
+        ({"left": "decay"}, {}, "made without the part 'decay'; leave it out again"),
+        ({}, {"left": "decay"}, "made with the part 'decay' of the package"),
+        ({"left": "decay", "parts": [Renamed]}, {}, "made with the part 'decay'"),
     ],
 )
 def test_what_is_missing_is_named(dataset, saved, resumed, message):
-    def begun(parts=(), loss=None, **state) -> Trainer:
-        return trainer_with(dataset, *(part() for part in parts), loss=loss, **state)
+    def begun(parts=(), loss=None, left="", **state) -> Trainer:
+        usual = [part for part in parts_of(CONFIG) if part.name != left]
+        parts = [*usual, *(part() for part in parts)]
+        return Trainer(dataset, CONFIG, parts=parts, loss=loss, **state)
 
     state = begun(**saved).state_tensors()
     with pytest.raises(UserError, match=message) as error:

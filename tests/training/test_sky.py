@@ -226,7 +226,8 @@ def test_the_default_recipe_starts_with_the_sky(outdoors):
     assert len(trainer.gaussians) <= initial_count(outdoors, config) == 2000
     trainer.run()
     resumed = Trainer(outdoors, config, state=trainer.state_tensors())
-    assert resumed.part(SkyPart).sky is not None
+    resumed.part(SkyPart).between(resumed)
+    assert resumed.part(SkyPart).sky.share == trainer.part(SkyPart).sky.share
     refined = Trainer(outdoors, config, initial=trainer.gaussians)
     assert refined.part(SkyPart).sky is None  # other programs may have placed their sky nearer
     without = Trainer(outdoors, changed(config, sky=False))

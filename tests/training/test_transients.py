@@ -18,6 +18,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
+from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts.densification import delayed
 from snowsplat.training.parts.transients import MOMENTS, Transients, cells_that_move
 from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
@@ -299,6 +300,18 @@ def test_a_resumed_run_has_the_same_masks(busy, trained, tmp_path, stop):
     second.run()
     assert second.part(Transients).shares() == trained.part(Transients).shares()
     assert_identical(second.gaussians, trained.gaussians)
+
+
+def test_masks_are_used_also_if_the_rest_of_the_training_is_shorter(busy, trained):
+    """With fewer steps from the beginning, the photos would not have been compared."""
+    shorter = Schedule(trained.step + 1, since=trained.step, passed=1.0)
+    few = replace(CONFIG, iterations=7 * COUNT)
+    resumed = Trainer(busy, few, shorter, state=trained.state_tensors())
+    part = resumed.part(Transients)
+    assert part.shares() == trained.part(Transients).shares()
+    view = SimpleNamespace(index=3)
+    photo = LoadedImage(torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8))
+    assert part.target(resumed, view, photo).mask is not None
 
 
 @pytest.mark.slow

@@ -170,8 +170,8 @@ class _ProjectActivated(torch.autograd.Function):
         if not harmonics:
             d_colors.index_copy_(0, rows, grad_packed[:, COLORS : COLORS + colors.shape[1]])
         d_scales = d_log_scales.div_(scales.clamp_min(torch.finfo(scales.dtype).tiny))
-        # The derivative of the logit is inaccurate for opacities near 1, and 0 at 1. The kernel adds
-        # only to the rows of the splats, which are all replaced.
+        # The derivative of the logit is inaccurate for opacities near 1, and 0 at 1. The kernel
+        # adds only to the rows of the splats, which are all replaced.
         d_opacities, d_rows = d_logits, grad_packed[:, OPACITIES]
         d_opacities.index_copy_(0, rows, d_rows if ctx.factors is None else d_rows * ctx.factors)
         return None, None, None, d_pose, d_means, d_scales, d_quats, d_opacities, d_colors

@@ -27,6 +27,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.history import History
 from snowsplat.training.core.progress import Progress
+from snowsplat.training.core.run import DatasetCameras
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.misalignment import misalignment
@@ -187,8 +188,9 @@ class TrainingRun:
 
     def _write_scene(self, gaussians: Gaussians) -> Path:
         self._restore_folder()
-        if self.poses is not None:
-            views = [*self.poses.views(), *self.poses.test_views()]
+        cameras = self.trainer.cameras
+        if not isinstance(cameras, DatasetCameras):  # a part has refined them
+            views = [*cameras.views(), *cameras.test_views()]
             self.out.write_cameras(views)
             write_refined(self.out.path, views, replace(self.settings, resolution=-1).load())
         return self.out.write_scene(self.trainer.step, gaussians)
@@ -282,6 +284,8 @@ class TrainingRun:
         """The line about the camera poses; see `TrainResult.poses`."""
         if self.poses is not None:
             return str(self.poses.drift())
+        if not isinstance(self.trainer.cameras, DatasetCameras):
+            return None
         views = self.trainer.dataset.train
         used = [view for i, view in enumerate(views) if i not in self.trainer.left_out]
         pixels = misalignment(gaussians, used, self.out.settings()[1])

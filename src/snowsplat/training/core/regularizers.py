@@ -24,7 +24,7 @@ def add_regularizers(run: Run) -> None:
     with torch.enable_grad():
         terms = [part.regularizer(run, leaves) for part in used]
         for term in terms:
-            if term is not None:
+            if term is not None and term.requires_grad:
                 term.backward()
     leaf_of = leaves.parameters()
     for name, parameter in run.gaussians.parameters().items():

@@ -18,7 +18,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.background import Background
 from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.run_state import load_state, state_tensors
+from snowsplat.training.core.run_state import RESERVED, load_state, state_tensors
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_queue import ViewQueue
@@ -179,6 +179,10 @@ class Run:
         names = [part.name for part in self.parts]
         if twice := {name for name in names if names.count(name) > 1}:
             raise UserError(f"two parts have the name {min(twice)!r}; set `name` of one of them")
+        if bad := [name for name in names if name in RESERVED or "." in name or not name]:
+            raise UserError(f"a part cannot have the name {bad[0]!r}; set another `name`")
+        # A regulariser acts on all Gaussians, not only on those that a view shows.
+        regularized = any(type(part).regularizer is not Part.regularizer for part in self.parts)
         for part in self.parts:
             part.prepare(self)
         self.gaussians = replace(shards.scattered(self._first()), antialiased=config.antialias)
@@ -187,7 +191,7 @@ class Run:
             config.learning_rates,
             schedule=self.schedule,
             extent=dataset.extent,
-            visible_only=config.visible_only,
+            visible_only=config.visible_only and not regularized,
             shards=shards,
         )
         self.runner = StepRunner(
@@ -198,6 +202,7 @@ class Run:
             shards,
             with_depth=any(part.with_depth for part in self.parts),
         )
+        self.count()
         for part in self.parts:
             part.begin(self)
         if state is not None:
@@ -218,7 +223,7 @@ class Run:
                 self.photos,
                 self.generators["start"],
                 self.device,
-                self._adapted,
+                self._adapted if not self.resumed else lambda points: points,
             )
 
     def _adapted(self, points: Points) -> Points:
@@ -233,14 +238,19 @@ class Run:
     @property
     def rows(self) -> dict[str, Tensor]:
         """Tensors with one row for each Gaussian of this process, by name. They follow all changes
-        of the rows (new Gaussians have zeros), and are part of checkpoints.
+        of the rows (new Gaussians have zeros), and are part of checkpoints. A part adds them in
+        `Part.begin`.
         """
         return self.optimizer.rows
 
     @property
     def total(self) -> int:
         """The number of Gaussians of all processes."""
-        return self.shards.total(len(self.gaussians))
+        return len(self.gaussians) if self.shards.size == 1 else self._total
+
+    def count(self) -> None:
+        """Count the Gaussians of all processes, after their number may have changed."""
+        self._total = self.shards.total(len(self.gaussians))
 
     @property
     def sh_degree(self) -> int:
@@ -272,3 +282,4 @@ class Run:
                 is not finite.
         """
         load_state(self, tensors)
+        self.count()

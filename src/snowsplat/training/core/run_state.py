@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 _FORMER_NAMES = {"checked": "unexplained.checked", "left_out": "unexplained.left_out"}
 #: Before the names of the user's own parts and loss. The tensors have no elements: they only tell
 #: that a run without them would continue differently.
-_PART, _LOSS = "part.", "loss."
+_PART, _LOSS, _WITHOUT = "part.", "loss.", "without."
+#: Names that a part cannot have, because other tensors of a state begin with them.
+RESERVED = ("gaussians", "optimizer", "rows", "random", "step", "order", "part", "loss", "without")
 
 
 def state_tensors(run: Run) -> dict[str, Tensor]:
@@ -53,9 +55,12 @@ def _common_tensors(run: Run) -> dict[str, Tensor]:
 
 
 def _own(run: Run) -> list[str]:
-    """The names of what the configuration does not tell: the user's own parts and loss."""
-    usual = {part.name for part in parts_of(run.config)}
-    own = [_PART + part.name for part in run.parts if part.name not in usual]
+    """The names of what the configuration does not tell: the user's own parts and loss, and the
+    parts of the configuration that the user left out.
+    """
+    usual = {part.name: type(part) for part in parts_of(run.config)}
+    own = [_PART + part.name for part in run.parts if usual.get(part.name) is not type(part)]
+    own += [_WITHOUT + name for name in usual.keys() - {part.name for part in run.parts}]
     if run.has_own_loss:
         own.append(_LOSS + getattr(run.loss, "__name__", type(run.loss).__name__))
     return own
@@ -65,14 +70,16 @@ def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
     """See `Run.load_state`."""
     tensors = {_FORMER_NAMES.get(name, name): tensor for name, tensor in tensors.items()}
     own = set(_own(run))
-    _check_own(own, {name for name in tensors if name.startswith((_PART, _LOSS))})
-    rows, unchecked = row_tensors(run), tuple(name.removeprefix(_PART) + "." for name in own)
-    common, given = (
+    _check_own(own, {name for name in tensors if name.startswith((_PART, _LOSS, _WITHOUT))})
+    # What the user's own parts have saved is checked by themselves.
+    unchecked = tuple(name.removeprefix(_PART) + "." for name in own)
+    rows, common, given = (
         {name: tensor for name, tensor in state.items() if not name.startswith(unchecked)}
-        for state in (_common_tensors(run), tensors)
+        for state in (row_tensors(run), _common_tensors(run), tensors)
     )
     check_state(rows, common, given, len(run.dataset.train))
-    tensors = tensors | {name: run.shards.own_rows(tensors[name]) for name in rows}
+    saved = row_tensors(run).keys() & tensors.keys()
+    tensors = tensors | {name: run.shards.own_rows(tensors[name]) for name in sorted(saved)}
 
     def of(prefix: str) -> dict[str, Tensor]:
         return {n[len(prefix) :]: t for n, t in tensors.items() if n.startswith(prefix)}
@@ -92,7 +99,13 @@ def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
     run.step = int(tensors["step"])
     run.within_step = False
     for part in run.parts:
-        part.load(of(f"{part.name}."))
+        try:
+            part.load(of(f"{part.name}."))
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise UserError(
+                f"the checkpoint: the state of the part {part.name!r} cannot be loaded "
+                f"({type(error).__name__}: {error}); use the part that wrote it"
+            ) from error
     run.queue.continue_with(tensors["order"].tolist(), run.step)
 
 
@@ -100,6 +113,10 @@ def _check_own(present: set[str], saved: set[str]) -> None:
     """Raises UserError unless a state was saved with the same parts and loss of the user."""
     for name in sorted(saved - present):
         what, _, key = name.partition(".")
+        if what == "without":
+            raise UserError(
+                f"the checkpoint: was made without the part {key!r}; leave it out again: parts=[…]"
+            )
         how = "parts=[…]" if what == "part" else "loss=…"
         raise UserError(
             f"the checkpoint: was made with the {what} {key!r}, which is not part of the package; "
@@ -107,6 +124,11 @@ def _check_own(present: set[str], saved: set[str]) -> None:
         )
     for name in sorted(present - saved):
         what, _, key = name.partition(".")
+        if what == "without":
+            raise UserError(
+                f"the checkpoint: was made with the part {key!r} of the package; use it again: "
+                "parts_of(config)"
+            )
         raise UserError(
             f"the checkpoint: was made without the {what} {key!r}; resume without it, or start anew"
         )

@@ -67,6 +67,7 @@ class Trainer(Run):
             if self.step > 0:
                 for part in self.parts:
                     part.between(self)
+                self.count()
             step = min(self.step + self.config.batch, self.schedule.iterations)
             batch = self.queue.take(self.step, step)
             losses = self.runner.run(

@@ -72,8 +72,12 @@ class McmcDensityControl:
         opacities, scales = gaussians.opacities, gaussians.scales
         count = self.shards.total(len(gaussians))
         opacity_weight = self.settings.opacity_regularizer / count
-        gaussians.opacity_logits.grad = opacity_weight * opacities * (1.0 - opacities)
-        gaussians.log_scales.grad = self.settings.scale_regularizer / (3 * count) * scales
+        scale_weight = self.settings.scale_regularizer / (3 * count)
+        for parameter, term in (
+            (gaussians.opacity_logits, opacity_weight * opacities * (1.0 - opacities)),
+            (gaussians.log_scales, scale_weight * scales),
+        ):
+            parameter.grad = term if parameter.grad is None else parameter.grad + term
 
     def after_step(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         """Add noise; relocate and add Gaussians if the settings require it."""

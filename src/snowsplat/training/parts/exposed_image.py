@@ -27,25 +27,28 @@ class ExposedImages:
     def __init__(self) -> None:
         self._kept: dict[tuple[int, int], Tensor] = {}
 
-    def exposed(self, image: Tensor, log_gains: Tensor, photo: LoadedImage, index: int) -> Tensor:
+    def exposed(
+        self, image: Tensor, log_gains: Tensor, photo: LoadedImage, index: int | None
+    ) -> Tensor:
         """exp(log_gains) · image, at most 1 where the photo is overexposed; differentiable.
 
         Args:
             image: (H, W, 3), planar in memory.
             log_gains: (3,) on the device of the image.
-            photo: has the same colours at each call with the same ``index`` and size.
+            photo: has the same colours at each call with the same ``index`` and size; None: it may
+                have others.
         """
-        at = self._positions(photo, (index, image.shape[0]))
+        at = self._positions(photo, None if index is None else (index, image.shape[0]))
         result: Tensor = _Exposed.apply(image, log_gains, at)
         return result
 
-    def _positions(self, photo: LoadedImage, key: tuple[int, int]) -> Tensor:
+    def _positions(self, photo: LoadedImage, key: tuple[int, int] | None) -> Tensor:
         """(K,) int64: where the planes of the colours are overexposed."""
-        at = self._kept.get(key)
+        at = None if key is None else self._kept.get(key)
         if at is None:
             colors = photo.planes[:3].reshape(-1)
             at = (colors >= _OVEREXPOSED).nonzero()[:, 0]
-            if at.nbytes <= _KEPT * colors.nbytes:
+            if key is not None and at.nbytes <= _KEPT * colors.nbytes:
                 self._kept[key] = at
         return at
 

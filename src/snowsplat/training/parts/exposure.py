@@ -107,7 +107,9 @@ class Exposure(Part):
         """The image (H, W, 3) as the camera of the view exposes it."""
         if not self.active:
             return image
-        return self._images.exposed(image, self._present[view], photo, view.index)
+        # Another part may have changed the colours: then the positions are not remembered.
+        same = view.photo is not None and photo.planes is view.photo.planes
+        return self._images.exposed(image, self._present[view], photo, view.index if same else None)
 
     def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
         """Update the gains of the photos of the batch."""

@@ -43,13 +43,16 @@ class Part:
 
     A part belongs to one training run. Methods that return something return their argument, or
     nothing, if they are not overridden. Autograd is off, except in `background`, `target`, `image`,
-    `loss` and `regularizer`. With several processes, each of them calls the same methods in the
-    same order.
+    `loss` and `regularizer`. With several processes, all of them call the same methods in the same
+    order, but `background`, `target`, `image` and `loss` only in the process that blends the view:
+    these must not call `Run.render` or methods of ``run.shards``. On a GPU, these four may be
+    called twice for a view, if the memory of the rasterizer was too small.
 
     Attributes:
         name: of the part in checkpoints and messages; default: the name of the class.
         with_depth: whether the part uses ``rendered.depth``. Rendering it takes time.
-        abs_grad: whether the part uses ``gradient.splats.abs_grad``.
+        abs_grad: whether the part uses ``gradient.splats.abs_grad``. Both are set at the latest in
+            `prepare`.
     """
 
     name: ClassVar[str]
@@ -122,7 +125,8 @@ class Part:
     def regularizer(self, run: Run, gaussians: Gaussians) -> Tensor | None:
         """A term () that is added to the loss of the batch. It can be differentiated with respect
         to the parameters of the Gaussians. With several processes, each has some of the Gaussians,
-        and the terms are added.
+        and the terms are added. If a part has a regulariser, ``TrainConfig.visible_only`` has no
+        effect: all Gaussians are updated in each step.
         """
         return None
 
@@ -133,7 +137,7 @@ class Part:
 
     def state(self) -> dict[str, Tensor]:
         """The state on which the next steps depend, by name. The tensors are not copied. They are
-        the same in all processes.
+        finite, and the same in all processes.
         """
         return {}
 

@@ -40,15 +40,19 @@ class SkyPart(Part):
         """
         self.distance = distance
         self.sky: Sky | None = None
+        self._decided = False
 
     def prepare(self, run: Run) -> None:
-        """Find the sky in the photos.
+        """Find the sky in the photos, unless a state follows, which may correct the photos.
 
         Raises:
             UserError: a photo is missing or damaged.
         """
-        if run.initial is not None:
-            return
+        self._decided = not run.resumed
+        if not run.resumed and run.initial is None:
+            self._find(run)
+
+    def _find(self, run: Run) -> None:
         with single_threaded():
             found = find_sky(run.dataset, run.photos, self.distance)
         if found is not None:
@@ -69,6 +73,9 @@ class SkyPart(Part):
 
     def between(self, run: Run) -> None:
         """Make Gaussians before the sky transparent, in place, in every `INTERVAL`-th step."""
+        if not self._decided:
+            self._decided = True
+            self._find(run)
         if self.sky is not None and run.schedule.multiples(run.step, INTERVAL):
             before = [self.sky.is_before(means) for means in run.gaussians.means.split(_ROWS)]
             run.gaussians.opacity_logits.masked_fill_(torch.cat(before), REMOVED)

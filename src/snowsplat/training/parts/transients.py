@@ -96,7 +96,7 @@ class Transients(Part):
         Args:
             mode: "auto": only if something moves in several photos; see ``TrainConfig.transients``.
         """
-        self._mode = mode
+        self.mode = self._mode = mode
         self._run: Run
         self.masks: list[Tensor] = []
 
@@ -104,7 +104,9 @@ class Transients(Part):
         """Begin with empty masks, and decide whether there are enough photos and steps."""
         self._run, views = run, run.dataset.train
         self.masks = [torch.ones(cell_size(view.camera), dtype=torch.bool) for view in views]
-        few_steps = run.schedule.iterations < _STEPS_PER_VIEW * len(views)
+        # The schedule of a resumed training run may be shorter than at its beginning.
+        few_steps = run.config.iterations < _STEPS_PER_VIEW * len(views)
+        self._mode = self.mode
         if (self._mode == "auto" and few_steps) or len(views) < _FEWEST_VIEWS[self._mode]:
             self._mode = "off"
 
@@ -158,7 +160,7 @@ class Transients(Part):
             return photo
         size = photo.planes.shape[1:]
         mask = interpolate(cells[None, None].to(torch.uint8), size)[0, 0].to(torch.bool)
-        mask = mask.to(photo.planes.device)
+        mask = mask.to(photo.planes.device, non_blocking=True)
         return replace(photo, mask=mask if photo.mask is None else mask & photo.mask)
 
     def shares(self) -> dict[str, float]:
@@ -197,6 +199,8 @@ class Transients(Part):
         self.masks = [
             part.clone().reshape(mask.shape) for part, mask in zip(parts, self.masks, strict=True)
         ]
+        if self.shares():
+            self._mode = self.mode
         if self._run.step > self._run.schedule.step_of(MOMENTS[-1]):
             self._tell()
 
