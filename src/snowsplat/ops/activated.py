@@ -166,14 +166,13 @@ class _ProjectActivated(torch.autograd.Function):
             ),
             with_pose=ctx.needs_input_grad[3],
         )
-        rows = ids.long()
         if not harmonics:
-            d_colors.index_copy_(0, rows, grad_packed[:, COLORS : COLORS + colors.shape[1]])
+            found = grad_packed[:, COLORS : COLORS + colors.shape[1]]
+            d_colors.index_copy_(0, ids.long(), found)
         d_scales = d_log_scales.div_(scales.clamp_min(torch.finfo(scales.dtype).tiny))
-        # The derivative of the logit is inaccurate for opacities near 1, and 0 at 1. The kernel
-        # adds only to the rows of the splats, which are all replaced.
-        d_opacities, d_rows = d_logits, grad_packed[:, OPACITIES]
-        d_opacities.index_copy_(0, rows, d_rows if ctx.factors is None else d_rows * ctx.factors)
+        # The derivative of the logit is inaccurate for opacities near 1, and 0 at 1.
+        d_opacities, d_rows = d_logits.zero_(), grad_packed[:, OPACITIES]
+        d_opacities.index_add_(0, ids, d_rows if ctx.factors is None else d_rows * ctx.factors)
         return None, None, None, d_pose, d_means, d_scales, d_quats, d_opacities, d_colors
 
 
