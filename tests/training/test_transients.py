@@ -302,6 +302,7 @@ def test_a_resumed_run_has_the_same_masks(busy, trained, tmp_path, stop):
     assert_identical(second.gaussians, trained.gaussians)
 
 
+@pytest.mark.slow
 def test_masks_are_used_also_if_the_rest_of_the_training_is_shorter(busy, trained):
     """With fewer steps from the beginning, the photos would not have been compared."""
     shorter = Schedule(trained.step + 1, since=trained.step, passed=1.0)
@@ -338,6 +339,7 @@ def test_a_checkpoint_without_the_setting_is_as_before(busy):
     assert not [name for name in state if name.startswith("transients.")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "views", "steps"), [("auto", 29, 250), ("auto", 31, 247), ("on", 7, 250)]
 )
