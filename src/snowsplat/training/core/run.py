@@ -152,11 +152,11 @@ class Run:
             for i, name in enumerate(GENERATORS)
         }
         self.background = Background(config.background, self.generators["background"], self.device)
+        memory = config.image_memory or available_memory(self.device) // (2 * shards.in_memory)
         self.images = ImageLoader(
             dataset.train,
             background=self.background.fixed,
-            budget_bytes=config.image_memory
-            or available_memory(self.device) // (2 * shards.in_memory),
+            budget_bytes=memory,
             device=self.device,
         )
         self.photos: Photos = self.images
@@ -175,38 +175,39 @@ class Run:
         )
         self.loss = loss or partial(view_loss, ssim_weight=config.ssim_weight)
         self.has_own_loss = loss is not None
-        self.parts = list(parts_of(config) if parts is None else parts)
-        names = [part.name for part in self.parts]
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise UserError(f"two parts have the name {min(twice)!r}; set `name` of one of them")
-        if bad := [name for name in names if name in RESERVED or "." in name or not name]:
-            raise UserError(f"a part cannot have the name {bad[0]!r}; set another `name`")
-        # A regulariser acts on all Gaussians, not only on those that a view shows.
-        regularized = any(type(part).regularizer is not Part.regularizer for part in self.parts)
-        for part in self.parts:
+        self.parts = _with_valid_names(parts_of(config) if parts is None else parts)
+        self._begin()
+        if state is not None:
+            self.load_state(state)
+
+    def _begin(self) -> None:
+        """Prepare the parts, and create the first Gaussians and what belongs to them."""
+        config, parts = self.config, self.parts
+        for part in parts:
             part.prepare(self)
-        self.gaussians = replace(shards.scattered(self._first()), antialiased=config.antialias)
+        first = self.shards.scattered(self._first())
+        self.gaussians = replace(first, antialiased=config.antialias)
+        # A regulariser acts on all Gaussians, not only on those that a view shows.
+        regularized = any(type(part).regularizer is not Part.regularizer for part in parts)
         self.optimizer = Adam(
             self.gaussians,
             config.learning_rates,
             schedule=self.schedule,
-            extent=dataset.extent,
+            extent=self.dataset.extent,
             visible_only=config.visible_only and not regularized,
-            shards=shards,
+            shards=self.shards,
         )
         self.runner = StepRunner(
             len(self.gaussians),
             self.device,
-            any(part.abs_grad for part in self.parts),
+            any(part.abs_grad for part in parts),
             config.batch,
-            shards,
-            with_depth=any(part.with_depth for part in self.parts),
+            self.shards,
+            with_depth=any(part.with_depth for part in parts),
         )
         self.count()
-        for part in self.parts:
+        for part in parts:
             part.begin(self)
-        if state is not None:
-            self.load_state(state)
 
     def _first(self) -> Gaussians | None:
         """The first Gaussians, in process 0."""
@@ -283,3 +284,13 @@ class Run:
         """
         load_state(self, tensors)
         self.count()
+
+
+def _with_valid_names(parts: Sequence[Part]) -> list[Part]:
+    """The parts. Raises UserError: the names of two parts are the same, or a name is reserved."""
+    names = [part.name for part in parts]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise UserError(f"two parts have the name {min(twice)!r}; set `name` of one of them")
+    if bad := [name for name in names if name in RESERVED or "." in name or not name]:
+        raise UserError(f"a part cannot have the name {bad[0]!r}; set another `name`")
+    return list(parts)
