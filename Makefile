@@ -1,5 +1,6 @@
 # make demo     renders photos of a small synthetic scene and reconstructs it: `snowsplat demo`
 # make quick    checks of format, lint, types and layers, and the fast tests: under a minute once built
+# make nightly  long tests, which `make test` leaves out
 # make test     the same checks and all tests: on every instruction set, with the GPU kernels on the CPU
 # make dev      creates the development environment for the other targets
 # make docs     builds the documentation site in build/docs; warnings are errors
@@ -33,7 +34,7 @@ BUILD := build/native
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo quick test dev docs format native wheel compiler lint types layers clean
+.PHONY: demo quick test nightly dev docs format native wheel compiler lint types layers clean
 .PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
 
 demo: native
@@ -103,8 +104,8 @@ PYTEST = $(PROCESS) $(PYTHON) -m pytest $(PROCESSES)
 PROCESS = $(if $(filter 1,$(JOBS)),OMP_NUM_THREADS=1)
 PROCESSES = $(if $(filter 1,$(JOBS)),,-n $(JOBS) --dist worksteal)
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
-QUICK := not (sfm or browser or build or emulated or gpu or kill or slow)
-ISA := isa and not (emulated or gpu)
+QUICK := not (sfm or browser or build or emulated or gpu or kill or slow or nightly)
+ISA := isa and not (emulated or gpu or nightly)
 # Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
 SANITIZED := emulated-float32 or sanitizers_find
 REPEATED := build/pytest-repeated.log
@@ -120,7 +121,10 @@ pytest: native
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
 pytest-best:
-	$(PYTEST) $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
+	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
+
+nightly: native
+	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
 # used for them. The two longest tests of threads take minutes there, and threads do not depend on the

@@ -119,6 +119,7 @@ def test_a_wrong_dataset_is_a_one_line_error(tmp_path):
     assert len(run.stderr.splitlines()) == 1
 
 
+@pytest.mark.nightly
 def test_a_street_in_blocks(tmp_path):
     arguments = ["blocks.py", "--out", tmp_path, "--photos", 16, "--size", 48, 32, "--blocks", 2]
     arguments += ["--gaussians", 500, "--iterations", 20, "--block-iterations", 20, "--frames", 4]

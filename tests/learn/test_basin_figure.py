@@ -120,6 +120,7 @@ def test_a_handle_can_be_dragged(page):
     assert after - before == pytest.approx(60 * 20 / (width - 16), abs=0.3)
 
 
+@pytest.mark.nightly
 def test_the_animation_reaches_the_same_result(page):
     page.call("Emulation.setEmulatedMedia", features=[])
     choose(page, "count", "2")

@@ -128,7 +128,7 @@ def psnr_of(page: Page, scene: ReadyScene, kept: torch.Tensor) -> float:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("webgpu", [False, True])
+@pytest.mark.parametrize("webgpu", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_the_sliders(trained, tmp_path, webgpu):
     scene = ready(trained.gaussians, trained.cameras)
     file = tmp_path / "balls.html"
