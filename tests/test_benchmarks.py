@@ -61,6 +61,7 @@ def test_the_script_starts(script):
     assert "usage: " in benchmark(script, "--help")
 
 
+@pytest.mark.nightly
 def test_stages_of_an_iteration(tmp_path):
     isa = native.available_isas()[-1]
     flags = ("--size", "tiny", "--isa", isa, "--threads", 1, "--repeats", 2)

@@ -252,6 +252,7 @@ def found_in(text):
 
 
 @pytest.mark.emulated
+@pytest.mark.nightly
 def test_the_sanitizer_program_runs_every_kernel(fake_gpu, monkeypatch):
     import gpu_ops
 

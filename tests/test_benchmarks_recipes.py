@@ -36,6 +36,7 @@ def compare(tmp_path: Path, *arms: str) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_comparison_resumes_and_shows_the_worst_views(tmp_path):
     write_toy_dataset(tmp_path / "toy", n_views=9, width=32, height=24)
     arms = ("default:iterations=20", "classic:iterations=20,sh_degree=1")

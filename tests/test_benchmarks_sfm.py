@@ -128,6 +128,7 @@ def test_the_two_rooms_are_identical(sfm_modules):
             np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.nightly
 def test_stages_and_places(tmp_path):
     file = tmp_path / "sfm.json"
     text = benchmark(
