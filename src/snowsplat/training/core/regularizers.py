@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,12 +13,17 @@ if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
 
 
+def regularizing(parts: Sequence[Part]) -> list[Part]:
+    """The parts that override `Part.regularizer`."""
+    return [part for part in parts if type(part).regularizer is not Part.regularizer]
+
+
 def add_regularizers(run: Run) -> None:
     """Add the gradients of `Part.regularizer` of all parts to ``.grad`` of the parameters.
 
     The optimiser adds ``.grad`` to the gradient of the photos, and clears it.
     """
-    used = [part for part in run.parts if type(part).regularizer is not Part.regularizer]
+    used = regularizing(run.parts)
     if not used:
         return
     leaves = run.gaussians.map(lambda tensor: tensor.detach().requires_grad_())

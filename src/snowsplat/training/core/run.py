@@ -18,6 +18,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.background import Background
 from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.optim import Adam
+from snowsplat.training.core.regularizers import regularizing
 from snowsplat.training.core.run_state import RESERVED, load_state, state_tensors
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.step_schedule import Schedule
@@ -188,13 +189,12 @@ class Run:
         first = self.shards.scattered(self._first())
         self.gaussians = replace(first, antialiased=config.antialias)
         # A regulariser acts on all Gaussians, not only on those that a view shows.
-        regularized = any(type(part).regularizer is not Part.regularizer for part in parts)
         self.optimizer = Adam(
             self.gaussians,
             config.learning_rates,
             schedule=self.schedule,
             extent=self.dataset.extent,
-            visible_only=config.visible_only and not regularized,
+            visible_only=config.visible_only and not regularizing(parts),
             shards=self.shards,
         )
         self.runner = StepRunner(

@@ -73,12 +73,13 @@ def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
     _check_own(own, {name for name in tensors if name.startswith((_PART, _LOSS, _WITHOUT))})
     # What the user's own parts have saved is checked by themselves.
     unchecked = tuple(name.removeprefix(_PART) + "." for name in own)
+    present = row_tensors(run)
     rows, common, given = (
         {name: tensor for name, tensor in state.items() if not name.startswith(unchecked)}
-        for state in (row_tensors(run), _common_tensors(run), tensors)
+        for state in (present, _common_tensors(run), tensors)
     )
     check_state(rows, common, given, len(run.dataset.train))
-    saved = row_tensors(run).keys() & tensors.keys()
+    saved = present.keys() & tensors.keys()
     tensors = tensors | {name: run.shards.own_rows(tensors[name]) for name in sorted(saved)}
 
     def of(prefix: str) -> dict[str, Tensor]:
