@@ -147,10 +147,10 @@ class _ProjectActivated(torch.autograd.Function):
             grad_packed[:, MEANS2D] = grad_means2d
         harmonics = colors.dim() == 3
         d_means, d_log_scales, d_quats, d_logits, d_colors = (
-            _empty(t).zero_() for t in (means, scales, quats, opacities, colors)
+            scratch.empty_like(t).zero_() for t in (means, scales, quats, opacities, colors)
         )
         # Without harmonics, the kernel's gradients of the colours are not used.
-        d_dc, d_rest = _harmonics(d_colors) if harmonics else (_empty(means), d_colors)
+        d_dc, d_rest = _harmonics(d_colors) if harmonics else (scratch.empty_like(means), d_colors)
         d_pose = project_vjp(
             ctx.gaussians,
             replace(ctx.camera, cam_from_world=cam_from_world),
@@ -194,9 +194,9 @@ def _tensors(
     rows = colors.shape[1] if harmonics else 1
     return GaussianTensors(
         means=means,
-        log_scales=torch.log(scales, out=_empty(scales)),
+        log_scales=torch.log(scales, out=scratch.empty_like(scales)),
         quats=quats,
-        opacity_logits=torch.logit(opacities, out=_empty(opacities)),
+        opacity_logits=torch.logit(opacities, out=scratch.empty_like(opacities)),
         sh_dc=sh_dc,
         sh_rest=sh_rest,
         sh_rest_rows=rows,
@@ -208,10 +208,6 @@ def _tensors(
 def _harmonics(colors: Tensor) -> tuple[Tensor, Tensor]:
     """The arguments sh_dc and sh_rest of native functions, in the storage of `colors` (N, K, 3)."""
     return colors, colors.view(-1)[3:]
-
-
-def _empty(like: Tensor) -> Tensor:
-    return scratch.empty(tuple(like.shape), like.dtype, like.device)
 
 
 def _with_colors(packed: Tensor, colors: Tensor, ids: Tensor) -> Tensor:

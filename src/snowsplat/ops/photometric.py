@@ -67,7 +67,7 @@ class _Photometric(torch.autograd.Function):
         planes, target_planes = _planar(op, image.detach(), target)
         grad = None
         if ctx.needs_input_grad[0]:
-            grad = scratch.empty(tuple(planes.shape), planes.dtype, planes.device)
+            grad = scratch.empty_like(planes)
         means = torch.empty(2, dtype=torch.float64, device=planes.device)
         name = "photometric_u8" if target_planes.dtype == torch.uint8 else "photometric"
         channels, height, width = planes.shape

@@ -333,7 +333,7 @@ def _grad_packed(
     atomically. If their order must be fixed, it needs memory for all instances: the slots.
     """
     packed, stride = frame.params.packed, frame.params.stride
-    grad_packed = scratch.empty(tuple(packed.shape), packed.dtype, packed.device)
+    grad_packed = scratch.empty_like(packed)
     slots = None
     if frame.slot_range is not None:
         slots = scratch.empty((frame.instances, SLOT_WIDTH), packed.dtype, packed.device)

@@ -94,6 +94,11 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | Non
     return torch.from_numpy(array).view(dtype).view(shape)
 
 
+def empty_like(tensor: Tensor) -> Tensor:
+    """`empty` with the shape, dtype and device of a tensor, which need not be contiguous."""
+    return empty(tuple(tensor.shape), tensor.dtype, tensor.device)
+
+
 def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
     return math.prod(shape) * dtype.itemsize
 

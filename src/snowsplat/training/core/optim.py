@@ -140,8 +140,7 @@ def _add_up(gaussians: Gaussians, gradients: Sequence[ViewGradient]) -> Tensor:
     sums = {}
     for name, parameter in gaussians.parameters().items():
         if parameter.grad is None:
-            shape = tuple(parameter.shape)
-            parameter.grad = scratch.empty(shape, parameter.dtype, parameter.device).zero_()
+            parameter.grad = scratch.empty_like(parameter).zero_()
         sums[name] = parameter.grad
     means = gaussians.means
     # The index -1, an empty row, is the last element: it is no Gaussian.

@@ -82,5 +82,4 @@ class _Exposed(torch.autograd.Function):
 def _product(image: Tensor, gains: Tensor) -> Tensor:
     """(3, H, W): an image (H, W, 3) times (3,), in memory that the next step uses again."""
     planes = image.permute(2, 0, 1)
-    result = scratch.empty(tuple(planes.shape), planes.dtype, planes.device)
-    return torch.mul(planes, gains[:, None, None], out=result)
+    return torch.mul(planes, gains[:, None, None], out=scratch.empty_like(planes))
