@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import pycolmap
 
@@ -68,13 +69,18 @@ class Mapping:
     # and few of them are in several photos.
     forward: bool = False
 
-    def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
+    def run(
+        self, mapper: Mapper | Literal["plain"], relaxed: bool = False
+    ) -> list[pycolmap.Reconstruction]:
         """Estimate poses and points; returns the models, the one with the most photos first.
 
+        ``mapper``: "plain" is the incremental mapper with COLMAP's own order of registration.
         ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
         if mapper == "global":
             models = self._map_globally()
+        elif mapper == "plain":
+            models = self._map_in_plain_order(relaxed)
         else:
             models = self._map_incrementally(relaxed)
         return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
@@ -216,6 +222,14 @@ class Mapping:
         mapper.grow(model, first, adjust=True)
         if len(first) < len(graph.names):
             mapper.grow(model, graph.names, adjust=False)
+
+    def _map_in_plain_order(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
+        options = self._options(relaxed)
+        options.min_model_size = MIN_PHOTOS
+        self.report(0, 0, "registered photos")
+        with self._output() as output:
+            models = pycolmap.incremental_mapping(self.database, self.images, output, options)
+        return list(models.values())
 
     def _map_globally(self) -> list[pycolmap.Reconstruction]:
         options = pycolmap.GlobalPipelineOptions()

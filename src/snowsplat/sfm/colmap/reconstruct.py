@@ -1,11 +1,12 @@
-"""Estimates camera poses from photos, in up to six attempts with increasing effort.
+"""Estimates camera poses from photos, in up to seven attempts with increasing effort.
 
     1  features, pairs and mapper as configured
     2  the same matches; the focal length is held, and the camera may move forward (`Lens.simple`)
-    3  the same features, more pairs; weaker matches are accepted
-    4  twice as many features, from larger photos; about 4 times the work of the first attempt
-    5  these, with a held focal length
-    6  the other mapper, with the existing matches
+    3  the same matches, registered in COLMAP's own order
+    4  the same features, more pairs; weaker matches are accepted
+    5  twice as many features, from larger photos; about 4 times the work of the first attempt
+    6  these, with a held focal length
+    7  the other mapper, with the existing matches
 
 The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
 are verified again without it.
@@ -23,6 +24,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -57,6 +59,13 @@ _NEXT_ATTEMPT = 3.0
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
 _MAX_ERROR = 4.0
+
+
+_MAPPING = {
+    "incremental": "incremental mapping",
+    "plain": "incremental mapping in COLMAP's order",
+    "global": "global mapping",
+}
 
 
 @dataclass(frozen=True)
@@ -157,6 +166,8 @@ class PoseEstimation:
         if self._enough(evidence) or (not self._found and evidence.more_effort_is_useless):
             return evidence
         self._try("as configured", matched, "incremental", lens.simple)
+        if not self._enough(evidence):
+            self._try("as configured", matched, "plain", lens)
         if self._enough(evidence):
             return evidence
         if not (self._found and evidence.matched_all):
@@ -214,7 +225,12 @@ class PoseEstimation:
         return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
 
     def _try(
-        self, how: str, matched: Matched, mapper: Mapper, lens: Lens, relaxed: bool = False
+        self,
+        how: str,
+        matched: Matched,
+        mapper: Mapper | Literal["plain"],
+        lens: Lens,
+        relaxed: bool = False,
     ) -> None:
         """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
         set_cameras(matched.database, self.photos, lens)
@@ -241,7 +257,7 @@ class PoseEstimation:
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
         self.log.append(
             f"{how}{lens_text}: {effort.features} features per photo at {effort.image_size} "
-            f"pixels, {matched.choice.description}, {mapper} mapping: "
+            f"pixels, {matched.choice.description}, {_MAPPING[mapper]}: "
             f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
         )
 
