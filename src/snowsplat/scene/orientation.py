@@ -35,6 +35,14 @@ _NO_DIRECTION = 0.3
 def up_direction(rotations: np.ndarray) -> np.ndarray:
     """The up direction of the world: the one most perpendicular to the x axes of the cameras.
 
+    (3,) unit vector in the world frame; see `level_of_cameras`.
+    """
+    return level_of_cameras(rotations)[0]
+
+
+def level_of_cameras(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The up direction of the world, and how certain the cameras are about it.
+
     It is the most likely direction if the roll of each photo has the standard deviation `_ROLL` and
     the mean pitch of all photos has `_COMMON_PITCH`. If all x axes are parallel, for example in
     front of a wall, the mean pitch decides. Photos whose roll is much larger than `_ROLL` have a
@@ -44,7 +52,8 @@ def up_direction(rotations: np.ndarray) -> np.ndarray:
         rotations: (N, 3, 3) rotations of cam_from_world.
 
     Returns:
-        (3,) unit vector in the world frame.
+        (3,) unit vector in the world frame, and the inverse (3, 3) of its covariance, in 1/rad²,
+        perpendicular to it.
     """
     x, upper, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
     # If the upper edges of the photos point in all directions, the photos look straight down (not
@@ -66,7 +75,8 @@ def up_direction(rotations: np.ndarray) -> np.ndarray:
     # If there are few photos that look down, their upper edges may have a common direction by
     # chance. Then the sign of `up` comes from the viewing directions.
     looks_down = abs(upper @ up) < _NO_DIRECTION
-    return -up if looks_down and forward @ up > 0 else up
+    precision = across.T @ matrix @ across
+    return (-up if looks_down and forward @ up > 0 else up), precision
 
 
 def up_of_surfaces(

@@ -32,7 +32,7 @@ from snowsplat.sfm.dataset_report import REPORT, write_report
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sources import RECORDS, Sources, find_sources
-from snowsplat.sfm.orient import orientation
+from snowsplat.sfm.orient import PLACEMENT, orientation
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
@@ -243,11 +243,14 @@ def _undistort(
 
     for name in _IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
-    scene_from_sfm = orientation(pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0"))
-    made = undistort(
-        folder, photos, scene_from_sfm, options.resize, report, threads=options.sfm.threads
-    )
-    return asdict(made) | {"scene_from_sfm": scene_from_sfm.to_json()}
+    model = pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0")
+    oriented = orientation(model, photos)
+    scene_from_sfm, threads = oriented.scene_from_sfm, options.sfm.threads
+    made = undistort(folder, photos, scene_from_sfm, options.resize, report, threads=threads)
+    return asdict(made) | {
+        "scene_from_sfm": scene_from_sfm.to_json(),
+        PLACEMENT: asdict(oriented.placement),
+    }
 
 
 # Checks of the folder

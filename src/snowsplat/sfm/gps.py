@@ -1,0 +1,56 @@
+"""GPS positions in metres, and how far they can be trusted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from snowsplat.sfm.ingest.photo import Photo
+
+#: Standard deviation of a horizontal position in metres, if the receiver states none.
+USUAL_ERROR = 5.0
+
+# The ellipsoid of WGS 84.
+_RADIUS = 6_378_137.0  # m, at the equator
+_ECCENTRICITY2 = 6.694379990141e-3
+
+
+def east_north_up(
+    locations: np.ndarray, origin: Sequence[float] | np.ndarray | None = None
+) -> np.ndarray:
+    """(N, 3) metres east, north and up of ``origin``, from latitudes, longitudes (°) and altitudes.
+
+    The plane is tangent to the ellipsoid: exact to a thousandth within 10 km.
+
+    Args:
+        locations: (N, 3).
+        origin: (3,); None: the first location.
+    """
+    start = locations[0] if origin is None else np.asarray(origin)
+    differences = locations - start
+    longitudes = (differences[:, 1] + 180) % 360 - 180  # also across the date line
+    east, north = _metres_per_degree(float(start[0]))
+    return np.stack([longitudes * east, differences[:, 0] * north, differences[:, 2]], axis=1)
+
+
+def location_of(place: np.ndarray, origin: np.ndarray) -> tuple[float, float, float]:
+    """Latitude, longitude (°) and altitude of ``place`` (3,), the inverse of `east_north_up`."""
+    east, north = _metres_per_degree(float(origin[0]))
+    longitude = (origin[1] + place[0] / east + 180) % 360 - 180
+    return float(origin[0] + place[1] / north), float(longitude), float(origin[2] + place[2])
+
+
+def _metres_per_degree(latitude: float) -> tuple[float, float]:
+    sine = math.sin(math.radians(latitude))
+    flattened = 1 - _ECCENTRICITY2 * sine * sine
+    across = _RADIUS / math.sqrt(flattened)  # radius of curvature from west to east
+    along = across * (1 - _ECCENTRICITY2) / flattened
+    east = math.radians(across * math.cos(math.radians(latitude)))
+    return max(east, 1e-9), math.radians(along)
+
+
+def position_errors(photos: Sequence[Photo]) -> np.ndarray:
+    """(N,) standard deviations of the horizontal positions in metres, as the receivers state."""
+    return np.array([photo.location_error or USUAL_ERROR for photo in photos])
