@@ -17,22 +17,25 @@ _RADIUS = 6_378_137.0  # m, at the equator
 _ECCENTRICITY2 = 6.694379990141e-3
 
 
-def east_north_up(
-    locations: np.ndarray, origin: Sequence[float] | np.ndarray | None = None
-) -> np.ndarray:
-    """(N, 3) metres east, north and up of ``origin``, from latitudes, longitudes (°) and altitudes.
+def middle_of(locations: np.ndarray) -> np.ndarray:
+    """(3,) the median latitude, longitude and altitude of locations (N, 3)."""
+    return locations[0] + np.median(_differences(locations, locations[0]), axis=0)
 
-    The plane is tangent to the ellipsoid: exact to a thousandth within 10 km.
 
-    Args:
-        locations: (N, 3).
-        origin: (3,); None: the first location.
+def east_north_up(locations: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(N, 3) metres east, north and up of ``origin`` (3,).
+
+    Locations (N, 3) are latitudes, longitudes (°) and altitudes (m). The plane is tangent to the
+    ellipsoid: exact to a thousandth within 10 km.
     """
-    start = locations[0] if origin is None else np.asarray(origin)
-    differences = locations - start
-    longitudes = (differences[:, 1] + 180) % 360 - 180  # also across the date line
-    east, north = _metres_per_degree(float(start[0]))
-    return np.stack([longitudes * east, differences[:, 0] * north, differences[:, 2]], axis=1)
+    east, north = _metres_per_degree(float(origin[0]))
+    return _differences(locations, origin)[:, [1, 0, 2]] * (east, north, 1.0)
+
+
+def _differences(locations: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    differences = locations - origin
+    differences[:, 1] = (differences[:, 1] + 180) % 360 - 180  # also across the date line
+    return differences
 
 
 def location_of(place: np.ndarray, origin: np.ndarray) -> tuple[float, float, float]:

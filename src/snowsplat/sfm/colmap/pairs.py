@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.colmap.retrieval import nearest
-from snowsplat.sfm.gps import east_north_up, position_errors
+from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
 
 # Share of `Effort.neighbours` that is used for similar photos if all photos already have pairs from
@@ -148,7 +148,8 @@ def _near_pairs(photos: Sequence[Photo], neighbours: int) -> tuple[Pairs, int]:
     located = [i for i, photo in enumerate(photos) if photo.location is not None]
     if len(located) <= neighbours:
         return set(), 0
-    places = east_north_up(np.array([photos[i].location for i in located]))[:, :2]
+    locations = np.array([photos[i].location for i in located])
+    places = east_north_up(locations, middle_of(locations))[:, :2]
     distances = np.linalg.norm(places[:, None] - places[None], axis=2)
     errors = position_errors([photos[i] for i in located])
     within = (distances <= errors[:, None]).sum(axis=1) - 1  # the photo itself is not counted

@@ -33,6 +33,8 @@ _ANGLE = rb'%s:(?:Gimbal|Camera)%sDegree(?:\s*=\s*["\']|>)\s*([-+]?[0-9.]+)'
 _GIMBALS = (b"drone-dji", b"drone-parrot")
 # The accelerometer also measures the movement of the hand. Then its length is not that of gravity.
 _GRAVITY = (0.85, 1.15)  # in units of the acceleration of gravity
+# A photo is level if this part of the unit vector is in the plane of the photo.
+_STANDING = 0.7
 _APPLE_NOTE, _APPLE_ACCELERATION = b"Apple iOS\0", 8
 _SIGNED_RATIONAL = 10  # a type of TIFF: two integers of 32 bits
 
@@ -58,7 +60,7 @@ def read_attitude(
     Args:
         exif, details, gps: the main tags, those of the exposure, and those of the position.
         xmp: the XMP packet; empty if there is none.
-        orientation: EXIF value, 1 to 8.
+        orientation: EXIF value, 1 to 8, with which the photo was taken.
     """
     if orientation not in _UPRIGHT:
         return None
@@ -67,10 +69,8 @@ def read_attitude(
         up, north = (_upright(direction, orientation) for direction in gimbal)
         return Attitude(_rounded(up), _rounded(north), gimbal=True)
     gravity = _apple_up(details)
-    if gravity is not None:
-        gravity = _upright(gravity, orientation)
-    else:
-        gravity = _mapillary_up(exif)
+    gravity = _mapillary_up(exif) if gravity is None else _upright(gravity, orientation)
+    gravity = None if gravity is None else _standing(gravity)
     heading = _compass(gps)
     if gravity is None and heading is None:
         return None
@@ -132,10 +132,9 @@ def _apple_up(details: Mapping[int, Any]) -> np.ndarray | None:
 
 
 def _mapillary_up(exif: Image.Exif) -> np.ndarray | None:
-    """Up in the frame of the upright photo, from the description.
+    """Up in the frame of the photo, apart from a quarter turn, from the description.
 
-    The axes are those of the phone, which the app has rotated by quarters of a turn until the photo
-    was upright. So the quarter is the one that makes up most upward.
+    The axes are those of the phone; the app has turned the photo, but not the vector.
     """
     description = exif.get(_DESCRIPTION)
     if not isinstance(description, str) or "MAPAccelerometerVector" not in description:
@@ -145,9 +144,8 @@ def _mapillary_up(exif: Image.Exif) -> np.ndarray | None:
         x, y, z = (float(vector[axis]) for axis in "xyz")
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    quarters = ((x, y), (-y, x), (-x, -y), (y, -x))
-    x, y = min(quarters, key=lambda quarter: quarter[1])
-    return _of_gravity((x, y, z)) if -y > 2 * abs(x) else None
+    # A photo that looks up or down does not tell the quarter turn.
+    return _of_gravity((x, y, z)) if math.hypot(x, y) > _STANDING else None
 
 
 def _compass(gps: Mapping[int, Any]) -> float | None:
@@ -170,6 +168,19 @@ def _of_gravity(vector: Sequence[float]) -> np.ndarray | None:
     """The unit vector, if the length is that of gravity."""
     length = math.hypot(*vector)
     return np.array(vector) / length if _GRAVITY[0] < length < _GRAVITY[1] else None
+
+
+def _standing(up: np.ndarray) -> np.ndarray:
+    """``up`` turned by the quarters that make it point to the upper edge, if the photo is level.
+
+    A phone stores which edge is the upper one. Where a level photo does not stand, another program
+    has turned the pixels later, without the vector.
+    """
+    x, y, z = up
+    if math.hypot(x, y) < _STANDING:
+        return up
+    x, y = min(((x, y), (-y, x), (-x, -y), (y, -x)), key=lambda quarter: quarter[1])
+    return np.array([x, y, z])
 
 
 def _upright(direction: np.ndarray, orientation: int) -> np.ndarray:

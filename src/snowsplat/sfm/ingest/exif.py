@@ -46,10 +46,15 @@ class ExifInfo:
     attitude: Attitude | None = None  # in the frame of the upright photo
 
 
-def read_exif(exif: Image.Exif, width: int, height: int, xmp: bytes = b"") -> ExifInfo:
+def read_exif(
+    exif: Image.Exif, width: int, height: int, xmp: bytes = b"", taken: int | None = None
+) -> ExifInfo:
     """Read the metadata of a photo with ``width`` × ``height`` stored pixels.
 
     ``xmp`` is the XMP packet of the file, in which drones store the angles of their gimbal.
+    ``taken`` is the orientation with which the photo was taken, if the pixels have been turned
+    since, as in a HEIC file that is open.
+
     Missing and implausible values have the default of `ExifInfo`.
     """
     details, gps = _ifd(exif, _EXIF_IFD), _ifd(exif, _GPS_IFD)
@@ -63,7 +68,7 @@ def read_exif(exif: Image.Exif, width: int, height: int, xmp: bytes = b"") -> Ex
         focal=_focal(details, width, height),
         location=_location(gps),
         location_error=_number(gps.get(_GPS_ERROR)),
-        attitude=read_attitude(exif, details, gps, xmp, orientation),
+        attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
     )
 
 

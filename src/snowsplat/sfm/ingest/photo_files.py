@@ -105,7 +105,9 @@ def read_header(path: Path) -> Header:
                 and "transparency" not in image.info
                 and _bits(path, image) == 8,
                 transparent=transparent,
-                exif=read_exif(exif, width, height, _xmp(image)),
+                exif=read_exif(
+                    exif, width, height, _xmp(image), image.info.get("original_orientation")
+                ),
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None

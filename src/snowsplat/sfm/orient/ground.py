@@ -68,5 +68,7 @@ def of_ground(cameras: Cameras, known: Evidence) -> Evidence | None:
 
 def _near(cameras: Cameras, reach: float) -> np.ndarray:
     """The points that are nearer than ``reach`` to a camera."""
-    away = np.linalg.norm(cameras.points[:, None] - cameras.centres[None], axis=2)
-    return cameras.points[away.min(axis=1) < reach]
+    nearest = np.full(len(cameras.points), np.inf)
+    for centre in cameras.centres:
+        nearest = np.minimum(nearest, np.linalg.norm(cameras.points - centre, axis=1))
+    return cameras.points[nearest < reach]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -41,9 +42,13 @@ class Placement:
         """Lines of text for users, without a full stop."""
         found = [f"level: from {' and '.join(self.up_from)}, to about {_short(self.level_error)}°"]
         if self.north is not None and self.north_from and self.north_error is not None:
-            axis = "+z is north and +x is east, " if self.north[2] > 1 - 1e-9 else ""
+            x, _, z = self.north
+            turn = math.degrees(math.atan2(x, z)) % 360
+            aligned = "+z is north, +x is east"
+            other = f"{turn:.0f}° clockwise from +z, seen from above"
             found.append(
-                f"north: {axis}from {self.north_from}, to about {_short(self.north_error)}°"
+                f"north: {aligned if z > 1 - 1e-9 else other}; from {self.north_from}, to about "
+                f"{_short(self.north_error)}°"
             )
         if self.metres_per_unit and self.scale_from and self.scale_error and self.position_error:
             unit = "1 unit is 1 m" if self.is_metric else f"1 unit is {self.metres_per_unit:.4g} m"

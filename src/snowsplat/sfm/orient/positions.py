@@ -21,11 +21,12 @@ _INDEPENDENT = 0.25
 # The expected error counts as much as this number of measured errors. With few positions, the
 # measured ones are small by chance.
 _EXPECTED = 2.0
-# Positions that are farther away than this many times the error are outliers (Huber weights), and
-# more than this share of outliers is a contradiction.
+# Positions that are farther away than this many times the error are outliers, with a small weight.
+# More than this share of outliers is a contradiction.
 _OUTLIER, _MOST_OUTLIERS = 3.0, 0.4
-# The start of the least squares is the best of this number of fits to two positions each.
-_TRIALS = 1000
+# The start of the least squares is the best of this number of fits to two positions each, measured
+# at this number of positions.
+_TRIALS, _POSITIONS = 1000, 1000
 _FEWEST = 3
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -105,7 +106,7 @@ def align(
         sizes = np.stack([np.linalg.norm(away[:, :2], axis=1), np.abs(away[:, 2])], axis=1)
         sizes /= relative[:, None]
         error = _error(sizes, error, expected)
-        weights = np.minimum(1, _OUTLIER * error / np.maximum(sizes, 1e-9))
+        weights = np.minimum(1, _OUTLIER * error / np.maximum(sizes, 1e-9)) ** 2
         if not has_altitudes:
             weights[:, 1] = 1e-9
         precision = _INDEPENDENT * weights / (relative[:, None] * error) ** 2
@@ -163,7 +164,9 @@ def _start(
     if not len(factors):
         return None
     shifts = target[one] - factors * flat[one]
-    medians = np.median(np.abs(factors[:, None] * flat + shifts[:, None] - target), axis=1)
+    some = slice(None, None, -(-len(flat) // _POSITIONS))
+    away = np.abs(factors[:, None] * flat[some] + shifts[:, None] - target[some])
+    medians = np.median(away, axis=1)
     best = int(medians.argmin())
     scale, turn = float(abs(factors[best])), factors[best] / abs(factors[best])
     rotation = np.stack(
@@ -178,13 +181,16 @@ def _error(sizes: np.ndarray, before: np.ndarray, expected: float) -> np.ndarray
 
     ``before``: an earlier estimate, which tells the outliers.
     """
-    inside = np.minimum(sizes, _OUTLIER * np.maximum(before, np.median(sizes, axis=0)))
-    count = len(sizes)
+    limits = _OUTLIER * np.maximum(before, np.median(sizes, axis=0))
+    across, above = (size[size <= limit] for size, limit in zip(sizes.T, limits, strict=True))
     # Four unknowns are fitted to the horizontal positions, three to the altitudes.
-    across = (inside[:, 0] ** 2).sum() + 2 * _EXPECTED * expected**2
-    horizontal = across / (max(0, 2 * count - 4) + 2 * _EXPECTED)
-    above = (inside[:, 1] ** 2).sum() + _EXPECTED * _ALTITUDE**2 * horizontal
-    return np.sqrt(np.array([horizontal, above / (max(0, count - 3) + _EXPECTED)]))
+    horizontal = (np.square(across).sum() + 2 * _EXPECTED * expected**2) / (
+        max(0, 2 * len(across) - 4) + 2 * _EXPECTED
+    )
+    vertical = (np.square(above).sum() + _EXPECTED * _ALTITUDE**2 * horizontal) / (
+        max(0, len(above) - 3) + _EXPECTED
+    )
+    return np.sqrt(np.array([horizontal, vertical]))
 
 
 def _cross(vectors: np.ndarray) -> np.ndarray:

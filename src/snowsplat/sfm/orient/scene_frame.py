@@ -12,7 +12,7 @@ import torch
 
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.orientation import VIEWING_DISTANCE
-from snowsplat.sfm.gps import east_north_up, location_of, position_errors
+from snowsplat.sfm.gps import east_north_up, location_of, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.ground import of_ground
@@ -154,7 +154,8 @@ def _gps(
     if len(located) < _FEWEST:
         return None, []
     locations = np.array([photo.location for photo in located])
-    places, errors = east_north_up(locations), position_errors(located)
+    origin = middle_of(locations)
+    places, errors = east_north_up(locations, origin), position_errors(located)
     alignment = align(cameras.centres[rows], places, errors, up)
     if alignment is None:
         return None, ["GPS gives no scale: the photos have fewer than three different positions"]
@@ -169,7 +170,7 @@ def _gps(
     if alignment.up_away > _CONTRADICTION:
         doubts.append(f"GPS positions and {' and '.join(up.names)} disagree about the level")
     name = f"GPS positions of {len(located)} photos"
-    return _Gps(alignment, name, locations[0]), doubts
+    return _Gps(alignment, name, origin), doubts
 
 
 def _north_of_gps(gps: _Gps | None) -> _North | None:

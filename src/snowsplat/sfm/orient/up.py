@@ -132,8 +132,12 @@ def combined(evidence: Sequence[Evidence]) -> tuple[Evidence, list[str]]:
 
 
 def _apart(one: Evidence, two: Evidence) -> float:
-    """The difference in standard deviations."""
-    plane = tangent(one.up)
+    """The difference in standard deviations, measured half-way."""
+    middle = one.up + two.up
+    length = float(np.linalg.norm(middle))
+    if length < 1e-6:
+        return math.inf
+    plane = tangent(middle / length)
     away = plane @ (two.up - one.up)
     covariance = sum(np.linalg.inv(plane @ part.precision @ plane.T) for part in (one, two))
     return math.sqrt(away @ np.linalg.solve(covariance, away))
