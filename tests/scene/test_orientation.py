@@ -1,4 +1,4 @@
-"""The up direction from synthetic cameras. For complete models see tests/sfm/test_orient.py."""
+"""The up direction from synthetic cameras. For complete models see tests/sfm/orient."""
 
 import math
 

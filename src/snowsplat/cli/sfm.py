@@ -79,8 +79,8 @@ class Sfm:
     def run(self) -> int:
         """Returns the exit code, 0."""
         inputs, folder = self._inputs_and_folder()
+        from snowsplat.data.placement import placement_of
         from snowsplat.sfm.dataset_folder import make_dataset
-        from snowsplat.sfm.orient import placement_of
 
         options = self._options()
         with TerminalObserver(self.quiet) as observer:

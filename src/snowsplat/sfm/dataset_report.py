@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
+from snowsplat.data.placement import Placement, placement_of
 from snowsplat.sfm.more_photos import Advice, advice
-from snowsplat.sfm.orient import Placement, placement_of
 from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration

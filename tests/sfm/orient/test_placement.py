@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from snowsplat.data.placement import PLACEMENT, Placement, placement_of, read_placement
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.orientation import VIEWING_DISTANCE
 from snowsplat.sfm.gps import east_north_up, location_of
 from snowsplat.sfm.ingest.photo import Attitude, Photo
-from snowsplat.sfm.orient import PLACEMENT, Placement, orientation, placement_of
+from snowsplat.sfm.orient import orientation
 
 F64 = torch.float64
 HOME = np.array([52.5, 13.4, 40.0])
@@ -283,11 +284,17 @@ def test_the_ground_levels_photos_that_look_ahead_and_down(model_of):
     assert "the ground" not in placed(model_of, poses, [], ceiling)[1].up_from
 
 
-def test_the_record_is_restored(model_of):
+def test_the_record_is_restored(model_of, tmp_path):
     poses = walk()
     _, placement = placed(model_of, poses, photos_of(poses, gps=3.0))
     record = json.loads(json.dumps({PLACEMENT: asdict(placement)}))
     assert placement_of(record) == placement
+    assert read_placement(tmp_path) is None
+    for text in ("[]", '{"stages": []}', "{"):
+        (tmp_path / "sfm.json").write_text(text)
+        assert read_placement(tmp_path) is None
+    (tmp_path / "sfm.json").write_text(json.dumps({"stages": {"images": {"result": record}}}))
+    assert read_placement(tmp_path) == placement
     assert placement_of({}) is None
     assert placement_of({PLACEMENT: {"up_from": 3}}) is None
     assert Placement(["the ground"], 12.3).lines() == ["level: from the ground, to about 12°"]

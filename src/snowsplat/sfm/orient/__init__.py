@@ -3,12 +3,15 @@
 SfM determines the scene only up to a similarity transform. A viewer also needs the up direction, a
 known scale, and the photographed object at the origin.
 
-    scene_frame    the frame of the scene                          placement   its record, its words
-    up             up: sensors, the way cameras are held, ground   ground      the largest plane
-    positions      scale, north and level from GPS positions       cameras     data of the model
+    scene_frame    the frame of the scene, from the parts below
+    up             the up direction, from sensors and from the way people hold cameras
+    ground         the up direction from the largest plane below the cameras
+    positions      scale, north and level from GPS positions
+    cameras        the data of the model
+
+What was found is recorded in sfm.json; see `snowsplat.data.placement`.
 """
 
-from snowsplat.sfm.orient.placement import PLACEMENT, Placement, placement_of
 from snowsplat.sfm.orient.scene_frame import Oriented, orientation
 
-__all__ = ["PLACEMENT", "Oriented", "Placement", "orientation", "placement_of"]
+__all__ = ["Oriented", "orientation"]

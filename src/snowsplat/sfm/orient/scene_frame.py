@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from snowsplat.data.placement import Placement
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.orientation import VIEWING_DISTANCE
 from snowsplat.sfm.gps import east_north_up, location_of, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.ground import of_ground
-from snowsplat.sfm.orient.placement import Placement
 from snowsplat.sfm.orient.positions import Alignment, align
 from snowsplat.sfm.orient.up import Evidence, combined, of_cameras, of_sensors, robust_mean
 

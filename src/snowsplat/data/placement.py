@@ -1,13 +1,14 @@
-"""What is known about level, north and scale of a dataset: a record for sfm.json, and its words."""
+"""What is known about level, north and scale of a dataset: an entry of sfm.json, and its words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from snowsplat.util.safe_json import from_json
+from snowsplat.util.safe_json import from_json, read_json
 
 #: The entry of the result of the stage "images" in sfm.json.
 PLACEMENT = "placement"
@@ -64,7 +65,15 @@ def placement_of(images: Mapping[str, Any]) -> Placement | None:
     earlier versions, or if it is damaged."""
     try:
         return from_json(Placement, images.get(PLACEMENT))
-    except ValueError:
+    except (ValueError, AttributeError):
+        return None
+
+
+def read_placement(dataset: Path) -> Placement | None:
+    """The placement of the dataset in a folder; None if `sfm` did not make it, or see above."""
+    try:
+        return placement_of(read_json(dataset / "sfm.json")["stages"]["images"]["result"])
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
