@@ -24,10 +24,9 @@ from snowsplat.sfm.ingest.photo import Attitude
 from snowsplat.sfm.orient.cameras import Cameras
 
 # Standard deviations of a single photo, and of the mean of many: sensors are not aligned with the
-# lens exactly, and a photographer has a habit.
+# lens exactly.
 _GIMBAL = (math.radians(2.0), math.radians(0.5))
 _ACCELEROMETER = (math.radians(3.0), math.radians(1.0))
-_HABIT = math.radians(1.5)
 # Fewer photos with a sensor may all be wrong: the accelerometer also measures the hand.
 _FEWEST = 3
 # Sensors whose directions differ by more than this from their median are in contradiction.
@@ -63,10 +62,7 @@ class Evidence:
 
 def of_cameras(cameras: Cameras) -> Evidence:
     """The direction in which the photos are level; see `level_of_cameras`."""
-    up, precision = level_of_cameras(cameras.rotations)
-    return Evidence(
-        ("the way the photos were held",), up, _with_error_of_mean(up, precision, _HABIT)
-    )
+    return Evidence(("the way the photos were held",), *level_of_cameras(cameras.rotations))
 
 
 def of_sensors(
@@ -160,13 +156,6 @@ def _mean(one: Evidence, two: Evidence) -> Evidence:
     plane = tangent(up)
     total = plane @ (one.precision + two.precision) @ plane.T
     return Evidence(names, up, plane.T @ total @ plane)
-
-
-def _with_error_of_mean(up: np.ndarray, precision: np.ndarray, error: float) -> np.ndarray:
-    """``precision`` after an independent error of this standard deviation is added."""
-    plane = tangent(up)
-    covariance = np.linalg.inv(plane @ precision @ plane.T) + error**2 * np.eye(2)
-    return plane.T @ np.linalg.inv(covariance) @ plane
 
 
 def tangent(unit: np.ndarray) -> np.ndarray:
