@@ -5,6 +5,7 @@
     python benchmarks/sfm.py fern rooms-300 --json sfm.json
     python benchmarks/sfm.py room-120s                        a video of two minutes
     python benchmarks/sfm.py room --versus ../before/src      compare another build with this one
+    python benchmarks/sfm.py ahead-30 --plain                 beside COLMAP at its defaults
 
 A workload is a real dataset (a folder of photos or a video; skipped if absent), or a procedural
 scene of `sfm_scenes.py`: a number of photos, or a video. The photos of a scene and the frames of a
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import signal
 import subprocess
@@ -35,11 +37,13 @@ import numpy as np
 import torch
 from PIL import Image
 from sfm_placed import placed
+from sfm_plain import MODES
 from sfm_scenes import CACHE_VARIABLE, KINDS, SIZE, cache_folder, photos_of, video_of
 from torch import Tensor
 
 from snowsplat.data.colmap import read_model
 from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.sfm.ingest.exif import read_exif
 from snowsplat.util.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,6 +55,8 @@ DATASETS: dict[str, tuple[str, str | None]] = {
     "fox_photos": ("fox_photos", "fox/sparse/0"),
     "walkaround.mp4": ("walkaround.mp4", None),
     "bonsai_photos": ("bonsai_photos", None),
+    "street_photos": ("street_photos", None),
+    "drone_photos": ("drone_photos", None),
 }
 _SHARE = 0.95  # of the correct photos: the errors of the poses are those of this share
 _LONG = ("bonsai_photos",)  # not measured by default
@@ -148,22 +154,52 @@ def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Pa
         "peak_mb": answer["peak_mb"],
         "own_peak_mb": answer["own_peak_mb"],
     }
-    found: dict[str, Tensor] = {}
     if result is not None:
-        found = poses_in(folder / "distorted" / "sparse" / "0")
         row |= {
             "photos": len(result["registered"]) + len(result["unregistered"]),
-            "placed": len(found),
             "models": result["sub_models"],
             "points": result["points"],
             "reprojection_error": result["reprojection_error"],
             "attempts": result["attempts"],
         }
+    return row | judged(work, folder / "input", folder / "distorted" / "sparse" / "0")
+
+
+def measure_plain(work: Workload, photos: Path, folder: Path, mode: str) -> dict[str, Any]:
+    """As `measure`, with COLMAP at its defaults; ``mode`` as in `sfm_plain.py`."""
+    program = str(Path(__file__).with_name("sfm_plain.py"))
+    run = subprocess.run(
+        [sys.executable, program, str(photos), str(folder), mode],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    row: dict[str, Any] = {"workload": work.name, "source": f"plain {mode}", "error": None}
+    row |= {"stages": {}, "wall": 0.0, "cpu": 0.0, "peak_mb": None}
+    if run.returncode:
+        return row | {"error": f"COLMAP ended with status {run.returncode}"}
+    row |= json.loads(run.stdout.splitlines()[-1])
+    row["photos"] = sum(path.is_file() for path in photos.rglob("*"))
+    return row | judged(work, photos, folder / "sparse")
+
+
+def judged(work: Workload, photos: Path, model: Path) -> dict[str, Any]:
+    """The poses and the lens of the COLMAP model in a folder, compared with the truth if known.
+
+    ``photos``: the folder of the photos or frames of which the model was made.
+    """
+    row: dict[str, Any] = {}
+    found: dict[str, Tensor] = {}
+    if (model / "cameras.bin").is_file():
+        found = poses_in(model)
+        row["lens"] = lens_in(model)
+        row |= compared_with_gps(found, photos)
+    row["placed"] = len(found)
     if work.true is not None:
         true = work.true
         frames = work.source.with_name("frames")
         if work.source.is_file() and frames.is_dir():  # a video of a scene
-            shown = frames_shown(folder / "input", frames)
+            shown = frames_shown(photos, frames)
             true = {name: true[frame] for name, frame in shown.items()}
         compared = placed(found, true)
         row |= {"photos": len(true), "placed": len(found)}
@@ -179,11 +215,57 @@ def measure(work: Workload, folder: Path, options: Mapping[str, Any], source: Pa
     return row
 
 
+def lens_in(model: Path) -> str:
+    """The camera model, and the smallest and the largest focal length in pixels."""
+    used = read_model(model)
+    ids = {image.camera_id for image in used.images}
+    cameras = [camera for number, camera in used.cameras.items() if number in ids]
+    focals = sorted(camera.params[0] for camera in cameras)
+    span = f"{focals[0]:.0f}" + (f" to {focals[-1]:.0f}" if len(focals) > 1 else "")
+    return f"{cameras[0].model} {span}"
+
+
+def compared_with_gps(found: Mapping[str, Tensor], photos: Path) -> dict[str, Any]:
+    """The distance between the camera centres and the positions by GPS, in metres; empty without.
+
+    The centres are mapped to the plane of the earth by the affine map with the least sum of
+    distances: SfM knows neither the scale nor the vertical direction.
+    """
+    places = {}
+    for name in found:
+        with Image.open(photos / name) as image:
+            location = read_exif(image.getexif(), *image.size).location
+        if location is not None:
+            places[name] = location
+    if len({place[:2] for place in places.values()}) < 3:
+        return {}
+    table = np.array(list(places.values()))
+    middle = table.mean(0)
+    east = (table[:, 1] - middle[1]) * math.cos(math.radians(middle[0]))
+    gps = np.stack([east, table[:, 0] - middle[0]], 1) * 111_320.0
+    poses = torch.stack([found[name] for name in places])
+    centres = -(poses[:, :, :3].transpose(1, 2) @ poses[:, :, 3:])[..., 0].numpy()
+    weights = np.ones(len(gps))
+    for _ in range(30):  # iteratively reweighted least squares, over affine maps 3D -> 2D
+        system = np.concatenate([centres, np.ones((len(gps), 1))], 1)
+        root = np.sqrt(weights)[:, None]
+        solution = np.linalg.lstsq(system * root, gps * root, rcond=1e-3)[0]
+        away = np.linalg.norm(system @ solution - gps, axis=1)
+        weights = 1 / np.maximum(away, 0.3)
+    return {"gps_error": float(np.median(away)), "gps_length": float(np.ptp(gps, 0).max())}
+
+
 # Tables
 
 
 def _cell(value: float | int | None, digits: int = 0) -> str:
     return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def _gps(row: Mapping[str, Any]) -> str:
+    if "gps_error" not in row:
+        return ""
+    return f"; median distance from GPS {row['gps_error']:.1f} m of {row['gps_length']:.0f} m"
 
 
 def print_quality(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
@@ -198,6 +280,8 @@ def print_quality(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> No
         cells += [_cell(row.get("rotation_error"), 3), _cell(row.get("centre_error"), 3)]
         cells.append(_cell(row["peak_mb"] or None))
         print(f"{name:22}" + "".join(f"{cell:>10}" for cell in cells))
+        if "lens" in row:
+            print(f"  {row['lens']}" + _gps(row))
         if row["error"]:
             print(f"  {row['error']}")
 
@@ -290,6 +374,11 @@ def main() -> None:
     parser.add_argument(
         "--versus", type=Path, metavar="SRC", help="compare with the package in another src folder"
     )
+    parser.add_argument(
+        "--plain",
+        action="store_true",
+        help="also run COLMAP at its defaults, with one camera and with one per photo",
+    )
     parser.add_argument("--repeats", type=int, default=1, help="measurements of each workload")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the datasets in DIR")
     parser.add_argument("--json", type=Path, help="also write all values to this file")
@@ -315,8 +404,12 @@ def main() -> None:
                     other = arguments.versus is not None and i == 0
                     labels.append(f"{name} other" if other else name)
                     print(f"{labels[-1]}: {rows[-1]['wall']:.0f} s", file=sys.stderr, flush=True)
-                    if arguments.json:
-                        arguments.json.write_text(json.dumps(rows, indent=1))
+                for mode in MODES if arguments.plain else ():
+                    photos = folder / "input"
+                    rows.append(measure_plain(work, photos, out / f"{name}-plain-{mode}", mode))
+                    labels.append(f"  plain, {mode}")
+                if arguments.json:
+                    arguments.json.write_text(json.dumps(rows, indent=1))
     if rows:
         print_quality(rows, labels)
         print_times(rows, labels)

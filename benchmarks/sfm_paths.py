@@ -7,6 +7,7 @@ the floor is at z = 0. Equal arguments return equal paths.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ _PHOTOS_OF_A_TURN = 6
 # The share of the way through the passage that the camera walks. It looks ahead by the rest, so at
 # a corner it turns over several photos.
 _WALKED = 0.8
+_STEP = 1.0  # metres between two photos of a walk along a street
 _HEIGHTS = (1.45, 1.75, 1.1)  # of the camera above the floor, in metres; one for each loop in turn
 
 
@@ -114,6 +116,41 @@ def around_two(count: int, seed: int, distance: float = 4.4, radius: float = 1.5
     looks = np.array([[-distance / 2, 0, 0.62], [distance / 2, 0, 0.62]])
     _turn(positions, targets, (ends[0], looks[0]), (ends[1], looks[1]), turning)
     circle(1, count - turning - first)
+    return _hand_held(positions, targets, random)
+
+
+def ahead(count: int, seed: int, start: float = 5.0) -> list[Tensor]:
+    """Along the middle of a street of `street_length`; the camera looks ahead."""
+    return _along_street(count, seed, start, lambda i: 0.0, side=0.0)
+
+
+def to_the_side(count: int, seed: int, start: float = 5.0) -> list[Tensor]:
+    """Along one pavement; the camera looks at the façades of the other side."""
+    return _along_street(count, seed, start, lambda i: math.pi / 2, side=-4.5)
+
+
+def around_corners(count: int, seed: int, start: float = 5.0) -> list[Tensor]:
+    """Along a street; the camera turns from side to side, once in about 15 photos."""
+    return _along_street(count, seed, start, lambda i: 1.1 * math.sin(0.42 * i), side=-1.0)
+
+
+def street_length(count: int) -> float:
+    """The length in metres of a street for a walk of ``count`` photos."""
+    return _STEP * count + 30.0
+
+
+def _along_street(
+    count: int, seed: int, start: float, heading: Callable[[int], float], side: float
+) -> list[Tensor]:
+    """A walk along +x with steps of `_STEP`. ``heading``: of the camera, in radians from +x."""
+    random = np.random.default_rng([seed, count])
+    positions, targets = [], []
+    for i in range(count):
+        at = np.array([start + _STEP * i, side + 0.4 * math.sin(0.3 * i), 1.6])
+        angle = heading(i) + random.normal(0, 0.03)
+        tilt = random.normal(0.03, 0.04)
+        positions.append(at)
+        targets.append(at + np.array([math.cos(angle), math.sin(angle), tilt]))
     return _hand_held(positions, targets, random)
 
 

@@ -6,6 +6,9 @@
     carpet   a room with a worn carpet that repeats; the camera looks down at it, across the room
     twins    two identical objects in a hall with pictures; a figure of eight around the objects
     rooms    two identical rooms, and the passage from one to the other
+    ahead    a street; the camera walks and looks ahead
+    side     a street; the camera looks at the façades of the other side
+    turns    a street; the camera walks ahead and turns from side to side
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
@@ -15,6 +18,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +26,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from sfm_paths import (
+    ahead,
+    around_corners,
     around_two,
     in_between,
     looking_across,
     looking_down,
     loops,
+    street_length,
     through_two_rooms,
+    to_the_side,
 )
 from torch import Tensor
 
@@ -40,6 +48,10 @@ from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.trajectory.video_file import video_writer
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.scenes.street import street
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
 VERSION = 5
@@ -63,7 +75,7 @@ _TWIN_DISTANCE = 4.4  # between the two identical objects
 class Kind:
     """The functions that make a scene and a camera path through it."""
 
-    build: Callable[[int], Scene]  # argument: the seed
+    build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
 
 
@@ -92,7 +104,7 @@ def photos_of(
     folder = cache / f"{kind}-{count}-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
     lens = phone_lens(*size)
     poses = chosen.path(count, seed)
-    return folder, take_photos(folder, lambda: chosen.build(seed), lens, poses, seed, report)
+    return folder, take_photos(folder, lambda: chosen.build(seed, count), lens, poses, seed, report)
 
 
 def video_of(
@@ -112,7 +124,9 @@ def video_of(
     folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
     poses = in_between(chosen.path(seconds, seed), seconds * FRAMES_PER_SECOND)
     lens = phone_lens(*size)
-    truth = take_photos(folder / "frames", lambda: chosen.build(seed), lens, poses, seed, report)
+    truth = take_photos(
+        folder / "frames", lambda: chosen.build(seed, seconds), lens, poses, seed, report
+    )
     video = folder / "video.mp4"
     if not video.exists():
         with video_writer(video, *size, FRAMES_PER_SECOND) as add:
@@ -377,11 +391,23 @@ def _through_two_rooms(count: int, seed: int) -> list[Tensor]:
     return through_two_rooms(count, seed, MIDDLES, _DOOR, corridor)
 
 
+def _street(seed: int, count: int) -> Scene:
+    return street(street_length(count), seed)
+
+
+def _indoors(build: Callable[[int], Scene]) -> Callable[[int, int], Scene]:
+    """A scene whose size does not depend on the number of photos."""
+    return lambda seed, _: build(seed)
+
+
 KINDS = {
-    "room": Kind(_room, loops),
-    "around": Kind(still_life, walk),
-    "plain": Kind(_plain_room, looking_across),
-    "carpet": Kind(_carpeted_room, looking_down),
-    "twins": Kind(_twins, around_two),
-    "rooms": Kind(_two_rooms, _through_two_rooms),
+    "room": Kind(_indoors(_room), loops),
+    "around": Kind(_indoors(still_life), walk),
+    "plain": Kind(_indoors(_plain_room), looking_across),
+    "carpet": Kind(_indoors(_carpeted_room), looking_down),
+    "twins": Kind(_indoors(_twins), around_two),
+    "rooms": Kind(_indoors(_two_rooms), _through_two_rooms),
+    "ahead": Kind(_street, ahead),
+    "side": Kind(_street, to_the_side),
+    "turns": Kind(_street, around_corners),
 }

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from snowsplat.sfm.colmap.database import closing_database, open_database
+from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
 
 COUNT, FAR = 16, range(9, 16)
@@ -79,7 +80,7 @@ def photos() -> list[Photo]:
 
 
 def write_database(path: Path, scene: Walk) -> Path:
-    open_database(path, photos(), "SIMPLE_PINHOLE", "none")
+    open_database(path, photos(), Lens("SIMPLE_PINHOLE"), "none")
     with closing_database(path) as database:
         for i, pixels in enumerate(scene.pixels):
             database.write_keypoints(i + 1, pixels.astype(np.float32))

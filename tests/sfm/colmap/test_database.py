@@ -16,6 +16,7 @@ from snowsplat.sfm.colmap.database import (
     set_names,
     verified_pairs,
 )
+from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
 
 
@@ -34,7 +35,7 @@ def path(tmp_path):
     folder = tmp_path / "mit Lücke"
     folder.mkdir()
     path = folder / "database.db"
-    open_database(path, PHOTOS, "auto", "one")
+    open_database(path, PHOTOS, Lens("auto"), "one")
     return path
 
 
@@ -70,15 +71,15 @@ def test_photos_of_a_group_share_a_camera(path):
 
 def test_features_are_reused_for_the_same_settings_only(path):
     add_features(path)
-    open_database(path, PHOTOS, "auto", "one")
+    open_database(path, PHOTOS, Lens("auto"), "one")
     assert feature_counts(path, len(PHOTOS))[0] == 5
-    open_database(path, PHOTOS, "auto", "another")
+    open_database(path, PHOTOS, Lens("auto"), "another")
     assert feature_counts(path, len(PHOTOS)) == [0] * len(PHOTOS)
 
 
 def test_another_camera_model_keeps_the_features(path):
     add_features(path)
-    open_database(path, PHOTOS, "RADIAL", "one")
+    open_database(path, PHOTOS, Lens("RADIAL"), "one")
     assert feature_counts(path, len(PHOTOS))[0] == 5
     with closing_database(path) as database:
         assert {c.model_name for c in database.read_all_cameras()} == {"RADIAL"}
@@ -86,7 +87,7 @@ def test_another_camera_model_keeps_the_features(path):
 
 def test_names_are_restored_after_a_kill_during_matching(path):
     set_names(path, [str(i) for i in range(len(PHOTOS))])
-    open_database(path, PHOTOS, "auto", "one")
+    open_database(path, PHOTOS, Lens("auto"), "one")
     assert names(path) == {i: p.name for i, p in enumerate(PHOTOS, start=1)}
 
 
@@ -101,14 +102,14 @@ def test_a_damaged_database_is_replaced(path, how):
             connection.execute("DROP TABLE snowsplat")
     else:
         path.write_bytes(b"" if how == "empty" else b"not a database" * 1000)
-    open_database(path, PHOTOS, "auto", "one")
+    open_database(path, PHOTOS, Lens("auto"), "one")
     assert len(names(path)) == len(PHOTOS)
     assert feature_counts(path, len(PHOTOS)) == [0] * len(PHOTOS)
 
 
 def test_one_database_replaces_another(path):
     strong = path.with_name("strong.db")
-    open_database(strong, PHOTOS, "auto", "strong")
+    open_database(strong, PHOTOS, Lens("auto"), "strong")
     add_features(strong)
     replace_database(path, by=strong)
     assert not strong.exists()

@@ -213,7 +213,7 @@ def test_two_scenes_yield_the_larger_one_after_a_second_attempt(tmp_path, pictur
     assert result.sub_models == [4, 3]
     assert "a separate group of 3 photos" in result.unregistered["000.png"]
     assert len(result.attempts) > 1
-    assert "4096 features" in result.attempts[1]
+    assert any("4096 features" in attempt for attempt in result.attempts[1:])
     sparse = tmp_path / "distorted" / "sparse"
     assert sorted(path.name for path in sparse.iterdir()) == ["0", "1"]
     left = {path.name for path in (tmp_path / "distorted").iterdir()}

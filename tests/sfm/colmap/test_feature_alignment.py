@@ -8,6 +8,7 @@ from tests.sfm.colmap.scenes import FOCAL, HEIGHT, WIDTH, arc, photograph, wall,
 from snowsplat.sfm.colmap import feature_alignment
 from snowsplat.sfm.colmap.database import closing_database, open_database
 from snowsplat.sfm.colmap.feature_alignment import align_features
+from snowsplat.sfm.colmap.lens import Lens
 
 CAMERAS = arc(6)
 DEPTH = 6.0  # of the wall
@@ -40,7 +41,7 @@ def scene(tmp_path_factory):
     observed += random.normal(0, NOISE, observed.shape)
     observed[-1, FALSE] = observed[-1, FALSE + 1] + [9, 9]
     database = folder / "database.db"
-    open_database(database, photos, "SIMPLE_PINHOLE", "")
+    open_database(database, photos, Lens("SIMPLE_PINHOLE"), "")
     angle = random.uniform(0, 6, len(points))  # the same in all photos, as the camera is upright
     scale = random.uniform(0.9, 4, len(points))
     frame = scale * np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)])

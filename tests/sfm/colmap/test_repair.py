@@ -12,6 +12,7 @@ from snowsplat.scene.geometry import similarity_from_points
 from snowsplat.sfm.colmap.consistency import CheckedPair, check_pairs
 from snowsplat.sfm.colmap.database import closing_database, copy_for_mapping, verified_pairs
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress
+from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs import PairChoice
@@ -234,7 +235,8 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     photos = look_alikes.photos()
     job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, progress)
     choice = PairChoice(sorted(scene.matches), "neighbours")
-    job._try("as configured", Matched(mapping.database, EFFORTS["draft"], choice, 1.0), "global")
+    matched = Matched(mapping.database, EFFORTS["draft"], choice, 1.0)
+    job._try("as configured", matched, "global", Lens("SIMPLE_PINHOLE"))
     assert job.attempts[0].registered == len(photos) - len(FAR)
     assert len(job.attempts[0].left_out) == len(FAR)
     assert job.log[0].endswith(

@@ -107,6 +107,12 @@ class CheckedPair(VerifiedPair):
         return self.counts and self.contradicted
 
 
+def share_agreeing(pairs: Sequence[CheckedPair]) -> float:
+    """The share of all verified matches of ``pairs`` that agree with the poses: 0 to 1."""
+    total = sum(pair.matches for pair in pairs)
+    return sum(pair.matches * pair.agreeing for pair in pairs) / total if total else 0.0
+
+
 def check_pairs(
     model: pycolmap.Reconstruction, database: Path, max_error: float
 ) -> list[CheckedPair]:

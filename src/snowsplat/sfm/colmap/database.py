@@ -21,14 +21,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.sfm.colmap.lens import Lens, camera_ids, cameras_of
 from snowsplat.sfm.ingest.photo import Photo
-
-# With fewer photos, the eight parameters of the camera model OPENCV are not well determined.
-MIN_PHOTOS_FOR_OPENCV = 8
-# Initial focal length of photos without EXIF, divided by the longest side: that of a 29 mm lens on
-# 35 mm film. It is between the values for the photos of a phone and for its videos, which are
-# cropped. The focal length is then refined together with the poses.
-GUESSED_FOCAL = 0.8
 
 _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
 
@@ -43,25 +37,36 @@ class Pair:
     flat: bool  # the matches are also consistent with a plane or with a pure rotation
 
 
-def open_database(path: Path, photos: list[Photo], camera_model: str, fingerprint: str) -> None:
+def open_database(path: Path, photos: list[Photo], lens: Lens, fingerprint: str) -> None:
     """Make the database ``path`` ready for ``photos``; keep its features and matches if valid.
 
     They are valid if the database is not damaged and has the same ``fingerprint``. Otherwise, a new
     database is created. Names and cameras are always rewritten, because the features do not depend
-    on the camera model.
+    on the lens.
     """
     if not _is_valid(path, fingerprint):
         remove_database(path)
         with closing_database(path) as database:
-            _write_photos(database, photos, camera_model)
+            _write_photos(database, photos, lens)
         with closing(sqlite3.connect(path)) as connection, connection:
             connection.execute("CREATE TABLE snowsplat (fingerprint TEXT)")
             connection.execute("INSERT INTO snowsplat VALUES (?)", (fingerprint,))
     else:
         set_names(path, [photo.name for photo in photos])
-        with closing_database(path) as database:
-            for camera in _cameras(photos, camera_model):
-                database.update_camera(camera)
+        set_cameras(path, photos, lens)
+
+
+def set_cameras(path: Path, photos: list[Photo], lens: Lens) -> None:
+    """Replace the cameras in the database by those with which an attempt begins."""
+    with closing_database(path) as database:
+        for camera in cameras_of(photos, lens):
+            database.update_camera(camera)
+
+
+def forget_verification(path: Path) -> None:
+    """Remove the results of the verification of matches; the matches are kept."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM two_view_geometries")
 
 
 def remove_database(path: Path) -> None:
@@ -141,17 +146,16 @@ def _is_valid(path: Path, fingerprint: str) -> bool:
         return False
 
 
-def _write_photos(database: pycolmap.Database, photos: list[Photo], camera_model: str) -> None:
-    cameras = {c.camera_id: c for c in _cameras(photos, camera_model)}
-    for camera in cameras.values():
+def _write_photos(database: pycolmap.Database, photos: list[Photo], lens: Lens) -> None:
+    for camera in cameras_of(photos, lens):
         database.write_camera(camera, use_camera_id=True)
         rig = pycolmap.Rig()
         rig.rig_id = camera.camera_id
         rig.add_ref_sensor(camera.sensor_id)
         database.write_rig(rig, use_rig_id=True)
-    camera_ids = _camera_ids(photos)
-    for image_id, photo in enumerate(photos, start=1):
-        camera_id = camera_ids[_camera_key(photo)]
+    for image_id, (photo, camera_id) in enumerate(
+        zip(photos, camera_ids(photos), strict=True), start=1
+    ):
         image = pycolmap.Image(name=photo.name, camera_id=camera_id, image_id=image_id)
         database.write_image(image, use_image_id=True)
         frame = pycolmap.Frame()
@@ -160,32 +164,6 @@ def _write_photos(database: pycolmap.Database, photos: list[Photo], camera_model
         frame.add_data_id(image.data_id)
         frame.finalize_data_ids()
         database.write_frame(frame, use_frame_id=True)
-
-
-def _camera_key(photo: Photo) -> tuple[str, int, int]:
-    # Photos of a group normally have the same size. If not, they need separate cameras.
-    return photo.group, photo.width, photo.height
-
-
-def _camera_ids(photos: list[Photo]) -> dict[tuple[str, int, int], int]:
-    keys = sorted({_camera_key(photo) for photo in photos})
-    return {key: number for number, key in enumerate(keys, start=1)}
-
-
-def _cameras(photos: list[Photo], camera_model: str) -> list[pycolmap.Camera]:
-    cameras = []
-    for key, camera_id in _camera_ids(photos).items():
-        members = [photo for photo in photos if _camera_key(photo) == key]
-        focals = [photo.focal for photo in members if photo.focal]
-        _, width, height = key
-        model = camera_model
-        if model == "auto":
-            model = "OPENCV" if len(members) >= MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
-        focal = float(np.median(focals)) if focals else GUESSED_FOCAL * max(width, height)
-        camera = pycolmap.Camera.create_from_model_name(camera_id, model, focal, width, height)
-        camera.has_prior_focal_length = bool(focals)
-        cameras.append(camera)
-    return cameras
 
 
 def set_names(path: Path, names: list[str]) -> None:

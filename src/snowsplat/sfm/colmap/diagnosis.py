@@ -131,8 +131,11 @@ def explain(
     return reasons
 
 
-def failure(evidence: Evidence) -> UserError:
-    """The error to raise if no model was found: the reason, and what to do about it."""
+def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
+    """The error to raise if no model was found: the reason, and what to do about it.
+
+    ``doubts``: why a model was rejected, as text for users.
+    """
     count = len(evidence.features)
     usable = sum(features >= _FEW_FEATURES for features in evidence.features)
     paired = {i for pair in evidence.pairs for i in (pair.first, pair.second)}
@@ -155,6 +158,12 @@ def failure(evidence: Evidence) -> UserError:
         return UserError(
             "photos: the camera only rotated, or the scene is flat, so depth cannot be estimated; "
             "walk around a scene that has depth"
+        )
+    if doubts:
+        return UserError(
+            f"photos: no possible camera poses were found for the {count} photos: "
+            f"{', '.join(doubts)}; take more photos, with smaller steps between them, or set "
+            "another camera_model"
         )
     return UserError(
         f"photos: no camera poses were found for the {count} photos, because their matches are "

@@ -28,6 +28,8 @@ from snowsplat.sfm.colmap.view_graph import ViewGraph
 # the second angle is used. Only if both fail for the photos that follow each other, other pairs are
 # tried. Photos that follow each other often have smaller angles than COLMAP requires (16).
 _INITIAL_ANGLES = (8.0, 4.0)
+# If pairs of photos that were taken while walking forward are allowed, these angles are used.
+_FORWARD_ANGLES = (8.0, 4.0, 2.0)
 _INITIAL_PAIRS = 100  # number of pairs that are tried for each angle
 _MIN_INITIAL_POINTS = 50
 ImagePair = tuple[int, int]
@@ -108,7 +110,9 @@ class IncrementalMapper:
     ) -> Iterator[tuple[ImagePair, pycolmap.Rigid3d]]:
         """Candidates for the first two photos of a model, with their relative poses."""
         pairs = sorted(self.graph.of_photos(photos).pairs, key=lambda pair: -pair.weight)
-        for follows, angle in itertools.product((True, False), _INITIAL_ANGLES):
+        forward = options.init_max_forward_motion >= 1
+        angles = _FORWARD_ANGLES if forward else _INITIAL_ANGLES
+        for follows, angle in itertools.product((True, False), angles):
             options.init_min_tri_angle = angle
             for pair in [pair for pair in pairs if pair.follows is follows][:_INITIAL_PAIRS]:
                 ids = pair.first, pair.second

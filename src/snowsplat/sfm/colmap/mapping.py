@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import pycolmap
 
@@ -48,7 +49,10 @@ _FINAL_TOLERANCE = 1e-4
 # first scale is sufficient.
 _FINAL_LOSS_SCALES = (3.0, 1.0)
 _FIRST_LOSS_SCALES = (3.0,)
-_MIN_ANGLE = 1.5  # degrees: smallest triangulation angle of a point
+# In degrees: smallest triangulation angle of a point; the second one for `Mapping.forward`.
+_MIN_ANGLE, _MIN_FORWARD_ANGLE = 1.5, 0.7
+# For `Mapping.forward`: a photo is registered with this number of points (default of COLMAP: 30).
+_FORWARD_INLIERS = 20
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,23 @@ class Mapping:
     scale: float  # size of a photo / size at which its features were detected (1 or more)
     threads: int
     report: Report
+    held: bool = False  # the focal lengths are not changed
+    # The photos may have been taken while walking forward. Then the points ahead have small angles,
+    # and few of them are in several photos.
+    forward: bool = False
 
-    def run(self, mapper: Mapper, relaxed: bool = False) -> list[pycolmap.Reconstruction]:
+    def run(
+        self, mapper: Mapper | Literal["plain"], relaxed: bool = False
+    ) -> list[pycolmap.Reconstruction]:
         """Estimate poses and points; returns the models, the one with the most photos first.
 
+        ``mapper``: "plain" is the incremental mapper with COLMAP's own order of registration.
         ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
         if mapper == "global":
             models = self._map_globally()
+        elif mapper == "plain":
+            models = self._map_in_plain_order(relaxed)
         else:
             models = self._map_incrementally(relaxed)
         return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
@@ -98,6 +111,23 @@ class Mapping:
         observations = pycolmap.ObservationManager(model)
         for image_id in sorted(photos):
             observations.deregister_frame(model.image(image_id).frame_id)
+        return self._refine(model)
+
+    def with_cameras(
+        self, model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera]
+    ) -> pycolmap.Reconstruction:
+        """Replace cameras of ``model`` by those with the same ids, and run bundle adjustment.
+
+        Changes ``model`` and returns it.
+        """
+        for camera in cameras:
+            if camera.camera_id in model.cameras:
+                old = model.cameras[camera.camera_id]
+                old.model, old.params = camera.model, list(camera.params)
+        if cameras:  # with other cameras, correct observations have large errors at first
+            model.update_point_3d_errors()
+            self._adjust(model, _FINAL_LOSS_SCALES[0])
+            model.update_point_3d_errors()
         return self._refine(model)
 
     def align_features(self, model: pycolmap.Reconstruction, image_size: int) -> None:
@@ -133,6 +163,11 @@ class Mapping:
         mapper.filter_max_reproj_error *= self.scale
         triangulation.merge_max_reproj_error *= self.scale
         triangulation.complete_max_reproj_error *= self.scale
+        options.ba_refine_focal_length = not self.held
+        if self.forward:
+            mapper.init_max_forward_motion = 1.0
+            mapper.filter_min_tri_angle = triangulation.min_angle = self._min_angle
+            mapper.abs_pose_min_num_inliers = _FORWARD_INLIERS
         if relaxed:
             options.min_num_matches = 10
             mapper.init_min_num_inliers = 40
@@ -141,6 +176,10 @@ class Mapping:
             mapper.abs_pose_min_inlier_ratio = 0.15
             mapper.max_reg_trials = 6
         return options
+
+    @property
+    def _min_angle(self) -> float:
+        return _MIN_FORWARD_ANGLE if self.forward else _MIN_ANGLE
 
     def _map_incrementally(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
         """Make models one after the other, each from the photos that are in no earlier model."""
@@ -184,6 +223,14 @@ class Mapping:
         if len(first) < len(graph.names):
             mapper.grow(model, graph.names, adjust=False)
 
+    def _map_in_plain_order(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
+        options = self._options(relaxed)
+        options.min_model_size = MIN_PHOTOS
+        self.report(0, 0, "registered photos")
+        with self._output() as output:
+            models = pycolmap.incremental_mapping(self.database, self.images, output, options)
+        return list(models.values())
+
     def _map_globally(self) -> list[pycolmap.Reconstruction]:
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads = self.threads
@@ -218,19 +265,24 @@ class Mapping:
 
         Changes ``model`` and returns it. ``min_points`` as in `_remove_outliers`.
         """
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary = False
-        options.ceres.solver_options.num_threads = self.threads
-        options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         self._remove_outliers(model, min_points)
         for scale in scales:
             if model.num_reg_images() < MIN_PHOTOS:
                 break
-            options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
-            pycolmap.bundle_adjustment(model, options)
+            self._adjust(model, scale)
             self._remove_outliers(model, min_points)
         return model
+
+    def _adjust(self, model: pycolmap.Reconstruction, scale: float) -> None:
+        """Run bundle adjustment; ``scale`` of the loss, in units of the mean reprojection error."""
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        options.refine_focal_length = not self.held
+        options.ceres.solver_options.num_threads = self.threads
+        options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
+        pycolmap.bundle_adjustment(model, options)
 
     def _remove_outliers(self, model: pycolmap.Reconstruction, min_points: int) -> None:
         """Remove observations with a large error, flat points, and cameras with few points.
@@ -238,7 +290,7 @@ class Mapping:
         A camera remains if it sees at least ``min_points`` points.
         """
         observations = pycolmap.ObservationManager(model)
-        observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, _MIN_ANGLE)
+        observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, self._min_angle)
         for image_id in list(model.reg_image_ids()):
             image = model.image(image_id)
             if image.num_points3D < min_points:

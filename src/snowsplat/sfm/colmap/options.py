@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Mapper = Literal["incremental", "global"]
@@ -57,6 +57,8 @@ class SfmResult:
     cameras: list[dict[str, Any]]
     pairs: str  # how the pairs of photos to match were chosen, as text for users
     attempts: list[str]  # a description of each attempt, as text for users, in order
+    # What is in doubt about the lenses, as text for users; earlier versions did not have this.
+    doubts: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,15 @@
-"""Estimates camera poses from photos, in up to four attempts with increasing effort.
+"""Estimates camera poses from photos, in up to seven attempts with increasing effort.
 
     1  features, pairs and mapper as configured
-    2  the same features, more pairs; weaker matches are accepted
-    3  twice as many features, from larger photos; about 4 times the work of the first attempt
-    4  the other mapper, with the existing matches
+    2  the same matches; the focal length is held, and the camera may move forward (`Lens.simple`)
+    3  the same matches, registered in COLMAP's own order
+    4  the same features, more pairs; weaker matches are accepted
+    5  twice as many features, from larger photos; about 4 times the work of the first attempt
+    6  these, with a held focal length
+    7  the other mapper, with the existing matches
+
+The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
+are verified again without it.
 
 The attempts end when one of them finds poses for 90% of the usable photos (`Evidence.usable`), or
 when the matches show that no further attempt can succeed. The result is the model with the most
@@ -12,25 +18,31 @@ registered photos.
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.sfm.colmap.consistency import check_pairs, share_agreeing
 from snowsplat.sfm.colmap.database import (
     fingerprint_of,
+    forget_verification,
     open_database,
     read_descriptors,
     remove_database,
     replace_database,
+    set_cameras,
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
+from snowsplat.sfm.colmap.lens import Lens, Refine, exif_focals, settled
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pair_matching import match_pairs
@@ -49,6 +61,13 @@ _NEXT_ATTEMPT = 3.0
 _MAX_ERROR = 4.0
 
 
+_MAPPING = {
+    "incremental": "incremental mapping",
+    "plain": "incremental mapping in COLMAP's order",
+    "global": "global mapping",
+}
+
+
 @dataclass(frozen=True)
 class Matched:
     """A database with features and matches, and how they were made."""
@@ -64,8 +83,10 @@ class Attempt:
     """The result of an attempt."""
 
     matched: Matched
+    mapping: Mapping  # for further work on the models
     models: list[pycolmap.Reconstruction]
     left_out: dict[str, str]  # name -> reason, for photos that had a pose in a wrong place
+    doubts: list[str]  # about the lenses, as text for users
 
     @property
     def registered(self) -> int:
@@ -88,6 +109,7 @@ class PoseEstimation:
         self.options = options
         self.threads = threads
         self.progress = progress
+        self.lens = Lens(options.camera_model)
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
         self.log: list[str] = []  # a description of each attempt, as text for users
@@ -101,14 +123,13 @@ class PoseEstimation:
         shutil.rmtree(self.folders.sparse, ignore_errors=True)
         second = self.folders.distorted / "database_strong.db"
         evidence = self._make_attempts(effort, second)
-        best = max(self.attempts, key=lambda attempt: attempt.registered)
+        best = self._best()
         if not best.models:
             remove_database(second)
-            raise failure(evidence)
-        mapping = self._mapping(best.matched)
+            raise failure(evidence, next((a.doubts for a in self.attempts if a.doubts), []))
         for model in best.models:
-            mapping.align_features(model, best.matched.effort.image_size)
-            mapping.add_points(model)
+            best.mapping.align_features(model, best.matched.effort.image_size)
+            best.mapping.add_points(model)
             model.extract_colors_for_all_images(self.folders.images, self.threads)
         write_models(best.models, self.folders.sparse)
         reasons = explain(
@@ -123,38 +144,73 @@ class PoseEstimation:
         if best.matched.database == second:
             replace_database(self.folders.database, by=second)
         remove_database(second)
-        return result
+        return dataclasses.replace(result, doubts=best.doubts)
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
         """Make as many attempts as needed; returns the evidence of the last matching.
 
-        ``second`` is the path of the database for the third attempt, which has more features.
+        ``second`` is the path of the database for the attempts that have more features.
         """
-        first, mapper = self.folders.database, self.options.mapper
-        matched = self._match(first, effort, effort)
+        first, mapper, lens = self.folders.database, self.options.mapper, self.lens
+        matched = self._match(first, effort, effort, lens)
         evidence = self._evidence(matched)
         if evidence.flat:
             mapper = "incremental"  # the global mapper returns a wrong depth for flat scenes
-        self._try("as configured", matched, mapper)
-        found = bool(self.attempts[0].models)
-        if self._enough(evidence) or (not found and evidence.more_effort_is_useless):
+        self._try("as configured", matched, mapper, lens)
+        if not self._found and evidence.flat and exif_focals(self.photos):
+            lens = dataclasses.replace(lens, exif=False)
+            forget_verification(first)
+            matched = self._match(first, effort, effort, lens)
+            evidence = self._evidence(matched)
+            self._try("as configured", matched, mapper, lens)
+        if self._enough(evidence) or (not self._found and evidence.more_effort_is_useless):
             return evidence
-        if not (found and evidence.matched_all):
-            matched = self._match(first, effort, effort.stronger())
-            self._try("with more pairs and weaker matches", matched, "incremental", relaxed=True)
+        self._try("as configured", matched, "incremental", lens.simple)
+        if not self._enough(evidence):
+            self._try("as configured", matched, "plain", lens)
+        if self._enough(evidence):
+            return evidence
+        if not (self._found and evidence.matched_all):
+            matched = self._match(first, effort, effort.stronger(), lens)
+            self._try("with more pairs and weaker matches", matched, "incremental", lens, True)
         if not self._enough(evidence):
             strong = effort.stronger()
-            matched = self._match(second, strong, strong)
-            self._try("with more features, from larger photos", matched, mapper, relaxed=True)
+            matched = self._match(second, strong, strong, lens)
+            how = "with more features, from larger photos"
+            self._try(how, matched, mapper, lens, True)
+            if not self._enough(evidence):
+                self._try(how, matched, "incremental", lens.simple)
         if not self._enough(evidence) and not evidence.flat:
             other: Mapper = "incremental" if mapper == "global" else "global"
-            self._try("with the other mapper", matched, other, relaxed=True)
+            self._try("with the other mapper", matched, other, lens, True)
         return self._evidence(matched)
 
-    def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
+    def _best(self) -> Attempt:
+        """The attempt with the most registered photos, weighted by the share of correct matches.
+
+        A model that is bent, because photos were registered with too few points, may have all
+        photos. But the matches of neighbouring photos do not agree with its poses.
+        """
+
+        def score(attempt: Attempt) -> float:
+            if not attempt.models:
+                return 0.0
+            matched = attempt.matched
+            pairs = check_pairs(attempt.models[0], matched.database, _MAX_ERROR * matched.scale)
+            return attempt.registered * share_agreeing(pairs)
+
+        found = [attempt for attempt in self.attempts if attempt.models]
+        return max(self.attempts, key=score) if len(found) > 1 else [*found, *self.attempts][0]
+
+    @property
+    def _found(self) -> bool:
+        """Whether an attempt has found poses."""
+        return any(attempt.models for attempt in self.attempts)
+
+    def _match(self, database: Path, effort: Effort, pairing: Effort, lens: Lens) -> Matched:
         """Detect the features of ``effort``, and match the pairs of the effort ``pairing``."""
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
-        open_database(database, self.photos, self.options.camera_model, fingerprint)
+        open_database(database, self.photos, lens, fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
         choice = choose_pairs(self.photos, pairing, self._similarity(database))
         sizes = [max(photo.width, photo.height) for photo in self.photos]
@@ -168,9 +224,17 @@ class PoseEstimation:
         indices = range(len(self.photos))
         return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
 
-    def _try(self, how: str, matched: Matched, mapper: Mapper, relaxed: bool = False) -> None:
+    def _try(
+        self,
+        how: str,
+        matched: Matched,
+        mapper: Mapper | Literal["plain"],
+        lens: Lens,
+        relaxed: bool = False,
+    ) -> None:
         """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
-        mapping = self._mapping(matched)
+        set_cameras(matched.database, self.photos, lens)
+        mapping = self._mapping(matched, lens)
         models = mapping.run(mapper, relaxed)
         weak = ""
         if models and models[0].num_reg_images() < len(self.photos):
@@ -178,24 +242,40 @@ class PoseEstimation:
             models = mapping.extend(models)
             added = models[0].num_reg_images() - before
             weak = f", {added} of them with weak matches" if added else ""
-        check, left_out = "", dict[str, str]()
+        check, left_out, doubts = "", dict[str, str](), list[str]()
         if models:
             repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
-            models = usable_models([repaired.model, *models[1:]])
             left_out = repaired.left_out
             check = f"; {repaired.description}" if repaired.description else ""
-        attempt = Attempt(matched, models, left_out)
+            found = settled(repaired.model, self.photos, lens, self._refine(mapping))
+            mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
+            models = usable_models([found.model, *models[1:]]) if found.model else []
+            if not found.model:
+                check = f"; impossible: {', '.join(doubts)}"
+        attempt = Attempt(matched, mapping, models, left_out, doubts)
         self.attempts.append(attempt)
-        effort = matched.effort
+        effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
         self.log.append(
-            f"{how}: {effort.features} features per photo at {effort.image_size} pixels, "
-            f"{matched.choice.description}, {mapper} mapping: "
+            f"{how}{lens_text}: {effort.features} features per photo at {effort.image_size} "
+            f"pixels, {matched.choice.description}, {_MAPPING[mapper]}: "
             f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
         )
 
-    def _mapping(self, matched: Matched) -> Mapping:
+    def _mapping(self, matched: Matched, lens: Lens) -> Mapping:
         return Mapping(
-            matched.database, self.folders.images, matched.scale, self.threads, self.progress.report
+            matched.database,
+            self.folders.images,
+            matched.scale,
+            self.threads,
+            self.progress.report,
+            held=lens.held,
+            forward=lens.held,
+        )
+
+    @staticmethod
+    def _refine(mapping: Mapping) -> Refine:
+        return lambda model, cameras, held: dataclasses.replace(mapping, held=held).with_cameras(
+            model, cameras
         )
 
     def _enough(self, evidence: Evidence) -> bool:

@@ -1,0 +1,255 @@
+"""The lens of each camera: how an attempt begins, and whether the result is possible.
+
+Bundle adjustment determines a lens only if the photos do. If the camera moves forward, or if the
+photos are few, then several focal lengths explain the matches equally well, and the estimate is
+arbitrary: the poses are bent, although the reprojection error is small. So an estimate is compared
+with what is known about lenses (`lens_findings`), and with the focal length in EXIF.
+
+An estimate in doubt is compared with a model whose focal length is held (`settled`). If this model
+agrees equally well with the matches, then the photos do not determine the focal length, and the
+held one is better. Otherwise the photos contradict it, and the estimate is right.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snowsplat.data.lens_check import Finding, lens_findings
+from snowsplat.sfm.ingest.photo import Photo
+
+# With fewer photos, the eight parameters of the camera model OPENCV are not well determined.
+_MIN_PHOTOS_FOR_OPENCV = 8
+#: Focal length of photos without EXIF, divided by the longest side: that of a 29 mm lens on 35 mm
+#: film. It is between the values for the photos of a phone and for its videos, which are cropped.
+GUESSED_FOCAL = 0.8
+# An ordinary lens changes the distance of a pixel from the centre by at most this share, in
+# addition to the difference between a pinhole camera and a fisheye lens (r = f θ).
+_MAX_DISPLACEMENT = 0.1
+# An ordinary lens enlarges no part of the photo by more than this factor, compared with its centre.
+_MAX_STRETCH = 1.3
+# Two focal lengths agree equally well with the matches if the reprojection errors differ by less
+# than this share. Small systematic errors (rolling shutter, things that move) have this effect.
+_EQUAL_ERROR = 0.05
+# A possible lens is used instead of an impossible one up to this factor between the errors.
+_MAX_WORSE = 2.0
+# The estimated focal length is in doubt if it differs from that in EXIF by more than this share.
+_NEAR_EXIF = 0.1
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How the cameras of an attempt begin, and what the mapper may change.
+
+    Attributes:
+        model: a camera model of COLMAP; "auto": OPENCV if enough photos share a camera to determine
+            its eight parameters, else SIMPLE_RADIAL.
+        held: the focal length is not changed.
+        exif: the focal length is that in EXIF, where known.
+    """
+
+    model: str = "auto"
+    held: bool = False
+    exif: bool = True
+
+    @property
+    def simple(self) -> Lens:
+        """A lens with fewer unknown parameters, for photos that do not determine them."""
+        return Lens("SIMPLE_RADIAL" if self.model == "auto" else self.model, True, self.exif)
+
+    @property
+    def description(self) -> str:
+        """As text for users; empty for the first choice."""
+        parts = ["a fixed focal length"] if self.held else []
+        return " and ".join(parts if self.exif else [*parts, "without the focal length in EXIF"])
+
+
+def camera_ids(photos: Sequence[Photo]) -> list[int]:
+    """The camera id of each photo: 1, 2, … in the order of the groups."""
+    keys = [_key(photo) for photo in photos]
+    ids = {key: number for number, key in enumerate(sorted(set(keys)), start=1)}
+    return [ids[key] for key in keys]
+
+
+def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
+    """The camera of each group of photos, in the order of `camera_ids`."""
+    cameras = []
+    known = exif_focals(photos) if lens.exif else {}
+    for number, key in enumerate(sorted({_key(photo) for photo in photos}), start=1):
+        _, width, height = key
+        count = sum(_key(photo) == key for photo in photos)
+        model = lens.model
+        if model == "auto":
+            model = "OPENCV" if count >= _MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
+        focal = known.get(number, GUESSED_FOCAL * max(width, height))
+        camera = pycolmap.Camera.create_from_model_name(number, model, focal, width, height)
+        camera.has_prior_focal_length = number in known
+        cameras.append(camera)
+    return cameras
+
+
+def exif_focals(photos: Sequence[Photo]) -> dict[int, float]:
+    """The focal length of each camera in pixels, from EXIF; cameras without are left out."""
+    focals: dict[int, list[float]] = {}
+    for photo, number in zip(photos, camera_ids(photos), strict=True):
+        if photo.focal:
+            focals.setdefault(number, []).append(photo.focal)
+    return {number: float(np.median(values)) for number, values in focals.items()}
+
+
+def _key(photo: Photo) -> tuple[str, int, int]:
+    # Photos of a group normally have the same size. If not, they need separate cameras.
+    return photo.group, photo.width, photo.height
+
+
+def findings_of(camera: pycolmap.Camera, exif: float | None) -> list[Finding]:
+    """What is wrong with an estimated lens; ``exif``: the focal length in EXIF, in pixels."""
+    fx, fy = camera.focal_length_x, camera.focal_length_y
+    cx, cy = camera.principal_point_x, camera.principal_point_y
+    found = lens_findings(camera.width, camera.height, fx, fy, cx, cy, known_focal=exif)
+    reason = _implausible_distortion(camera)
+    return [*found, Finding("distortion", reason, True)] if reason else found
+
+
+def _implausible_distortion(camera: pycolmap.Camera) -> str:
+    """Why the distortion is not that of a lens, as text; empty: it is plausible.
+
+    Fisheye models and models without distortion are plausible.
+    """
+    if not camera.is_perspective_pinhole() or camera.is_undistorted():
+        return ""
+    ideal = _border(camera)
+    if not np.isfinite(ideal).all():
+        return "the lens distortion is not one-to-one over the whole photo"
+    # Along rays from the principal point to the border, in units of the focal length.
+    steps = np.linspace(0.0, 1.0, 33)[1:]
+    rays = np.concatenate([ideal[:, None] * steps[:, None], np.ones((len(ideal), 32, 1))], 2)
+    pixels = np.asarray(camera.img_from_cam(rays.reshape(-1, 3))).reshape(len(ideal), 32, 2)
+    focal = np.array([camera.focal_length_x, camera.focal_length_y])
+    centre = np.array([camera.principal_point_x, camera.principal_point_y])
+    distorted = np.linalg.norm((pixels - centre) / focal, axis=2)
+    radius = np.linalg.norm(ideal, axis=1)[:, None] * steps
+    slope = np.diff(distorted, axis=1) / np.diff(radius, axis=1)
+    if not np.isfinite(slope).all() or slope.min() <= 0:
+        return "the lens distortion is not one-to-one over the whole photo"
+    displaced = distorted / radius - 1
+    fisheye = np.arctan(radius) / radius - 1
+    if displaced.max() > _MAX_DISPLACEMENT or (displaced - fisheye).min() < -_MAX_DISPLACEMENT:
+        worst = max(displaced.min(), displaced.max(), key=abs)
+        return f"the lens distortion moves pixels at the border by {worst:.0%}"
+    if slope.max() > _MAX_STRETCH:
+        return f"the lens distortion enlarges a part of the photo {slope.max():.1f} times"
+    return ""
+
+
+def _border(camera: pycolmap.Camera) -> NDArray[np.floating[Any]]:
+    """(N, 2) points on the border of the photo, in the ideal image plane; NaN if undefined."""
+    along = np.linspace(0.0, 1.0, 9)
+    sides = [(along, 0 * along), (along, 0 * along + 1), (0 * along, along), (0 * along + 1, along)]
+    photo = np.concatenate([np.stack(side, 1) for side in sides]) * (camera.width, camera.height)
+    return np.asarray(camera.cam_from_img(photo), np.float64).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A model whose lens is possible.
+
+    Attributes:
+        model: None: no possible lens agrees with the matches.
+        held: whether the focal length is held from now on.
+        notes: what is in doubt about the lens, as text for users.
+    """
+
+    model: pycolmap.Reconstruction | None
+    held: bool
+    notes: list[str]
+
+
+#: Runs bundle adjustment on a model, changes it and returns it. If cameras are given, the model
+#: gets them before. The last argument: whether the focal length is held.
+Refine = Callable[
+    [pycolmap.Reconstruction, Sequence[pycolmap.Camera], bool], pycolmap.Reconstruction
+]
+
+
+def settled(
+    model: pycolmap.Reconstruction, photos: Sequence[Photo], lens: Lens, refine: Refine
+) -> Settled:
+    """Replace a lens in doubt by a possible one.
+
+    Args:
+        model: from the mapper; it is not changed.
+        lens: that of the attempt which made ``model``.
+    """
+    known = exif_focals(photos)
+    if not lens.held and not _doubts(model, known):
+        return Settled(model, False, [])
+    free = refine(copy.deepcopy(model), [], False)
+    held = _held(model, photos, lens, known, refine)
+    if _loss(held) <= (1 + _EQUAL_ERROR) * _loss(free) and not _impossible(held, known):
+        return Settled(held, True, [])
+    if not _impossible(free, known):
+        return Settled(free, False, _doubts(free, known))
+    if _loss(held) <= _MAX_WORSE * _loss(free) and not _impossible(held, known):
+        return Settled(held, True, [])
+    return Settled(None, False, _doubts(free, known))
+
+
+def _held(
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo],
+    lens: Lens,
+    known: Mapping[int, float],
+    refine: Refine,
+) -> pycolmap.Reconstruction:
+    """``model`` with a held focal length; with a simpler lens if the distortion is impossible."""
+    for name in (lens.model, lens.simple.model, "SIMPLE_PINHOLE"):
+        begin = cameras_of(photos, Lens(name, True, lens.exif))
+        made = refine(copy.deepcopy(model), begin, True)
+        if not _impossible(made, known):
+            break
+    return made
+
+
+def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:
+    """What is wrong or in doubt about the lenses of a model, as text for users."""
+    found = []
+    for number in _used(model):
+        camera = model.cameras[number]
+        found += [finding.text for finding in findings_of(camera, None)]
+        exif, focal = known.get(number), camera.mean_focal_length()
+        if exif and not 1 / (1 + _NEAR_EXIF) < focal / exif < 1 + _NEAR_EXIF:
+            found.append(
+                f"the focal length in EXIF ({exif:.0f} pixels) does not agree with the photos "
+                f"({focal:.0f} pixels); the latter is used"
+            )
+    return list(dict.fromkeys(found))
+
+
+def _impossible(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> bool:
+    return any(
+        finding.impossible
+        for number in _used(model)
+        for finding in findings_of(model.cameras[number], known.get(number))
+    )
+
+
+def _used(model: pycolmap.Reconstruction) -> list[int]:
+    """The ids of the cameras of photos that have a pose."""
+    return sorted({model.image(image_id).camera_id for image_id in model.reg_image_ids()})
+
+
+def _loss(model: pycolmap.Reconstruction) -> float:
+    """The mean reprojection error in pixels / the number of observations.
+
+    Bundle adjustment removes observations with large errors. So a model that agrees less well with
+    the matches has larger errors, or fewer observations, or both.
+    """
+    count = model.compute_num_observations()
+    return model.compute_mean_reprojection_error() / count if count else float("inf")

@@ -1,0 +1,87 @@
+"""Features and verified matches of a walk along a street or around a place; there are no photos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from snowsplat.sfm.colmap.database import closing_database, open_database
+from snowsplat.sfm.colmap.lens import Lens
+from snowsplat.sfm.ingest.photo import Photo
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What the photos see."""
+
+    centres: np.ndarray  # (N, 3) of the cameras
+    pixels: list[np.ndarray]  # for each camera, (features, 2)
+    matches: dict[tuple[int, int], np.ndarray]  # (M, 2) features, of verified pairs i < j
+
+    def photos(self, exif: float | None) -> list[Photo]:
+        """``exif``: the focal length in EXIF, in pixels."""
+        names = [f"{i:02}.png" for i in range(len(self.centres))]
+        return [Photo(n, n, WIDTH, HEIGHT, "", None, exif, None, False, False) for n in names]
+
+    def write(self, path: Path, exif: float | None, lens: Lens) -> Path:
+        open_database(path, self.photos(exif), lens, "none")
+        with closing_database(path) as database:
+            for i, pixels in enumerate(self.pixels):
+                database.write_keypoints(i + 1, pixels.astype(np.float32))
+            for (i, j), rows in self.matches.items():
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                geometry.inlier_matches = rows
+                database.write_two_view_geometry(i + 1, j + 1, geometry)
+        return path
+
+
+def forward(count: int = 12, step: float = 1.5) -> Walk:
+    """Along a street between two rows of houses; the camera looks ahead."""
+    random = np.random.default_rng(0)
+    length = count * step + 40
+    side = random.choice([-1, 1], 5000) * random.uniform(5, 7, 5000)
+    xyz = np.stack([side, random.uniform(-4, 1.6, 5000), random.uniform(0, length, 5000)], 1)
+    sway = 0.02 * random.normal(size=(count, 3))
+    centres = np.stack([0 * np.arange(count), 0 * np.arange(count), step * np.arange(count)], 1)
+    return _walk(xyz, centres + 2 * sway, 0.5 * sway, random, reach=25.0)
+
+
+def sideways(count: int = 12) -> Walk:
+    """Past a room, with turns: the photos determine the focal length."""
+    random = np.random.default_rng(0)
+    xyz = random.uniform([-6, -2.5, 4], [6, 2.5, 9], (1500, 3))
+    angle = np.linspace(-0.5, 0.5, count)
+    centres = np.stack([6 * np.sin(angle), 0.3 * np.cos(5 * angle), 6 - 6 * np.cos(angle)], 1)
+    turns = np.stack([0.1 * np.sin(9 * angle), angle, 0 * angle], 1)
+    return _walk(xyz, centres, turns, random, reach=100.0)
+
+
+def _walk(
+    xyz: np.ndarray,
+    centres: np.ndarray,
+    turns: np.ndarray,
+    random: np.random.Generator,
+    reach: float,
+) -> Walk:
+    """``turns``: (N, 3) rotation vectors of the cameras; ``reach``: depth up to which they see."""
+    seen, pixels = [], []
+    for centre, turn in zip(centres, turns, strict=True):
+        local = (xyz - centre) @ pycolmap.Rotation3d(turn).matrix().T
+        pixel = FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        inside = (local[:, 2] > 1) & ((pixel > 0) & (pixel < [WIDTH, HEIGHT])).all(1)
+        inside &= local[:, 2] < reach
+        seen.append(np.flatnonzero(inside))
+        pixels.append(pixel[inside] + random.normal(0, 0.3, (inside.sum(), 2)))
+    matches = {}
+    for i in range(len(centres)):
+        for j in range(i + 1, min(i + 5, len(centres))):
+            _, one, two = np.intersect1d(seen[i], seen[j], return_indices=True)
+            if len(one) >= 30:
+                matches[i, j] = np.stack([one, two], 1).astype(np.uint32)
+    return Walk(centres, pixels, matches)
