@@ -15,9 +15,9 @@ from snowsplat.sfm.orient.up import Evidence
 
 # GPS measures altitudes less accurately than horizontal positions, by this factor.
 _ALTITUDE = 2.5
-# The errors of successive positions are alike. So the positions tell as much as this share of them
-# would with independent errors.
-_INDEPENDENT = 0.25
+# The errors of successive positions are alike: the correlation of neighbours is about 0.8. So the
+# positions tell as much as this share of them would with independent errors.
+_INDEPENDENT = 0.12
 # The expected error counts as much as this number of measured errors. With few positions, the
 # measured ones are small by chance.
 _EXPECTED = 2.0

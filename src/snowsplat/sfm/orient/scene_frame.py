@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 # GPS is used if it determines the scale to this relative standard deviation.
-_SCALE_ERROR = 0.1
+_SCALE_ERROR = 0.08
 # North determines the axes of the scene if it is known to this standard deviation.
 _NORTH_ERROR = math.radians(10)
 # Standard deviations of the mean of many gimbals and compasses: metal is near, and yaw drifts.
