@@ -190,7 +190,7 @@ def test_without_altitudes_gps_still_gives_the_scale(model_of):
     ]
     found, placement = placed(model_of, poses, photos)
     assert found.scale == pytest.approx(1, abs=0.05)
-    assert placement.level_error > 10  # the slope of the path is unknown again
+    assert 4 < placement.level_error < 10  # the path may slope by a tenth
 
 
 def test_a_scene_that_is_nearer_than_a_metre_keeps_its_scale(model_of):

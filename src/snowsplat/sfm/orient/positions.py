@@ -18,6 +18,8 @@ _ALTITUDE = 2.5
 # The errors of successive positions are alike: the correlation of neighbours is about 0.8. So the
 # positions tell as much as this share of them would with independent errors.
 _INDEPENDENT = 0.12
+# Standard deviation of the slope of a path whose altitudes are unknown.
+_SLOPE = 0.1
 # The expected error counts as much as this number of measured errors. With few positions, the
 # measured ones are small by chance.
 _EXPECTED = 2.0
@@ -86,7 +88,7 @@ def align(
     Args:
         centres: (N, 3) camera positions in the world frame of SfM.
         places: (N, 3) of the same cameras by GPS, in metres east, north and up. If all altitudes
-            are equal, they are unknown.
+            are equal, they are unknown, and the path is assumed to be nearly level.
         errors: (N,) expected standard deviations of the horizontal positions in metres.
         known: the up direction from other evidence.
     """
@@ -96,6 +98,8 @@ def align(
     if start is None:
         return None
     scale, rotation, translation = start
+    middle = np.median(places, axis=0)
+    places, translation = places - middle, translation - middle
     has_altitudes = bool(np.ptp(places[:, 2]) > 0)
     relative = errors / np.median(errors)
     expected = float(np.median(errors))
@@ -107,9 +111,9 @@ def align(
         sizes /= relative[:, None]
         error = _error(sizes, error, expected)
         weights = np.minimum(1, _OUTLIER * error / np.maximum(sizes, 1e-9)) ** 2
-        if not has_altitudes:
-            weights[:, 1] = 1e-9
         precision = _INDEPENDENT * weights / (relative[:, None] * error) ** 2
+        if not has_altitudes:
+            precision[:, 1] = 1 / (_SLOPE**2 * np.square(places[:, :2]).sum())
         precision = precision[:, [0, 0, 1]]  # east, north, up
         # (N, 3, 7) derivatives of the positions by the rotation vector, log scale, translation.
         jacobian = np.concatenate(
@@ -137,7 +141,7 @@ def align(
     return Alignment(
         scale,
         rotation,
-        translation,
+        translation + middle,
         np.linalg.inv(hessian),
         float(error[0]),
         float((sizes[:, 0] > _OUTLIER * error[0]).mean()),
