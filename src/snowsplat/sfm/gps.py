@@ -12,6 +12,8 @@ from snowsplat.sfm.ingest.photo import Photo
 #: Standard deviation of a horizontal position in metres, if the receiver states none.
 USUAL_ERROR = 5.0
 
+# No receiver is more accurate, in metres.
+_LEAST_ERROR = 0.01
 # The ellipsoid of WGS 84.
 _RADIUS = 6_378_137.0  # m, at the equator
 _ECCENTRICITY2 = 6.694379990141e-3
@@ -56,4 +58,5 @@ def _metres_per_degree(latitude: float) -> tuple[float, float]:
 
 def position_errors(photos: Sequence[Photo]) -> np.ndarray:
     """(N,) standard deviations of the horizontal positions in metres, as the receivers state."""
-    return np.array([photo.location_error or USUAL_ERROR for photo in photos])
+    stated = np.array([photo.location_error or USUAL_ERROR for photo in photos])
+    return np.maximum(stated, _LEAST_ERROR)
