@@ -190,3 +190,27 @@ def test_long_lists_are_shortened_and_any_name_is_accepted(dataset):
     assert "p199" in shown
     assert "p200" not in shown
     assert "and 701 more" in shown  # one of them is a photo that could not be decoded
+
+
+def test_level_north_and_scale_are_told(dataset):
+    """In metres, the scale bars name the unit too."""
+    before = write_report(dataset, facts()).read_text()
+    assert "Level, north" not in before
+    assert " units</text>" in before
+    placement = {
+        "up_from": ["the <gimbal> angles of 18 photos"],
+        "level_error": 0.7,
+        "metres_per_unit": 1.0,
+        "scale_from": "GPS positions of 18 photos",
+        "scale_error": 0.026,
+        "position_error": 1.2,
+        "doubts": ["GPS & gimbal disagree"],
+    }
+    record = facts()
+    record["undistorted"]["placement"] = placement
+    after = write_report(dataset, record).read_text()
+    assert "from the &lt;gimbal&gt; angles of 18 photos, to about 0.7°" in after
+    assert "scale from GPS positions of 18 photos (1.2 m typical error), to about 2.6%" in after
+    assert "GPS &amp; gimbal disagree" in after
+    assert " units</text>" not in after
+    assert re.search(r"[0-9] m</text>", after)

@@ -79,6 +79,7 @@ class Sfm:
     def run(self) -> int:
         """Returns the exit code, 0."""
         inputs, folder = self._inputs_and_folder()
+        from snowsplat.data.placement import placement_of
         from snowsplat.sfm.dataset_folder import make_dataset
 
         options = self._options()
@@ -90,6 +91,9 @@ class Sfm:
             f"{folder}: {found} of {found + count} photos placed, {poses['points']:,} points; "
             f"see {folder / outcomes['report'].result['file']}"
         )
+        placement = placement_of(outcomes["images"].result)
+        for line in placement.lines() if placement is not None else []:
+            print(line)
         print(f"train it with: snowsplat train {folder} -o OUT --eval")
         return 0
 

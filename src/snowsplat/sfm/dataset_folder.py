@@ -26,6 +26,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
+from snowsplat.data.placement import PLACEMENT
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.dataset_report import REPORT, write_report
@@ -243,11 +244,14 @@ def _undistort(
 
     for name in _IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
-    scene_from_sfm = orientation(pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0"))
-    made = undistort(
-        folder, photos, scene_from_sfm, options.resize, report, threads=options.sfm.threads
-    )
-    return asdict(made) | {"scene_from_sfm": scene_from_sfm.to_json()}
+    model = pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0")
+    oriented = orientation(model, photos)
+    scene_from_sfm, threads = oriented.scene_from_sfm, options.sfm.threads
+    made = undistort(folder, photos, scene_from_sfm, options.resize, report, threads=threads)
+    return asdict(made) | {
+        "scene_from_sfm": scene_from_sfm.to_json(),
+        PLACEMENT: asdict(oriented.placement),
+    }
 
 
 # Checks of the folder

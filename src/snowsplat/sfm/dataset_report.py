@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
+from snowsplat.data.placement import Placement, placement_of
 from snowsplat.sfm.more_photos import Advice, advice
 from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
@@ -56,11 +57,13 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
     rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
     more = advice(photos, xyz)
+    placement = placement_of(facts["undistorted"])
     body = [
         _headline(name, facts),
         _cards(facts),
         _your_photos(dataset, [photo.name for photo in photos], facts, more),
-        _maps(photos, xyz, rgb, more.places),
+        _maps(photos, xyz, rgb, more.places, placement),
+        _placed(placement),
         _strip(dataset, [photo.name for photo in photos]),
         _lenses(facts["sfm"]["cameras"], facts["undistorted"]),
         _left_out(facts),
@@ -179,8 +182,13 @@ def _more_photos(more: Advice) -> list[str]:
 
 
 def _maps(
-    photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray, marks: np.ndarray
+    photos: Sequence[PlacedPhoto],
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    marks: np.ndarray,
+    placement: Placement | None,
 ) -> str:
+    unit = "m" if placement is not None and placement.is_metric else "units"
     captions = (
         "From above. Orange: the cameras; white: the first camera.",
         "From the side.",
@@ -189,14 +197,23 @@ def _maps(
         captions = (captions[0] + " Numbers: places for more photos.", captions[1])
     if any(photo.sequence is not None for photo in photos):
         captions = (captions[0] + " Blue: the path of the video.", captions[1])
+    drawings = draw_scene(photos, xyz, rgb, marks, unit)
     # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
     figures = "\n".join(
         f'<figure style="flex:{drawing.width} 1 {drawing.width // 2}px;'
         f'max-width:{2 * drawing.width}px">{drawing.svg}'
         f"<figcaption>{caption}</figcaption></figure>"
-        for drawing, caption in zip(draw_scene(photos, xyz, rgb, marks), captions, strict=True)
+        for drawing, caption in zip(drawings, captions, strict=True)
     )
     return f'<h2>Cameras and points</h2>\n<div class="maps">{figures}</div>'
+
+
+def _placed(placement: Placement | None) -> str:
+    """What the frame of the scene was found from."""
+    if placement is None:  # a dataset of an earlier version
+        return ""
+    rows = [[text(part) for part in line.split(": ", 1)] for line in placement.lines()]
+    return f"<h2>Level, north and scale</h2>\n{table([], rows)}"
 
 
 def _strip(dataset: Path, names: Sequence[str]) -> str:

@@ -147,6 +147,8 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
         location=exif.location,
         mask=used is not None,
         alpha=alpha,
+        location_error=exif.location_error,
+        attitude=exif.attitude,
     )
 
 

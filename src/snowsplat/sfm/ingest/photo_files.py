@@ -105,13 +105,20 @@ def read_header(path: Path) -> Header:
                 and "transparency" not in image.info
                 and _bits(path, image) == 8,
                 transparent=transparent,
-                exif=read_exif(exif, width, height),
+                exif=read_exif(
+                    exif, width, height, _xmp(image), image.info.get("original_orientation")
+                ),
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
     return header
+
+
+def _xmp(image: Image.Image) -> bytes:
+    packet = image.info.get("xmp", b"")
+    return packet if isinstance(packet, bytes) else b""
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
