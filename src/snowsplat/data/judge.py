@@ -52,10 +52,12 @@ def judge(dataset: Dataset) -> list[Finding]:
     """
     views = sorted([*dataset.train, *dataset.test], key=lambda view: view.name)
     rig = Rig.of([view.camera for view in views])
-    findings = [*_lenses(views), *position_findings(rig)]
-    if not any(finding.impossible for finding in findings):
-        findings += _poses(views, rig, dataset.points)
-    return findings
+    lenses, positions = _lenses(views), position_findings(rig)
+    if any(finding.impossible for finding in lenses):
+        return lenses
+    poses = _poses(views, rig, dataset.points)
+    # Wrong poses may have any positions; what is wrong with the poses says more.
+    return [*lenses, *poses, *([] if poses else positions)]
 
 
 def _lenses(views: list[View]) -> list[Finding]:

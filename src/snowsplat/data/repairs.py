@@ -20,7 +20,7 @@ from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 # Factors of focal lengths and of units: steps of 12%. A match of photos tolerates half of it.
-_ZOOMS = 1.12 ** np.arange(-24, 25)
+_ZOOMS = 1.12 ** np.arange(-42, 43)
 _UNITS = 1.12 ** np.arange(-82, 83)
 
 
