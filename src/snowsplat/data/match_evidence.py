@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -65,15 +66,27 @@ class MatchEvidence:
     """Matches between the photos of a sample that agree with a rigid scene, without its poses."""
 
     def __init__(self, sample: PhotoSample) -> None:
-        features = [_features(photo) for photo in sample.photos]
+        self._sample = sample
+        self._features = [_features(photo) for photo in sample.photos]
+        #: The pairs with enough matches, within the groups of the sample.
+        self.pairs = self._matched(same_group=True)
+
+    def widen(self) -> None:
+        """Add pairs of different groups. If the names are shuffled, views of one group do not see
+        the same things, but others do.
+        """
+        self.pairs += self._matched(same_group=False)
+
+    def _matched(self, *, same_group: bool) -> list[Pair]:
+        groups = self._sample.groups
         candidates = [
-            Pair(a, b, *_matches(features[a], features[b]))
-            for a in range(len(sample))
-            for b in range(a + 1, len(sample))
+            Pair(a, b, *_matches(self._features[a], self._features[b]))
+            for a, b in combinations(range(len(groups)), 2)
+            if (groups[a] == groups[b]) == same_group
         ]
         candidates.sort(key=lambda pair: -len(pair.in_a))
-        rigid = (_rigid(pair, sample) for pair in candidates[:_MOST_PAIRS])
-        self.pairs = [pair for pair in rigid if len(pair.in_a) >= _FEWEST_MATCHES]
+        rigid = (_rigid(pair, self._sample) for pair in candidates[:_MOST_PAIRS])
+        return [pair for pair in rigid if len(pair.in_a) >= _FEWEST_MATCHES]
 
     def fit(self, rig: Rig) -> Fit:
         """How well cameras of the views of the sample explain the matches; see `Fit`."""
@@ -106,8 +119,11 @@ def _matches(
         return np.empty((0, 2)), np.empty((0, 2))
     similar = a[1] @ b[1].T
     best = similar.argmax(1)
-    mutual = similar.argmax(0)[best] == np.arange(len(best))
-    second, first = np.partition(similar, -2, axis=1)[:, -2:].T
+    rows = np.arange(len(best))
+    mutual = similar.argmax(0)[best] == rows
+    first = similar[rows, best]
+    similar[rows, best] = -1.0
+    second = similar.max(1)
     distinct = 2 - 2 * first < _RATIO**2 * (2 - 2 * second)
     kept = mutual & distinct
     return a[0][kept], b[0][best[kept]]

@@ -18,7 +18,7 @@ from snowsplat.util.errors import UserError
 SIDE = 320
 # Views spread over the dataset in the order of names. Each brings two neighbours: the next one by
 # name, and the nearest one by pose. If the poses are right, these see the same things.
-_ANCHORS = 6
+_ANCHORS = 8
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class PhotoSample:
         views: their indices in the dataset.
         groups: (N,) the number of the anchor that a view belongs to; views of one group may look
             alike.
-        photos: (4, h, w) uint8 RGBA each; alpha is 0 where a mask is black.
+        photos: (4, h, w) uint8 RGBA each. Masks are not applied: what is moving in a few photos
+            misleads no witness, and a mask may be wrong.
     """
 
     views: list[int]
@@ -66,10 +67,6 @@ def _chosen(rig: Rig) -> dict[int, int]:
 
 def _photo(view: View) -> np.ndarray | None:
     try:
-        photo = load_thumbnail(view.image, SIDE)
-        if view.mask is not None:
-            mask = load_thumbnail(view.mask, SIDE)
-            photo[3] = np.where(mask[:3].max(0) >= 128, photo[3], 0)
-    except (UserError, ValueError):  # the training will say so, or leave the photo out
+        return load_thumbnail(view.image, SIDE)
+    except UserError:  # the training says so, or leaves the photo out
         return None
-    return photo

@@ -130,7 +130,9 @@ def point_repairs(rig: Rig) -> Iterator[Repair]:
 
 
 def _times(factor: float) -> str:
-    return f"{factor:.2g} times" if factor >= 1 else f"1/{1 / factor:.2g} of"
+    """ "3 times" or "1/3 of", with two digits."""
+    number = float(f"{max(factor, 1 / factor):.2g}")
+    return f"{number:,g} times" if factor >= 1 else f"1/{number:,g} of"
 
 
 def _turned(rig: Rig, axes: np.ndarray) -> Rig:
