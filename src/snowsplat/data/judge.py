@@ -30,6 +30,8 @@ from snowsplat.data.rig import Rig
 
 # Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
 _COLOURS_AGREE = 0.6
+# A correlation above this is none of chance. Photos that look alike may agree no less with others.
+_COLOURS_FIT = 0.4
 # Matches: pairs that are needed, and the share of matches that agree. 0 to 0.4 for wrong poses
 # (0.4 if the cameras nearly look in one direction), 0.9 to 1 for exact ones.
 _FEWEST_PAIRS = 3
@@ -140,6 +142,8 @@ def _points(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Fin
         return []
     if repair := _coloured(point_repairs(rig), colours, agreement):
         return [_mistake(repair, _of_colours(agreement))]
+    if agreement.correlation >= _COLOURS_FIT:
+        return []
     text = f"{_of_colours(agreement)}; the points may be in another frame than the poses"
     return [Finding("points", text)]
 
