@@ -51,6 +51,7 @@ class TrainingRun:
         save_iterations: steps after which the scene is written, in addition to the last step.
         checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
         page: shows the training in the browser.
+        doubts: what is doubtful about the cameras of the dataset, for the report.
     """
 
     out: OutputFolder
@@ -64,6 +65,7 @@ class TrainingRun:
     save_iterations: tuple[int, ...] = ()
     checkpoint_seconds: float | None = None
     page: LivePage | None = None
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.config = self.trainer.config
@@ -321,6 +323,7 @@ class TrainingRun:
                 masks=self._masks(),
                 ended_early=self._ended_early(),
                 poses=about_poses,
+                doubts=self.doubts,
                 settings={
                     "recipe": self.recipe,
                     "dataset": dataset,

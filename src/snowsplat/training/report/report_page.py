@@ -62,6 +62,7 @@ class Trained:
             `Transients.pictures`.
         ended_early: why the training ended before its last planned step; None if it did not.
         poses: the line about the camera poses; None if there is nothing to say.
+        doubts: what is doubtful about the cameras of the dataset, a sentence each.
         peak_bytes: peak memory; 0 if unknown.
     """
 
@@ -78,6 +79,7 @@ class Trained:
     masks: Mapping[str, Image.Image] = field(default_factory=dict)
     ended_early: str | None = None
     poses: str | None = None
+    doubts: tuple[str, ...] = ()
     peak_bytes: int = 0
 
 
@@ -104,6 +106,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _left_out(trained.left_out),
             masks.masked(trained.dataset.train, trained.masks),
             _poses(trained.poses),
+            *map(_poses, trained.doubts),
             _curves(trained.history),
             _exposures(trained.exposures),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
