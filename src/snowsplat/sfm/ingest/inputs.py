@@ -12,7 +12,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
@@ -22,7 +22,16 @@ from snowsplat.sfm.ingest.gather_photos import (
     plan_photos,
     write_photos,
 )
+from snowsplat.sfm.ingest.panorama import (
+    CUT_INTO_VIEWS,
+    PANORAMA,
+    STITCHED,
+    is_spherical_video,
+    shows_all_around,
+)
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photo_files import open_image
+from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.sources import Source, Sources, find_sources
 from snowsplat.sfm.ingest.video_frames import SAME_VIEW, extract_frames
@@ -42,6 +51,8 @@ class Gathered:
 
     photos: list[Photo]
     skipped: list[tuple[str, str]]  # file, or file and time of a frame; reason
+    # Lines for the user about what was cropped and masked. Earlier versions did neither.
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -93,15 +104,22 @@ def gather(
     planned = plan_photos(sources.photos, options.size, skipped)
     if options.photos is not None:
         planned = evenly_spread(planned, options.photos)
+    for video in sources.videos:
+        if is_spherical_video(video.path):
+            raise _spherical(video.path.name)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
     if in_place:
         _refuse_changes(planned, sources.videos, options)
     folder.mkdir(parents=True, exist_ok=True)
+    notes: list[str] = []
     _check_disk_space(dataset, planned, clips, options)
     try:
         photos = write_photos(planned, dataset, options.size, in_place, skipped, report)
         for source, clip in clips:
-            photos += _take_frames(source, clip, folder, options, skipped, report)
+            photos += _take_frames(source, clip, folder, options, skipped, notes, report)
+        photos.sort(key=lambda photo: photo.name)
+        photos, found = set_fixed_parts_aside(photos, dataset, in_place)
+        notes += found
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
@@ -114,7 +132,7 @@ def gather(
         )
     if len(photos) < _MIN_PHOTOS:
         raise _too_few(len(photos), skipped)
-    return Gathered(sorted(photos, key=lambda photo: photo.name), skipped)
+    return Gathered(photos, skipped, notes)
 
 
 def _check(options: GatherOptions) -> None:
@@ -155,6 +173,7 @@ def _take_frames(
     folder: Path,
     options: GatherOptions,
     skipped: list[tuple[str, str]],
+    notes: list[str],
     report: Report,
 ) -> list[Photo]:
     frame_folder = folder / source.name
@@ -162,6 +181,11 @@ def _take_frames(
     max_frames = max_frame_count(clip, options.fps, options.frames)
     frames = extract_frames(clip, frame_folder, max_frames, options.size, report)
     label = source.path.name if not source.name else source.name
+    if frames.kept and all(
+        _is_panorama(frame_folder / frame.name) for frame in (frames.kept[0], frames.kept[-1])
+    ):
+        raise _spherical(label)
+    notes += [f"{label}: {line}" for line in frames.notes]
     skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
     return [
         Photo(
@@ -180,7 +204,20 @@ def _take_frames(
     ]
 
 
+def _is_panorama(path: Path) -> bool:
+    with open_image(path) as image:
+        return shows_all_around(image)
+
+
 # Errors
+
+
+def _spherical(video: str) -> UserError:
+    return UserError(
+        f"{video}: is a 360° video, but poses are estimated for lenses that show a part of the "
+        "surroundings; export a flat video of one direction, or frames as panoramas and "
+        f"{CUT_INTO_VIEWS}"
+    )
 
 
 def _check_disk_space(
@@ -228,6 +265,12 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
         return UserError(
             f"{video}: the camera does not move ({who} show the same view), but depth needs "
             "motion; film while walking around the scene"
+        )
+    if reason in (PANORAMA, STITCHED):
+        what = "360° panoramas" if reason == PANORAMA else "stitched panoramas"
+        return UserError(
+            f"photos: {who} are {what}, but poses are estimated for lenses that show a part of "
+            f"the surroundings; {CUT_INTO_VIEWS}"
         )
     if reason in (BLACK, WHITE, FLAT):
         what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]

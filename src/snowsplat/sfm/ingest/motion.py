@@ -32,12 +32,15 @@ _NEW_REFERENCE = 5.0
 _MIN_AGREEMENT = 0.25
 
 
-def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the camera moved between two frames, given equally large copies of `CONTENT_SIDE`."""
+def has_moved(before: np.ndarray, after: np.ndarray, fixed: np.ndarray | None = None) -> bool:
+    """Whether the camera moved between two frames, given equally large copies of `CONTENT_SIDE`.
+
+    ``fixed``: as for `FrameMotion`.
+    """
     if min(before.shape) < _BLOCK:
         return bool(np.abs(before.astype(np.float32) - after).mean() >= 1.0)
     first, second = _blocks(before), _blocks(after)
-    textured = _textured(first)
+    textured = _textured(first, _free_blocks(fixed, before.shape))
     if not textured.any():
         return bool(np.abs(first - second).mean() >= 1.0)
     return _shift(_spectrum(first[textured]), _spectrum(second[textured]))[0] >= _MOVED
@@ -49,9 +52,15 @@ class FrameMotion:
     The motion is the sum of small shifts, whatever their direction. Motion blur hardly affects it,
     because blur hardly changes the phases of a small copy. A cut counts as a shift by about an
     eighth of the frame, and so do other changes that are too large to be measured.
+
+    Args:
+        fixed: (H, W) bool, pixels of a frame that do not move with the scene, such as a time stamp;
+            in any size. Blocks with such pixels are not used, unless all blocks have some.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fixed: np.ndarray | None = None) -> None:
+        self._fixed = fixed
+        self._free = np.zeros(0, bool)  # (M,): the blocks without fixed pixels
         self._reference: np.ndarray | None = None  # (N, 32, 17) complex: spectra of textured blocks
         self._textured = np.zeros(0, bool)  # (M,): the blocks of the reference that have texture
         self._before = 0.0  # the motion up to the reference
@@ -72,6 +81,8 @@ class FrameMotion:
         if min(small.shape) < _BLOCK:
             return self._motion  # too small to be measured
         blocks = _blocks(small)
+        if len(blocks) != len(self._free):
+            self._free = _free_blocks(self._fixed, small.shape)
         largest = _BLOCK / 2
         if self._reference is None:
             self._set_reference(blocks)
@@ -79,7 +90,7 @@ class FrameMotion:
         if len(blocks) != len(self._textured):
             shift = largest
         elif not self._textured.any():  # the reference is black, for example
-            shift = largest if _textured(blocks).any() else 0.0
+            shift = largest if _textured(blocks, self._free).any() else 0.0
         else:
             shift, agreement = _shift(self._reference, _spectrum(blocks[self._textured]))
             shift = largest if agreement < _MIN_AGREEMENT else shift
@@ -89,7 +100,7 @@ class FrameMotion:
         return self._motion
 
     def _set_reference(self, blocks: np.ndarray) -> None:
-        self._textured = _textured(blocks)
+        self._textured = _textured(blocks, self._free)
         self._reference = _spectrum(blocks[self._textured])
         self._before = self._motion
 
@@ -103,10 +114,21 @@ def _blocks(grey: np.ndarray) -> np.ndarray:
     return part.reshape(rows, _BLOCK, columns, _BLOCK).swapaxes(1, 2).reshape(-1, _BLOCK, _BLOCK)
 
 
-def _textured(blocks: np.ndarray) -> np.ndarray:
-    """(N,) bool: the half of the blocks with the most contrast, except blocks without contrast."""
+def _free_blocks(fixed: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """(N,) bool: whether a block of a copy of this ``shape`` has no ``fixed`` pixel."""
+    small = np.zeros(shape, np.uint8)
+    if fixed is not None:
+        size = shape[1], shape[0]
+        enlarged = Image.fromarray(fixed.astype(np.uint8) * 255).resize(size, Image.Resampling.BOX)
+        small = np.asarray(enlarged)
+    free = ~_blocks(small).any(axis=(1, 2))
+    return np.asarray(free if free.any() else np.ones_like(free))
+
+
+def _textured(blocks: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """(N,) bool: the half of the ``free`` blocks with the most contrast, except flat blocks."""
     contrast = blocks.std(axis=(1, 2))
-    return contrast >= max(float(np.median(contrast)), _MIN_CONTRAST)
+    return free & (contrast >= max(float(np.median(contrast[free])), _MIN_CONTRAST))
 
 
 def _spectrum(blocks: np.ndarray) -> np.ndarray:
