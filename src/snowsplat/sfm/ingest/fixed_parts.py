@@ -39,10 +39,12 @@ _SYMMETRIC = 0.02  # opposite bars that differ by less, as a fraction of the sid
 
 _FINE, _COARSE = 1.0, 3.0  # pixels: standard deviations of the band-pass filter. Shading is coarser
 _EDGE = 4.0  # grey levels per pixel: gradient of an edge that can be a feature
-# Photos with an edge, divided by all photos.
-_FIXED, _SLOW = 0.85, 0.6
-# Of the edges in and around an overlay that are slow, at least this share is fixed. Measured: 0.8
-# to 0.93 for bars and text in videos; below 0.06 for any six or more photos of a moving camera.
+# Photos with an edge, divided by all photos. Before a background as bright as itself, a text has no
+# edge. In few photos, edges meet at a pixel by chance.
+_FIXED, _FIXED_IN_FEW, _SLOW = 0.75, 0.85, 0.6
+_FEW_PHOTOS = 12
+# Of the edges in and around an overlay that are slow, at least this share is fixed. Measured: 0.63
+# to 0.84 for text in videos; at most 0.3 for six or more photos of a moving camera.
 _SUDDEN = 0.5
 _AROUND = 8  # pixels: edges at most this far from a fixed edge are around it
 _MIN_EDGES = 40  # pixels of fixed edges in an overlay
@@ -199,9 +201,10 @@ def _edges(copies: NDArray[np.uint8]) -> _Edges:
     x, y = np.median(across, axis=0), np.median(down, axis=0)
     strength = np.hypot(x, y)
     sizes = np.hypot(across, down)
-    same = (across * x + down * y >= 0.4 * strength**2) & (sizes <= 2.5 * strength)
+    same = (across * x + down * y >= 0.25 * strength**2) & (sizes <= 2.5 * strength)
     share = same.mean(axis=0)
-    fixed = (strength >= _EDGE) & (share >= _FIXED)
+    least = _FIXED if len(copies) >= _FEW_PHOTOS else _FIXED_IN_FEW
+    fixed = (strength >= _EDGE) & (share >= least)
     slow = fixed | ((strength >= _EDGE / 2) & (share >= _SLOW))
     return _Edges(fixed, slow, (sizes >= _EDGE).sum(axis=0))
 

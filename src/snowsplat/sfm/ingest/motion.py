@@ -39,8 +39,8 @@ def has_moved(before: np.ndarray, after: np.ndarray, fixed: np.ndarray | None = 
     """
     if min(before.shape) < _BLOCK:
         return bool(np.abs(before.astype(np.float32) - after).mean() >= 1.0)
-    first, second = _blocks(before), _blocks(after)
-    textured = _textured(first, _free_blocks(fixed, before.shape))
+    first, second = _blocks(before, fixed), _blocks(after, fixed)
+    textured = _textured(first)
     if not textured.any():
         return bool(np.abs(first - second).mean() >= 1.0)
     return _shift(_spectrum(first[textured]), _spectrum(second[textured]))[0] >= _MOVED
@@ -55,12 +55,11 @@ class FrameMotion:
 
     Args:
         fixed: (H, W) bool, pixels of a frame that do not move with the scene, such as a time stamp;
-            in any size. Blocks with such pixels are not used, unless all blocks have some.
+            in any size. They are replaced by the mean of the other pixels of their block.
     """
 
     def __init__(self, fixed: np.ndarray | None = None) -> None:
         self._fixed = fixed
-        self._free = np.zeros(0, bool)  # (M,): the blocks without fixed pixels
         self._reference: np.ndarray | None = None  # (N, 32, 17) complex: spectra of textured blocks
         self._textured = np.zeros(0, bool)  # (M,): the blocks of the reference that have texture
         self._before = 0.0  # the motion up to the reference
@@ -80,9 +79,7 @@ class FrameMotion:
         small = np.asarray(Image.fromarray(grey).reduce(factor)) if factor > 1 else grey
         if min(small.shape) < _BLOCK:
             return self._motion  # too small to be measured
-        blocks = _blocks(small)
-        if len(blocks) != len(self._free):
-            self._free = _free_blocks(self._fixed, small.shape)
+        blocks = _blocks(small, self._fixed)
         largest = _BLOCK / 2
         if self._reference is None:
             self._set_reference(blocks)
@@ -90,7 +87,7 @@ class FrameMotion:
         if len(blocks) != len(self._textured):
             shift = largest
         elif not self._textured.any():  # the reference is black, for example
-            shift = largest if _textured(blocks, self._free).any() else 0.0
+            shift = largest if _textured(blocks).any() else 0.0
         else:
             shift, agreement = _shift(self._reference, _spectrum(blocks[self._textured]))
             shift = largest if agreement < _MIN_AGREEMENT else shift
@@ -100,35 +97,39 @@ class FrameMotion:
         return self._motion
 
     def _set_reference(self, blocks: np.ndarray) -> None:
-        self._textured = _textured(blocks, self._free)
+        self._textured = _textured(blocks)
         self._reference = _spectrum(blocks[self._textured])
         self._before = self._motion
 
 
-def _blocks(grey: np.ndarray) -> np.ndarray:
-    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image."""
-    rows, columns = grey.shape[0] // _BLOCK, grey.shape[1] // _BLOCK
-    top = (grey.shape[0] - rows * _BLOCK) // 2
-    left = (grey.shape[1] - columns * _BLOCK) // 2
-    part = grey[top : top + rows * _BLOCK, left : left + columns * _BLOCK].astype(np.float32)
+def _blocks(grey: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
+    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image.
+
+    ``fixed``: as for `FrameMotion`.
+    """
+    blocks = _divided(grey.astype(np.float32))
+    if fixed is None:
+        return blocks
+    size = grey.shape[1], grey.shape[0]
+    resized = Image.fromarray(fixed.astype(np.uint8) * 255).resize(size, Image.Resampling.BOX)
+    free = _divided(np.asarray(resized)) == 0
+    count = np.maximum(free.sum(axis=(1, 2), keepdims=True), 1)
+    mean = np.where(free, blocks, 0).sum(axis=(1, 2), keepdims=True) / count
+    return np.where(free, blocks, mean)
+
+
+def _divided(image: np.ndarray) -> np.ndarray:
+    rows, columns = image.shape[0] // _BLOCK, image.shape[1] // _BLOCK
+    top = (image.shape[0] - rows * _BLOCK) // 2
+    left = (image.shape[1] - columns * _BLOCK) // 2
+    part = image[top : top + rows * _BLOCK, left : left + columns * _BLOCK]
     return part.reshape(rows, _BLOCK, columns, _BLOCK).swapaxes(1, 2).reshape(-1, _BLOCK, _BLOCK)
 
 
-def _free_blocks(fixed: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """(N,) bool: whether a block of a copy of this ``shape`` has no ``fixed`` pixel."""
-    small = np.zeros(shape, np.uint8)
-    if fixed is not None:
-        size = shape[1], shape[0]
-        enlarged = Image.fromarray(fixed.astype(np.uint8) * 255).resize(size, Image.Resampling.BOX)
-        small = np.asarray(enlarged)
-    free = ~_blocks(small).any(axis=(1, 2))
-    return np.asarray(free if free.any() else np.ones_like(free))
-
-
-def _textured(blocks: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """(N,) bool: the half of the ``free`` blocks with the most contrast, except flat blocks."""
+def _textured(blocks: np.ndarray) -> np.ndarray:
+    """(N,) bool: the half of the blocks with the most contrast, except blocks without contrast."""
     contrast = blocks.std(axis=(1, 2))
-    return free & (contrast >= max(float(np.median(contrast[free])), _MIN_CONTRAST))
+    return contrast >= max(float(np.median(contrast)), _MIN_CONTRAST)
 
 
 def _spectrum(blocks: np.ndarray) -> np.ndarray:
