@@ -23,6 +23,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from snowsplat.sfm.ingest.still_background import Backdrop, find_backdrop
+
 #: Longest side in pixels of the copies.
 FIXED_SIDE = 640
 #: With fewer photos, an edge may be at the same place by chance.
@@ -30,6 +32,7 @@ MIN_PHOTOS = 6
 #: More photos make the result no better.
 ENOUGH_PHOTOS = 32
 
+_LEAST_SIDE = 32  # pixels of a copy
 _SAME_LEVEL = 6.0  # grey levels; compression changes a constant pixel by less
 # Share of the pixels of a row (or column) that are constant: in a bar at least the first, beside it
 # at most the second. A bar may contain a clock, and the scene beside it may be white in places.
@@ -57,11 +60,6 @@ _CHANGING_DIGITS = 1.5
 # fraction of the scene's, or if it is smaller than this fraction of the frame.
 _CALM, _SMALL = 0.5, 0.02
 
-_BLOCK = 16  # pixels: side of the blocks in which a still background is measured
-# Of the blocks with edges, at least the first share shows a still background, and at least the
-# second share an object that moves in front of it.
-_BACKGROUND, _OBJECT = 0.3, 0.03
-
 _GRID = (
     ("upper left", "top", "upper right"),
     ("left", "centre", "right"),
@@ -79,12 +77,12 @@ class FixedParts:
     Attributes:
         bars: widths of the bars at the left, top, right and bottom, in pixels of the copy.
         fixed: (H, W) bool, whether a pixel of the copy shows no scene; includes the bars.
-        background: whether the background stands still, and only an object in front of it moves.
+        backdrop: the background, if it stands still and only an object in front of it moves.
     """
 
     bars: tuple[int, int, int, int]
     fixed: NDArray[np.bool_]
-    background: bool
+    backdrop: Backdrop | None
 
     @property
     def crop(self) -> Crop | None:
@@ -105,7 +103,7 @@ class FixedParts:
     def overlays(self) -> NDArray[np.bool_]:
         """(H, W) bool: what is fixed except the bars; empty pixels for a still background."""
         found = np.zeros_like(self.fixed)
-        if not self.background:
+        if self.backdrop is None:
             inner = _inner(self.fixed.shape, self.bars)
             found[inner] = self.fixed[inner]
         return found
@@ -124,20 +122,20 @@ def find_fixed_parts(copies: NDArray[np.uint8]) -> FixedParts | None:
         copies: (N, H, W) grey copies of photos of equal size, at least `MIN_PHOTOS` of them, with
             the longest side of about `FIXED_SIDE`.
     """
-    if len(copies) < MIN_PHOTOS or min(copies.shape[1:]) < 2 * _BLOCK:
+    if len(copies) < MIN_PHOTOS or min(copies.shape[1:]) < _LEAST_SIDE:
         return None
     bars = _bars(copies)
     inner = _inner(copies.shape[1:], bars)
     fixed = np.ones(copies.shape[1:], bool)
     edges = _edges(copies[:, inner[0], inner[1]])
-    still = _still_background(edges, copies[:, inner[0], inner[1]])
-    if still is None:
+    backdrop = find_backdrop(copies, edges.fixed, edges.count, inner)
+    if backdrop is None:
         fixed[inner] = _overlays(edges, copies[:, inner[0], inner[1]])
     else:
-        fixed[inner] = still
+        fixed[inner] = backdrop.never_covered[inner]
     if not fixed.any() or fixed.all():
         return None
-    return FixedParts(bars, fixed, still is not None)
+    return FixedParts(bars, fixed, backdrop)
 
 
 def _inner(shape: tuple[int, ...], bars: tuple[int, int, int, int]) -> tuple[slice, slice]:
@@ -258,39 +256,6 @@ def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArr
     return found
 
 
-# A still background
-
-
-def _still_background(edges: _Edges, copies: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """(H, W) bool: the background that stands still while an object moves; None: it does not."""
-    height, width = (side // _BLOCK * _BLOCK for side in edges.fixed.shape)
-
-    def in_blocks(values: NDArray[np.generic]) -> NDArray[np.float64]:
-        blocks = values[:height, :width].reshape(height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
-        return np.asarray(blocks, np.float64).sum(axis=(1, 3))
-
-    edge_count = in_blocks(edges.count)
-    fixed_count = in_blocks(np.where(edges.fixed, edges.count, 0))
-    textured = edge_count >= len(copies) * _BLOCK
-    share = fixed_count[textured] / edge_count[textured]
-    if not len(share) or (share >= 0.5).mean() < _BACKGROUND or (share < 0.1).mean() < _OBJECT:
-        return None
-    # An object that turns changes each pixel that it ever covers.
-    low, high = copies.min(axis=0).astype(np.float32), copies.max(axis=0).astype(np.float32)
-    noise = float(np.median((high - low)[edges.fixed]))
-    changed = (high - low > max(_SAME_LEVEL, 3 * noise)).astype(np.uint8)
-    changed = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    changed = cv2.morphologyEx(changed, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8))
-    number, labels, boxes, _ = cv2.connectedComponentsWithStats(changed)
-    if number < 2:
-        return None
-    largest = boxes[1:, cv2.CC_STAT_AREA].max()
-    for i in range(1, number):  # what moves elsewhere is not the object
-        if boxes[i, cv2.CC_STAT_AREA] < 0.05 * largest:
-            changed[labels == i] = 0
-    return changed == 0
-
-
 # Lines for the user
 
 
@@ -305,7 +270,7 @@ def describe_bars(parts: FixedParts, cropped: bool, where: str) -> str:
 def describe(parts: FixedParts, cropped: bool, where: str) -> list[str]:
     """What is fixed to the frame, and what was done about it; ``where``: e.g. "all 14 photos"."""
     lines = [describe_bars(parts, cropped, where)] if any(parts.bars) else []
-    if parts.background:
+    if parts.backdrop is not None:
         lines.append(
             f"the background ({100 * parts.fixed.mean():.0f}% of the picture) stands still while "
             f"something in front of it moves, as on a turntable: masked in {where}; if nothing "

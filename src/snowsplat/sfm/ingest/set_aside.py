@@ -20,6 +20,7 @@ from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     FIXED_SIDE,
     MIN_PHOTOS,
+    FixedParts,
     box_of,
     describe,
     find_fixed_parts,
@@ -68,15 +69,17 @@ def set_fixed_parts_aside(
             crop = parts.crop if crops else None
             size = group[0].width, group[0].height
             box = (0, 0, *size) if crop is None else box_of(crop, *size)
-            still = parts.fixed if crop is None or parts.background else parts.overlays
-            masked = _enlarged(still, size)[box[1] : box[3], box[0] : box[2]]
 
             def work(
                 photo: Photo,
+                parts: FixedParts = parts,
+                cropped: bool = crop is not None,
                 box: tuple[int, int, int, int] = box,
-                masked: NDArray[np.bool_] = masked,
             ) -> Photo:
-                return _cropped_and_masked(photo, dataset, box, masked)
+                fixed = parts.overlays if cropped else parts.fixed
+                if parts.backdrop is not None:
+                    fixed = parts.backdrop.seen_in(_copy(dataset / "input" / photo.name))
+                return _cropped_and_masked(photo, dataset, box, fixed)
 
             for photo in pool.map(work, group):
                 changed[photo.name] = photo
@@ -96,9 +99,9 @@ def _enlarged(still: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.boo
 
 
 def _cropped_and_masked(
-    photo: Photo, dataset: Path, box: tuple[int, int, int, int], masked: NDArray[np.bool_]
+    photo: Photo, dataset: Path, box: tuple[int, int, int, int], fixed: NDArray[np.bool_]
 ) -> Photo:
-    """The photo, cropped to ``box`` and with the pixels ``masked`` (in the box) masked."""
+    """The photo, cropped to ``box``, with the pixels masked that are ``fixed`` in its copy."""
     path = dataset / "input" / photo.name
     size = box[2] - box[0], box[3] - box[1]
     if size != (photo.width, photo.height):
@@ -108,7 +111,7 @@ def _cropped_and_masked(
             cropped = image.crop(box)
         save(cropped, new, path)
         os.replace(new, path)
-    used = ~masked
+    used = ~_enlarged(fixed, (photo.width, photo.height))[box[1] : box[3], box[0] : box[2]]
     mask_path = dataset / "distorted" / "masks" / f"{photo.name}.png"
     if photo.mask:
         with Image.open(mask_path) as mask:
