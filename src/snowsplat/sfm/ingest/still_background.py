@@ -43,14 +43,15 @@ class Backdrop:
     def seen_in(self, copy: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """(H, W) bool: the pixels of a copy that show the background.
 
-        A uniform part of the object may look like the backdrop, so only the pixels count that are
-        connected with the part that is never covered.
+        A uniform part of the object may look like the backdrop. So pixels count that belong to the
+        texture of the backdrop, or are connected with others that count.
         """
         same = self.known & (_difference(copy, self.level) <= self.tolerance)
         shown = (self.never_covered | same).astype(np.uint8)
         opened = cv2.morphologyEx(shown, cv2.MORPH_OPEN, _PATCH)
         _, labels = cv2.connectedComponents(opened)
-        outside = np.unique(labels[self.never_covered])
+        texture = _difference(self.level, cv2.blur(self.level, _PATCH.shape)) > self.tolerance
+        outside = np.unique(labels[self.never_covered | (texture & (opened > 0))])
         # `_difference` compares patches, so it stops short of the silhouette by half a patch.
         connected = np.isin(labels, outside[outside > 0]).astype(np.uint8)
         return (cv2.dilate(connected, _PATCH) > 0) | self.never_covered
