@@ -38,17 +38,18 @@ _SAME_LEVEL = 6.0  # grey levels; compression changes a constant pixel by less
 # at most the second. A bar may contain a clock, and the scene beside it may be white in places.
 _BAR, _BESIDE = 0.8, 0.4
 _BAR_EDGE = 4  # pixels: width of the blurred edge of a bar
+_BLACK = 40.0  # grey levels; a bright bar without an opposite one may be a white sky or a wall
 _SYMMETRIC = 0.02  # opposite bars that differ by less, as a fraction of the side, are equal
 
 _FINE, _COARSE = 1.0, 3.0  # pixels: standard deviations of the band-pass filter. Shading is coarser
 _EDGE = 4.0  # grey levels per pixel: gradient of an edge that can be a feature
 # Photos with an edge, divided by all photos. Before a background as bright as itself, a text has no
 # edge. In few photos, edges meet at a pixel by chance.
-_FIXED, _FIXED_IN_FEW, _SLOW = 0.75, 0.85, 0.6
+_FIXED, _FIXED_IN_FEW, _SLOW = 0.75, 0.85, 0.5
 _FEW_PHOTOS = 12
-# Of the edges in and around an overlay that are slow, at least this share is fixed. Measured: 0.63
-# to 0.84 for text in videos; at most 0.3 for six or more photos of a moving camera.
-_SUDDEN = 0.5
+# Of the edges in and around an overlay that are slow, at least this share is fixed. Measured: 0.4 to
+# 0.9 for text and bonnets; at most 0.29 for 221 series of 6 to 14 photos of a moving camera.
+_SUDDEN = 0.4
 _AROUND = 8  # pixels: edges at most this far from a fixed edge are around it
 _MIN_EDGES = 40  # pixels of fixed edges in an overlay
 _GAP = 12  # pixels: gap between two words of a text
@@ -56,6 +57,9 @@ _TEXT_HEIGHT = 0.12  # of the height of the frame; higher overlays are no line o
 # The last digits of a clock change, so that they have no fixed edges. This number of times the
 # height of a text is masked beside it.
 _CHANGING_DIGITS = 1.5
+# An edge from border to border in this part of the height is no bonnet, but the horizon of a camera
+# that is held level, e.g. by the gimbal of a drone.
+_HORIZON = 0.6
 # A part of the frame that an overlay encloses is masked, too, if its pixels change less than this
 # fraction of the scene's, or if it is smaller than this fraction of the frame.
 _CALM, _SMALL = 0.5, 0.02
@@ -167,12 +171,21 @@ def _bars(copies: NDArray[np.uint8]) -> tuple[int, int, int, int]:
         return width + int(clear[0]) + 1 if width >= 2 and len(clear) else 0
 
     across, along = middle.mean(axis=0), middle.mean(axis=1)
-    return (
-        with_edge(left, across),
-        with_edge(top, along),
-        with_edge(right, across[::-1]),
-        with_edge(bottom, along[::-1]),
-    )
+    left, right = with_edge(left, across), with_edge(right, across[::-1])
+    top, bottom = with_edge(top, along), with_edge(bottom, along[::-1])
+    if not (left and right):
+        left, right = (
+            _if_black(left, high[:, :left]),
+            _if_black(right, high[:, high.shape[1] - right :]),
+        )
+    if not (top and bottom):
+        top, bottom = _if_black(top, high[:top]), _if_black(bottom, high[len(high) - bottom :])
+    return left, top, right, bottom
+
+
+def _if_black(width: int, levels: NDArray[np.floating]) -> int:
+    """The ``width`` of a bar with these ``levels``; 0 if it is bright."""
+    return width if width and float(np.median(levels)) <= _BLACK else 0
 
 
 # Edges
@@ -203,7 +216,7 @@ def _edges(copies: NDArray[np.uint8]) -> _Edges:
     share = same.mean(axis=0)
     least = _FIXED if len(copies) >= _FEW_PHOTOS else _FIXED_IN_FEW
     fixed = (strength >= _EDGE) & (share >= least)
-    slow = fixed | ((strength >= _EDGE / 2) & (share >= _SLOW))
+    slow = fixed | ((strength >= 0.75 * _EDGE) & (share >= _SLOW))
     return _Edges(fixed, slow, (sizes >= _EDGE).sum(axis=0))
 
 
@@ -227,6 +240,8 @@ def _overlays(edges: _Edges, copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
         if (edges.fixed & near).sum() < _SUDDEN * (edges.slow & near).sum():
             continue
         x, y, width, height, _ = boxes[i]
+        if width > 0.9 * part.shape[1] and y + height / 2 < _HORIZON * len(part):
+            continue
         if height <= _TEXT_HEIGHT * len(part):
             more = round(_CHANGING_DIGITS * height)
             part[y : y + height, max(0, x - more) : x + width + more] = True

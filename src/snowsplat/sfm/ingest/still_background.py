@@ -50,7 +50,8 @@ class Backdrop:
         shown = (self.never_covered | same).astype(np.uint8)
         opened = cv2.morphologyEx(shown, cv2.MORPH_OPEN, _PATCH)
         _, labels = cv2.connectedComponents(opened)
-        texture = _difference(self.level, cv2.blur(self.level, _PATCH.shape)) > self.tolerance
+        mean = np.asarray(cv2.blur(self.level, _PATCH.shape), np.uint8)
+        texture = _difference(self.level, mean) > self.tolerance
         outside = np.unique(labels[self.never_covered | (texture & (opened > 0))])
         # `_difference` compares patches, so it stops short of the silhouette by half a patch.
         connected = np.isin(labels, outside[outside > 0]).astype(np.uint8)

@@ -60,6 +60,8 @@ SAME_VIEW = "shows the same view as the previous frame"
 _MIN_STEP = 0.01
 # If fewer frames are requested, there are as many candidates as for this number of frames.
 _MIN_COUNT = 30
+# With fewer key frames, what is fixed to the frame is not found reliably.
+_FEW_KEY_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -255,12 +257,11 @@ def _grey(frame: VideoFrame) -> np.ndarray:
 def _fixed_parts(clip: Clip) -> FixedParts | None:
     """What is fixed to the frame, found before the frames are chosen, as it would hide the motion.
 
-    The copies are not rotated. Key frames are enough if there are many, which takes little time.
+    The copies are not rotated. Only if there are few key frames, all frames are decoded.
     """
-    copies: list[np.ndarray] = []
-    for key_frames in (True, False):
-        if len(copies) < ENOUGH_PHOTOS // 2:
-            copies = _spread_copies(clip, key_frames)
+    copies = _spread_copies(clip, key_frames=True)
+    if len(copies) < _FEW_KEY_FRAMES:
+        copies = _spread_copies(clip, key_frames=False)
     same = [copy for copy in copies if copy.shape == copies[0].shape]
     return find_fixed_parts(np.stack(same)) if same else None
 
