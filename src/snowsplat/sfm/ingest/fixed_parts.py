@@ -39,6 +39,7 @@ _SAME_LEVEL = 6.0  # grey levels; compression changes a constant pixel by less
 _BAR, _BESIDE = 0.8, 0.4
 _BAR_EDGE = 4  # pixels: width of the blurred edge of a bar
 _BLACK = 40.0  # grey levels; a bright bar without an opposite one may be a white sky or a wall
+_TEXT_IN_BAR = 0.003  # share of the pixels of a bar that differ by `_BLACK` from the others
 _SYMMETRIC = 0.02  # opposite bars that differ by less, as a fraction of the side, are equal
 
 _FINE, _COARSE = 1.0, 3.0  # pixels: standard deviations of the band-pass filter. Shading is coarser
@@ -47,9 +48,13 @@ _EDGE = 4.0  # grey levels per pixel: gradient of an edge that can be a feature
 # edge. In few photos, edges meet at a pixel by chance.
 _FIXED, _FIXED_IN_FEW, _SLOW = 0.75, 0.85, 0.5
 _FEW_PHOTOS = 12
-# Of the edges in and around an overlay that are slow, at least this share is fixed. Measured: 0.4 to
-# 0.9 for text and bonnets; at most 0.29 for 221 series of 6 to 14 photos of a moving camera.
+# Of the edges in and around an overlay that are slow, at least this share is fixed. Measured: 0.4
+# to 0.9 for text and bonnets; at most 0.29 for 221 series of 6 to 14 photos of a moving camera.
 _SUDDEN = 0.4
+# The same for overlays that are not near a border, which are rare. The point to which a camera
+# moves or zooms is usually in the middle. Measured for zooms without any shake: at most 0.75.
+_SUDDEN_IN_MIDDLE = 0.8
+_NEAR_BORDER = 0.15  # distance, as a fraction of the height or the width
 _AROUND = 8  # pixels: edges at most this far from a fixed edge are around it
 _MIN_EDGES = 40  # pixels of fixed edges in an overlay
 _GAP = 12  # pixels: gap between two words of a text
@@ -57,9 +62,11 @@ _TEXT_HEIGHT = 0.12  # of the height of the frame; higher overlays are no line o
 # The last digits of a clock change, so that they have no fixed edges. This number of times the
 # height of a text is masked beside it.
 _CHANGING_DIGITS = 1.5
-# An edge from border to border in this part of the height is no bonnet, but the horizon of a camera
-# that is held level, e.g. by the gimbal of a drone.
-_HORIZON = 0.6
+# A straight edge stays where it is if the camera moves along it: a level horizon, a window sill. So
+# the edges of an overlay must have more than one direction: the energy of their gradients across
+# the main direction, divided by that along it. Measured: 0.00 for lines, 0.04 or more for bonnets.
+_DIRECTIONS = 0.02
+_ALL_OF_IT = 0.5  # share of the picture; if more does not move, it is the camera that stands still
 # A part of the frame that an overlay encloses is masked, too, if its pixels change less than this
 # fraction of the scene's, or if it is smaller than this fraction of the frame.
 _CALM, _SMALL = 0.5, 0.02
@@ -174,18 +181,23 @@ def _bars(copies: NDArray[np.uint8]) -> tuple[int, int, int, int]:
     left, right = with_edge(left, across), with_edge(right, across[::-1])
     top, bottom = with_edge(top, along), with_edge(bottom, along[::-1])
     if not (left and right):
-        left, right = (
-            _if_black(left, high[:, :left]),
-            _if_black(right, high[:, high.shape[1] - right :]),
-        )
+        left = left if _is_no_scene(high[:, :left], constant[:, :left]) else 0
+        start = high.shape[1] - right
+        right = right if _is_no_scene(high[:, start:], constant[:, start:]) else 0
     if not (top and bottom):
-        top, bottom = _if_black(top, high[:top]), _if_black(bottom, high[len(high) - bottom :])
+        top = top if _is_no_scene(high[:top], constant[:top]) else 0
+        start = len(high) - bottom
+        bottom = bottom if _is_no_scene(high[start:], constant[start:]) else 0
     return left, top, right, bottom
 
 
-def _if_black(width: int, levels: NDArray[np.floating]) -> int:
-    """The ``width`` of a bar with these ``levels``; 0 if it is bright."""
-    return width if width and float(np.median(levels)) <= _BLACK else 0
+def _is_no_scene(levels: NDArray[np.floating], constant: NDArray[np.bool_]) -> bool:
+    """Whether a bar without an opposite one is black, or has a text in it that does not change."""
+    if not levels.size:
+        return False
+    middle = float(np.median(levels))
+    text = constant & (np.abs(levels - middle) > _BLACK)
+    return middle <= _BLACK or bool(text.mean() >= _TEXT_IN_BAR)
 
 
 # Edges
@@ -198,6 +210,8 @@ class _Edges:
     fixed: NDArray[np.bool_]  # edges that nearly all photos have
     slow: NDArray[np.bool_]  # edges that more than half of the photos have; includes `fixed`
     count: NDArray[np.int_]  # number of photos with any edge at a pixel
+    x: NDArray[np.floating]  # median gradient, in grey levels per pixel
+    y: NDArray[np.floating]
 
 
 def _edges(copies: NDArray[np.uint8]) -> _Edges:
@@ -217,7 +231,7 @@ def _edges(copies: NDArray[np.uint8]) -> _Edges:
     least = _FIXED if len(copies) >= _FEW_PHOTOS else _FIXED_IN_FEW
     fixed = (strength >= _EDGE) & (share >= least)
     slow = fixed | ((strength >= 0.75 * _EDGE) & (share >= _SLOW))
-    return _Edges(fixed, slow, (sizes >= _EDGE).sum(axis=0))
+    return _Edges(fixed, slow, (sizes >= _EDGE).sum(axis=0), x, y)
 
 
 # Overlays
@@ -229,27 +243,40 @@ def _overlays(edges: _Edges, copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
     joined = cv2.morphologyEx(
         edges.fixed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 2 * _GAP + 1), np.uint8)
     )
-    around = np.ones((2 * _AROUND + 1, 2 * _AROUND + 1), np.uint8)
     number, labels, boxes, _ = cv2.connectedComponentsWithStats(joined)
     for i in range(1, number):
-        part = labels == i
-        count = int((edges.fixed & part).sum())
-        if count < _MIN_EDGES:
-            continue
-        near = cv2.dilate(part.astype(np.uint8), around) > 0
-        if (edges.fixed & near).sum() < _SUDDEN * (edges.slow & near).sum():
-            continue
-        x, y, width, height, _ = boxes[i]
-        if width > 0.9 * part.shape[1] and y + height / 2 < _HORIZON * len(part):
+        part, (x, y, width, height) = labels == i, boxes[i, :4]
+        if not _is_overlay(part, (x, y, width, height), edges):
             continue
         if height <= _TEXT_HEIGHT * len(part):
             more = round(_CHANGING_DIGITS * height)
             part[y : y + height, max(0, x - more) : x + width + more] = True
         found |= part
-    if not found.any():
-        return found
+    if not found.any() or found.mean() > _ALL_OF_IT:
+        return np.zeros_like(found)
     found = cv2.dilate(found.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     return _with_enclosed(found, copies)
+
+
+def _is_overlay(part: NDArray[np.bool_], box: tuple[int, int, int, int], edges: _Edges) -> bool:
+    """Whether a connected ``part`` (H, W) of the fixed edges is no part of the scene.
+
+    ``box``: left, top, width and height of the part.
+    """
+    if (edges.fixed & part).sum() < _MIN_EDGES:
+        return False
+    rows, columns = part.shape
+    x, y, width, height = box
+    gradients = np.stack([edges.x[edges.fixed & part], edges.y[edges.fixed & part]])
+    across, along = np.linalg.eigvalsh(gradients @ gradients.T)
+    if across < _DIRECTIONS * along:
+        return False
+    beside, above = min(x, columns - x - width), min(y, rows - y - height)
+    at_border = beside <= _NEAR_BORDER * columns or above <= _NEAR_BORDER * rows
+    around = np.ones((2 * _AROUND + 1, 2 * _AROUND + 1), np.uint8)
+    near = cv2.dilate(part.astype(np.uint8), around) > 0
+    sudden = _SUDDEN if at_border else _SUDDEN_IN_MIDDLE
+    return bool((edges.fixed & near).sum() >= sudden * (edges.slow & near).sum())
 
 
 def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
