@@ -27,6 +27,7 @@ from snowsplat.sfm.ingest.panorama import (
     PANORAMA,
     STITCHED,
     is_spherical_video,
+    is_twice_as_wide,
     shows_all_around,
 )
 from snowsplat.sfm.ingest.photo import Photo
@@ -115,6 +116,7 @@ def gather(
     _check_disk_space(dataset, planned, clips, options)
     try:
         photos = write_photos(planned, dataset, options.size, in_place, skipped, report)
+        photos = _without_panoramas(photos, folder, in_place, skipped)
         for source, clip in clips:
             photos += _take_frames(source, clip, folder, options, skipped, notes, report)
         photos.sort(key=lambda photo: photo.name)
@@ -148,6 +150,23 @@ def _check(options: GatherOptions) -> None:
         raise SettingError("photos", f"{options.photos} is too few; use 1 or more")
     if options.size is not None and options.size < _MIN_SIZE:
         raise SettingError("size", f"{options.size} is too small; use {_MIN_SIZE} or more")
+
+
+def _without_panoramas(
+    photos: list[Photo], folder: Path, in_place: bool, skipped: list[tuple[str, str]]
+) -> list[Photo]:
+    """The photos without those of a panorama's size, if most of this size are panoramas.
+
+    Not every panorama is recognised by its pixels: there may be an edge at a pole.
+    """
+    alike = [photo for photo in photos if is_twice_as_wide(photo.width, photo.height)]
+    if not alike or sum(reason == PANORAMA for _, reason in skipped) < len(alike):
+        return photos
+    skipped += [(photo.source, PANORAMA) for photo in alike]
+    if not in_place:
+        for photo in alike:
+            (folder / photo.name).unlink()
+    return [photo for photo in photos if photo not in alike]
 
 
 def _refuse_changes(

@@ -39,9 +39,11 @@ _LONGEST_HEADER = 64 << 20  # bytes; longer ones are not searched
 _WIDTH = 256  # pixels of the copy that is tested
 _RATIO_ERROR = 0.01  # relative difference of the aspect ratio from 2
 # The difference between the left and the right border, divided by the median difference between
-# neighbouring columns. Measured: 0.8 to 1.2 for panoramas.
-_SEAM = 1.6
-_POINT = 0.2  # variation along the first and last row, divided by that of the median row
+# neighbouring columns; and the variation along the first and the last row, divided by that of the
+# median row. Measured: 0.4 to 1.7 and usually below 0.2 for panoramas of a room. Of 1,300 parts of
+# ordinary photos, none has less than 0.8 in its rows and less than 2.5 at its borders.
+_SEAM = 1.8
+_POINT = 0.5
 _MIN_CONTRAST = 4.0  # grey levels; in a border without structure, a seam is not visible
 
 
@@ -62,15 +64,21 @@ def panorama_in_metadata(info: Mapping[str, Any]) -> str | None:
     return None
 
 
+def is_twice_as_wide(width: int, height: int) -> bool:
+    """Whether an image has the size of a panorama of all directions."""
+    return abs(width / max(1, height) / 2 - 1) <= _RATIO_ERROR
+
+
 def shows_all_around(image: Image.Image) -> bool:
     """Whether the pixels are those of an equirectangular panorama of all directions."""
-    if abs(image.width / max(1, image.height) / 2 - 1) > _RATIO_ERROR or image.width < _WIDTH:
+    if not is_twice_as_wide(*image.size) or image.width < _WIDTH:
         return False
-    small = image.convert("L").resize((_WIDTH, _WIDTH // 2), Image.Resampling.BOX)
-    grey = np.asarray(small, np.float32)
-    rows = grey.std(axis=1)
+    narrow = image.convert("L").resize((_WIDTH, image.height), Image.Resampling.BOX)
+    rows = np.asarray(narrow, np.float32).std(axis=1)
     if max(rows[0], rows[-1]) > _POINT * float(np.median(rows)):
         return False
+    small = narrow.resize((_WIDTH, _WIDTH // 2), Image.Resampling.BOX)
+    grey = np.asarray(small, np.float32)
     if min(grey[:, 0].std(), grey[:, -1].std()) < _MIN_CONTRAST:
         return False
     steps = _difference(grey[:, 1:], grey[:, :-1])
