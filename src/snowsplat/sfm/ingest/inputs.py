@@ -28,10 +28,9 @@ from snowsplat.sfm.ingest.panorama import (
     STITCHED,
     is_spherical_video,
     is_twice_as_wide,
-    shows_all_around,
+    spherical_video,
 )
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.photo_files import open_image
 from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.sources import Source, Sources, find_sources
@@ -107,7 +106,7 @@ def gather(
         planned = evenly_spread(planned, options.photos)
     for video in sources.videos:
         if is_spherical_video(video.path):
-            raise _spherical(video.path.name)
+            raise spherical_video(video.path)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
     if in_place:
         _refuse_changes(planned, sources.videos, options)
@@ -200,10 +199,6 @@ def _take_frames(
     max_frames = max_frame_count(clip, options.fps, options.frames)
     frames = extract_frames(clip, frame_folder, max_frames, options.size, report)
     label = source.path.name if not source.name else source.name
-    if frames.kept and all(
-        _is_panorama(frame_folder / frame.name) for frame in (frames.kept[0], frames.kept[-1])
-    ):
-        raise _spherical(label)
     notes += [f"{label}: {line}" for line in frames.notes]
     skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
     return [
@@ -223,20 +218,7 @@ def _take_frames(
     ]
 
 
-def _is_panorama(path: Path) -> bool:
-    with open_image(path) as image:
-        return shows_all_around(image)
-
-
 # Errors
-
-
-def _spherical(video: str) -> UserError:
-    return UserError(
-        f"{video}: is a 360° video, but poses are estimated for lenses that show a part of the "
-        "surroundings; export a flat video of one direction, or frames as panoramas and "
-        f"{CUT_INTO_VIEWS}"
-    )
 
 
 def _check_disk_space(

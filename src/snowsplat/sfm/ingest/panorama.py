@@ -16,6 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import shown
+
 # Reasons why a photo is unusable.
 PANORAMA = "is a 360° panorama"
 STITCHED = "is a stitched panorama"
@@ -89,6 +92,15 @@ def shows_all_around(image: Image.Image) -> bool:
 def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
     """(W,): the mean difference between the columns of two images."""
     return np.asarray(np.abs(first - second).mean(axis=0))
+
+
+def spherical_video(path: Path) -> UserError:
+    """The error to raise for a 360° video."""
+    return UserError(
+        f"{shown(path)}: is a 360° video, but poses are estimated for lenses that show a part of "
+        "the surroundings; export a flat video of one direction, or frames as panoramas and "
+        f"{CUT_INTO_VIEWS}"
+    )
 
 
 def is_spherical_video(path: Path) -> bool:

@@ -37,6 +37,7 @@ from snowsplat.sfm.ingest.fixed_parts import (
 )
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
+from snowsplat.sfm.ingest.panorama import shows_all_around, spherical_video
 from snowsplat.sfm.ingest.photo_files import resized, save, scaled_size
 from snowsplat.sfm.ingest.sharpness import (
     CONTENT_SIDE,
@@ -98,14 +99,17 @@ def extract_frames(
         size: resize larger frames to this longest side in pixels; None keeps the size.
 
     Raises:
-        UserError: no frame can be decoded.
+        UserError: no frame can be decoded, or the video shows all directions.
         OSError: the disk is full.
     """
     import av
 
     frames = Frames()
     name = clip.path.name
-    parts = _fixed_parts(clip)
+    try:
+        parts = _fixed_parts(clip)
+    except (av.FFmpegError, ValueError) as error:
+        raise undecodable(clip.path, error) from None
     crop = parts.crop if parts else None
     fixed = None if parts is None else _cropped(parts.fixed, crop)
     candidates = _Candidates(clip, folder, max_frames, size, crop, fixed)
@@ -258,11 +262,17 @@ def _fixed_parts(clip: Clip) -> FixedParts | None:
     """What is fixed to the frame, found before the frames are chosen, as it would hide the motion.
 
     The copies are not rotated. Only if there are few key frames, all frames are decoded.
+
+    Raises:
+        UserError: the video shows all directions. The rows at its poles would be bars.
     """
     copies = _spread_copies(clip, key_frames=True)
     if len(copies) < _FEW_KEY_FRAMES:
         copies = _spread_copies(clip, key_frames=False)
     same = [copy for copy in copies if copy.shape == copies[0].shape]
+    around = sum(shows_all_around(Image.fromarray(copy)) for copy in same)
+    if around > len(same) / 2:
+        raise spherical_video(clip.path)
     return find_fixed_parts(np.stack(same)) if same else None
 
 
