@@ -97,6 +97,13 @@ def test_page_is_well_formed_and_self_contained(dataset):
     assert "url(" not in text
 
 
+def test_page_says_what_is_fixed_to_the_frame(dataset):
+    known = facts()
+    known["gathered"]["notes"] = ["v <1>.mp4: bars at the left and right: cut off in all frames"]
+    shown = visible_text(write_report(dataset, known))
+    assert "Fixed to the frame: v <1>.mp4: bars at the left and right: cut off" in shown
+
+
 def test_page_reports_the_results(dataset):
     shown = visible_text(write_report(dataset, facts()))
     for expected in (

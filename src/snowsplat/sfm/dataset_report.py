@@ -143,6 +143,9 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
         )
     if without:
         lines.append(f"<p>{without} photos were not used; the reasons are below.</p>")
+    lines += [
+        f"<p>Fixed to the frame: {text(note)}.</p>" for note in facts["gathered"].get("notes", [])
+    ]
     lines += _more_photos(more)
     return "<h2>Your photos</h2>\n" + "\n".join(lines)
 

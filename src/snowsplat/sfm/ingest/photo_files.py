@@ -19,6 +19,7 @@ from PIL import Image, ImageOps
 from snowsplat.data import image_file
 from snowsplat.data.image_file import reason_of
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
+from snowsplat.sfm.ingest.panorama import panorama_in_metadata
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
 # Formats that COLMAP reads, by file extension.
@@ -47,6 +48,7 @@ class Header:
     plain: bool  # 8 bits per channel; grey, RGB, or RGBA in a PNG
     transparent: bool  # has an alpha channel
     exif: ExifInfo
+    panorama: str | None = None  # `PANORAMA` or `STITCHED`, if the metadata say so
 
     @property
     def sideways(self) -> bool:
@@ -108,6 +110,7 @@ def read_header(path: Path) -> Header:
                 exif=read_exif(
                     exif, width, height, _xmp(image), image.info.get("original_orientation")
                 ),
+                panorama=panorama_in_metadata(image.info),
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
