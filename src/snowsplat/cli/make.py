@@ -20,7 +20,17 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.live_page import LivePage
 
 # The flags that the command for resuming repeats, in this order.
-_RESUMED_FLAGS = ("output", "quality", "minutes", "threads", "device", "memory", "port", "host")
+_RESUMED_FLAGS = (
+    "output",
+    "quality",
+    "minutes",
+    "exposure",
+    "threads",
+    "device",
+    "memory",
+    "port",
+    "host",
+)
 
 
 @dataclass
@@ -56,6 +66,11 @@ class Make:
     """Finish within this time. If there are too many photos for this time, some of them are used,
     evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
     counted, and its training resumes with the time that remained."""
+    exposure: Annotated[
+        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default="auto")
+    ] = None
+    """Whether to learn a gain for each photo and colour channel, for photos with different
+    exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
@@ -82,6 +97,7 @@ class Make:
             quality=self.quality,
             minutes=self.minutes,
             memory=self.memory,
+            exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
         )
         page = PageFlags(self.port, self.host).page(self.view)

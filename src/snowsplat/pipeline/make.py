@@ -38,7 +38,8 @@ from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
-from snowsplat.training.settings.declare import Settings
+from snowsplat.training.settings.config import AutoOnOff, TrainConfig
+from snowsplat.training.settings.declare import Settings, same
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
@@ -46,7 +47,9 @@ from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
 RECORD = "make.json"
-HOLD_OUT = 8
+# Every 8th photo is held out, from the fifth on. The first photo of a walk is at its end: it shows
+# places that no other photo shows, so it says little about the scene.
+HOLD_OUT, FIRST_HELD_OUT = 8, 4
 # The fields of a preset that affect the training.
 _TRAINING_FIELDS = (
     "side",
@@ -80,6 +83,7 @@ class MakeOptions(Settings):
             Stages that an earlier run has finished are not counted. A resumed training run has the
             time that was left at its interruption.
         memory: memory limit of the training; see `TrainOptions`.
+        exposure: whether to learn a gain for each photo and channel; see ``TrainConfig.exposure``.
         compute: device and threads.
 
     Raises:
@@ -89,6 +93,7 @@ class MakeOptions(Settings):
     quality: Quality | None = None
     minutes: float | None = option.minutes()
     memory: int | str | None = option.memory()
+    exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
     compute: Compute = field(default_factory=Compute)
 
 
@@ -272,6 +277,11 @@ class _Job:
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
         else:
             settings |= {"minutes": self.options.minutes}
+        settings |= {
+            "hold_out": HOLD_OUT,
+            "first_held_out": FIRST_HELD_OUT,
+            "exposure": self.options.exposure,
+        }
         folder = OutputFolder(self.out / SCENE)
         outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
         scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
@@ -343,18 +353,17 @@ class _Job:
         return result | {"views": len(metrics["views"])}
 
     def _new_training(self, options: TrainOptions) -> TrainOptions:
+        settings: dict[str, Any] = {
+            "leave_out_after": _LEAVE_OUT_AFTER,
+            "exposure": self.options.exposure,
+        }
+        options = replace(options, hold_out=HOLD_OUT, first_held_out=FIRST_HELD_OUT)
         if self.options.minutes is not None:
             minutes = self._minutes_left(60.0 * self.options.minutes)
-            settings: dict[str, Any] = {"leave_out_after": _LEAVE_OUT_AFTER}
-            return replace(options, hold_out=HOLD_OUT, minutes=minutes, settings=settings)
+            return replace(options, minutes=minutes, settings=settings)
         preset = PRESETS[self.plan.quality]
-        settings = {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
-        return replace(
-            options,
-            hold_out=HOLD_OUT,
-            resolution=_width(self.dataset, preset),
-            settings=settings | {"leave_out_after": _LEAVE_OUT_AFTER},
-        )
+        settings |= {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
+        return replace(options, resolution=_width(self.dataset, preset), settings=settings)
 
     def _minutes_left(self, given: float) -> float:
         """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""
