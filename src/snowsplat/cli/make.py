@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,15 +146,20 @@ class Make:
 
 
 def print_summary(made: MakeResult) -> None:
-    """Print the files of a finished scene, and its quality."""
+    """Print the files of a finished scene, its quality, and the verdict."""
+    aligned = f"colour-aligned PSNR {made.psnr_aligned:.2f} dB"
+    figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
+    if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
+        figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
     print(
         f"\nThe scene, for any viewer:  {made.scene}\n"
         f"Report on camera poses:     {made.dataset_report}\n"
         f"Report on the training:     {made.folder.report}\n"
         f"Rendered test views:        {made.renders}\n"
         f" and held-out photos:       {made.photos}\n"
-        f"Quality of these views:     PSNR {made.psnr:.2f} dB, SSIM {made.ssim:.3f} "
-        f"({made.views} photos)\n"
-        f"Time:                       {duration(made.seconds)}",
-        flush=True,
+        f"Quality of these views:     {figures} ({made.views} photos)\n"
+        f"Time:                       {duration(made.seconds)}"
     )
+    if made.verdict is not None:
+        print("\n" + "\n".join(made.verdict.lines("The scene")))
+    sys.stdout.flush()

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat import ops
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
@@ -106,8 +107,12 @@ class MakeResult:
         folder: the output folder of the training.
         dataset_report: the HTML page about the camera poses.
         renders, photos: folders with the rendered test views and the held-out photos.
-        psnr, ssim: means over the held-out photos; PSNR in dB.
+        psnr, ssim, psnr_aligned: means over the held-out photos; PSNR in dB. If gains of exposure
+            are learnt, the colour-aligned PSNR tells the quality.
         views: number of held-out photos.
+        exposures: whether gains of exposure are learnt.
+        verdict: whether the scene is good, usable or poor, and why; None if it is not known, as for
+            a scene of an earlier version.
         seconds: duration of this call.
     """
 
@@ -118,7 +123,10 @@ class MakeResult:
     photos: Path
     psnr: float
     ssim: float
+    psnr_aligned: float
     views: int
+    exposures: bool
+    verdict: Verdict | None
     seconds: float
 
 
@@ -296,7 +304,10 @@ class _Job:
             photos=target / "gt",
             psnr=scene["psnr"],
             ssim=scene["ssim"],
+            psnr_aligned=scene["psnr_aligned"],
             views=scene["views"],
+            exposures=scene["exposures"],
+            verdict=Verdict.from_json(scene["verdict"]),
             seconds=self._elapsed(),
         )
 
@@ -339,18 +350,22 @@ class _Job:
         )
         same = self.stages.about.get("training") == settings
         if same and checkpoint.exists(folder.checkpoints):
-            resume(folder.path, options, observer=self.observer, page=self.page)
+            trained = resume(folder.path, options, observer=self.observer, page=self.page)
         else:
             shutil.rmtree(folder.path, ignore_errors=True)
             self.stages.about["training"] = settings
             self.stages.save()
             new = self._new_training(options)
-            train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
+            trained = train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
         metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
             shutil.copyfile(folder.scene_path(metrics["iteration"]), temporary)
-        result = {key: metrics[key] for key in ("iteration", "psnr", "ssim")}
-        return result | {"views": len(metrics["views"])}
+        result = {key: metrics[key] for key in ("iteration", "psnr", "ssim", "psnr_aligned")}
+        return result | {
+            "views": len(metrics["views"]),
+            "exposures": (folder.path / "exposure.json").is_file(),
+            "verdict": trained.verdict and trained.verdict.as_json(),
+        }
 
     def _new_training(self, options: TrainOptions) -> TrainOptions:
         settings: dict[str, Any] = {
