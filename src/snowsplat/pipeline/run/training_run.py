@@ -299,7 +299,7 @@ class TrainingRun:
             return None
         views = self.trainer.dataset.train
         used = [view for i, view in enumerate(views) if i not in self.trainer.left_out]
-        pixels = misalignment(gaussians, used, self.out.settings()[1])
+        pixels = misalignment(gaussians, used, self.out.settings()[1], self.trainer.step)
         if pixels is None:
             return None
         return (
@@ -325,7 +325,7 @@ class TrainingRun:
             dataset,
             left_out=left_out,
             spread=_spread(self._mean_exposures()),
-            poses=about_poses,
+            poses=about_poses if self.poses is None else None,  # refined poses are no fault
             capture=recorded_verdict(Path(self.settings.path)),
         )
 
