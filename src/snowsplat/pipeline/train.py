@@ -58,6 +58,9 @@ class TrainOptions(Settings):
             number: the new width in pixels; default: unchanged.
         hold_out: hold out every ``hold_out``-th photo for testing, if the dataset has no split of
             its own; default: none.
+        first_held_out: index of the first of these photos in the order of names; default: 0, as in
+            the papers. There, the first photo of a walk is at its end, where the fewest photos
+            show the scene.
         test_list: a text file with the names of the photos to hold out; replaces ``hold_out``.
         minutes: finish within this time. The number of steps, the size of the photos and the
             maximum number of Gaussians are chosen for this time, unless other options set them. In
@@ -80,6 +83,7 @@ class TrainOptions(Settings):
     images: str | None = None
     resolution: int | None = option.resolution()
     hold_out: int | None = option.hold_out()
+    first_held_out: int | None = option.first_held_out()
     test_list: Path | None = None
     minutes: float | None = option.minutes()
     memory: int | str | None = option.memory()
@@ -109,6 +113,7 @@ class TrainOptions(Settings):
             "hold_out": 8
             if self.hold_out is None and self.test_list is not None
             else self.hold_out,
+            "first_held_out": self.first_held_out,
             "test_list": None if self.test_list is None else str(Path(self.test_list).absolute()),
         }
         settings = before or DatasetSettings(path="")
@@ -384,7 +389,8 @@ def _resumed_dataset(
     def relevant(settings: DatasetSettings) -> tuple[Any, ...]:
         resolution = max(1, settings.resolution)  # -1 is full resolution too
         tests = settings.test_list and Path(settings.test_list).name
-        return settings.images, resolution, settings.hold_out, tests
+        split = settings.hold_out, settings.first_held_out, tests
+        return settings.images, resolution, split
 
     settings = options.dataset_settings(path, meta.dataset)
     if relevant(settings) != relevant(meta.dataset):

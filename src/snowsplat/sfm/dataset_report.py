@@ -15,8 +15,8 @@ from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.placement import Placement, placement_of
+from snowsplat.evaluation import verdict
 from snowsplat.sfm.more_photos import Advice, advice
-from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -27,7 +27,6 @@ REPORT = "dataset_report.html"
 _MAX_THUMBNAILS = 24  # evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
-_MAX_ERROR = 1.5  # pixels; a larger reprojection error is reported. Good models are below 1
 
 _FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}
 _STAGES = {"photos": "reading photos", "poses": "estimating poses", "images": "undistorting"}
@@ -46,7 +45,8 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
 
     Args:
         facts: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
-            an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage.
+            an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage;
+            "problems", what is wrong with single photos, by name; "verdict", a `Verdict`.
 
     Raises:
         UserError: the model in ``sparse/0`` or an image cannot be read.
@@ -60,6 +60,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     placement = placement_of(facts["undistorted"])
     body = [
         _headline(name, facts),
+        _verdict(facts["verdict"]),
         _cards(facts),
         _your_photos(dataset, [photo.name for photo in photos], facts, more),
         _maps(photos, xyz, rgb, more.places, placement),
@@ -71,7 +72,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _next_step(dataset),
     ]
     path = dataset / REPORT
-    write_text(path, page(f"{name} – dataset", body, _STYLE))
+    write_text(path, page(f"{name} – dataset", body, _STYLE + verdict.STYLE))
     return path
 
 
@@ -105,13 +106,12 @@ def _headline(name: str, facts: dict[str, Any]) -> str:
             f'<p class="bad">The photos form {len(sfm["sub_models"])} separate groups ({sizes} '
             "photos); only the largest is used. Take more photos in between to connect them.</p>"
         )
-    error = sfm["reprojection_error"]
-    if error is not None and error > _MAX_ERROR:
-        lines.append(
-            '<p class="bad">The reprojection error is high. Remove photos that are blurred or show '
-            "moving objects, or try another camera model.</p>"
-        )
     return "\n".join(lines)
+
+
+def _verdict(values: dict[str, Any]) -> str:
+    judged = verdict.Verdict.from_json(values)
+    return "" if judged is None else judged.html("the photos")
 
 
 def _cards(facts: dict[str, Any]) -> str:
@@ -131,10 +131,10 @@ def _cards(facts: dict[str, Any]) -> str:
 def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], more: Advice) -> str:
     """What was wrong, and what to do better, for the person who took the photos."""
     lines = []
-    bad = problems(dataset / "images", names)
+    bad = facts["problems"]
     without = len(facts["sfm"]["unregistered"]) + len(facts["gathered"]["skipped"])
-    if not bad and not without:
-        lines.append("<p>All photos are sharp, well exposed, and have a pose.</p>")
+    if not bad:
+        lines.append("<p>No photo is blurred, too dark or too bright.</p>")
     if bad:
         count = f"{len(bad)} of {len(names)} photos"
         lines.append(
