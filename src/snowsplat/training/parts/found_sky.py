@@ -5,9 +5,10 @@ distance, a training run explains it with fog before the cameras. What is very f
 property: all cameras, wherever they are, show the same colour in the same direction.
 
 So the sphere of directions is divided into cells. A cell shows the sky if most of the photos that
-show it, from positions that are far apart, have the same colour there. The parts of a photo near
-points of the dataset show the scene; they are not used. The same photos tell where nothing is: a
-point which several of them would show before the sky is in empty space.
+show it, from positions that are far apart, have the same colour there, if it is above the horizon,
+and if its region is not nearer (`far_regions`): a wall or a ceiling, too, may have one colour. The
+parts of a photo near points of the dataset show the scene; they are not used. The same photos tell
+where nothing is: a point which several of them would show before the sky is in empty space.
 """
 
 from __future__ import annotations
@@ -23,13 +24,16 @@ from torch.nn.functional import max_pool2d
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.orientation import up_direction
 from snowsplat.training.parts.direction_cells import (
     ANGLE,
+    COUNT,
     cells_of,
     directions_of,
     median_of,
     spread_of,
 )
+from snowsplat.training.parts.far_regions import in_far_regions
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 
 #: Distance of the sky from the middle of the cameras, in units of the root mean square of their
@@ -143,36 +147,53 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     depths = torch.cat([sample.depths for sample in samples])
     if not len(depths):
         return None
+    depth = float(depths.median())
     number = torch.tensor([len(sample.cells) for sample in samples])
-    positions = torch.stack([view.camera.position.cpu() for view in views]).to(torch.float32)
+    photo = torch.arange(len(samples)).repeat_interleave(number)
+    cameras = [view.camera for view in dataset.train]
+    origin, _ = _offsets(cameras)
+    positions = torch.stack([view.camera.position.cpu() for view in views])
+    offsets = (positions - origin).to(torch.float32)
     middle = median_of(cell, color)
     same = ((color - middle[cell]).abs() <= _SAME).all(1)
-    shown = torch.bincount(cell, minlength=len(middle))
-    agreeing = torch.bincount(cell[same], minlength=len(middle))
-    spread = spread_of(cell[same], positions.repeat_interleave(number, 0)[same])
+    shown = torch.bincount(cell, minlength=COUNT)
+    agreeing = torch.bincount(cell[same], minlength=COUNT)
     is_sky = (
-        (agreeing >= _FEWEST_VIEWS)
+        _above_the_horizon(cameras)
+        & (agreeing >= _FEWEST_VIEWS)
         & (agreeing >= _LEAST_AGREEMENT * shown)
-        & (spread >= _LEAST_BASELINE * float(depths.median()))
+        & (spread_of(cell[same], offsets[photo[same]]) >= _LEAST_BASELINE * depth)
     )
     confirmed = same & is_sky[cell]
+    if not confirmed.any():
+        return None
+    brighter = torch.cat([sample.brighter for sample in samples])
+    confirmed[confirmed.clone()] = in_far_regions(
+        cell[confirmed], photo[confirmed], color[confirmed], brighter[confirmed], offsets, depth
+    )
     share = float(confirmed.sum()) / max(1, sum(sample.shown for sample in samples))
     if share < _LEAST_SKY:
         return None
-    found = is_sky.nonzero()[:, 0]
+    found = cell[confirmed].unique()
     masks = [
         (sample.camera, sample.mask(part))
         for sample, part in zip(samples, confirmed.split(number.tolist()), strict=True)
     ]
-    cameras = [view.camera for view in dataset.train]
     return Sky(
         directions_of(found),
         middle[found].round().to(torch.uint8),
         share,
-        _offsets(cameras)[0].to(torch.float32),
+        origin.to(torch.float32),
         distance or sky_distance(cameras),
         masks,
     )
+
+
+def _above_the_horizon(cameras: Sequence[Camera]) -> Tensor:
+    """(COUNT,) bool: the cells above the horizon of the cameras."""
+    rotations = torch.stack([camera.cam_from_world[:, :3].cpu() for camera in cameras])
+    up = torch.from_numpy(up_direction(rotations.to(torch.float64).numpy())).to(torch.float32)
+    return directions_of(torch.arange(COUNT)) @ up > 0.0
 
 
 def _offsets(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
@@ -188,6 +209,7 @@ class _Sample:
     Attributes:
         cells: (M,) int64, without those of the scene.
         colors: (M, 3) float32 in 0..255, their mean colours.
+        brighter: (M,) float32: the share of the pixels near points that are darker; 0 without any.
         depths: (P,) of the points that the photo shows.
         shown: the number of all cells that the photo shows.
         pixels: (H, W) int64: the row in ``cells`` of each pixel; -1: the scene.
@@ -197,6 +219,7 @@ class _Sample:
     camera: Camera
     cells: Tensor
     colors: Tensor
+    brighter: Tensor
     depths: Tensor
     shown: int
     pixels: Tensor
@@ -218,17 +241,23 @@ class _Sample:
         scene = torch.zeros(1, 1, height, width)
         scene[0, 0, y[visible], x[visible]] = 1.0
         reach = math.ceil(_AROUND * _PIXELS)
-        used = max_pool2d(scene, 2 * reach + 1, stride=1, padding=reach)[0, 0] == 0.0
+        near = max_pool2d(scene, 2 * reach + 1, stride=1, padding=reach)[0, 0] > 0.0
+        used = ~near
         usable = usable_pixels(photo)
         if usable is not None:
-            used &= usable
+            used, near = used & usable, near & usable
         cells = cells_of(_rays(camera))
         cell, own = cells[used].unique(return_inverse=True)
         total = torch.zeros(len(cell), 3).index_add_(0, own, photo.rgb[used].to(torch.float32))
         pixels = torch.full((height, width), -1).masked_scatter_(used, own)
         colors = total / torch.bincount(own, minlength=len(cell))[:, None]
+        ranks = torch.searchsorted(
+            photo.rgb[near].to(torch.float32).mean(1).sort().values, colors.mean(1)
+        )
+        brighter = ranks / max(1, int(near.sum()))
         plain = (contrast <= _PLAIN).all(1)[0]
-        return _Sample(camera, cell, colors, depth[visible], len(cells.unique()), pixels, plain)
+        shown = len(cells.unique())
+        return _Sample(camera, cell, colors, brighter, depth[visible], shown, pixels, plain)
 
     def mask(self, confirmed: Tensor) -> Tensor:
         """(H, W) bool: the plain pixels of the cells (M,) bool, without those at their borders."""
