@@ -6,8 +6,9 @@ photos show them in the same directions; otherwise, parallax displaces them. So 
 compared as if the region were on a sphere around the cameras, with several radii, the largest one
 infinite: a sweep as in plane-sweep stereo. A region is far if the photos agree best at infinity.
 
-An overcast sky agrees at each radius. It is brighter than what it illuminates. A wall of which the
-same is true would have to be illuminated evenly.
+An overcast sky without any gradient agrees at every radius. But it is brighter than what it
+illuminates, and nothing of the scene is above it. In a room, neither is usual for a wall which is
+illuminated so evenly.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ _RADII = (0.7, 1.0, 1.4, 2.0, 4.0, 8.0)
 #: Photos agree clearly less at a radius up to this one if their residual is this many times as
 #: large, and as well if it is at least this many times as large.
 _NEAR, _CLEARLY, _AS_WELL = 2.0, 1.2, 0.95
-#: Standard deviation of the noise of colours in 0..255. Smaller residuals are not compared.
-_NOISE = 1.0
-#: A bright region is brighter than this share of the scene in the same photos.
-_BRIGHTER = 0.9
+#: Standard deviation of the noise of colours in 0..255, which every residual contains.
+_NOISE = 2.0
+#: A region looks like an overcast sky if at least this share of its observations does.
+_LOOKS_LIKE_SKY = 0.5
 #: Regions of fewer cells show too little of their gradients.
 _FEWEST_CELLS = 16
 #: The offsets of the photos are found in this number of rounds.
@@ -39,7 +40,7 @@ _TURN = torch.tensor([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
 
 
 def in_far_regions(
-    cells: Tensor, photos: Tensor, colors: Tensor, brighter: Tensor, offsets: Tensor, depth: float
+    cells: Tensor, photos: Tensor, colors: Tensor, overcast: Tensor, offsets: Tensor, depth: float
 ) -> Tensor:
     """Which of M observations, each of a cell in a photo, are of regions that are very far away.
 
@@ -47,7 +48,7 @@ def in_far_regions(
         cells: (M,) int64.
         photos: (M,) int64.
         colors: (M, 3) float32 in 0..255.
-        brighter: (M,) float32: the share of the scene in the same photo that is darker.
+        overcast: (M,) bool: whether it looks like an overcast sky.
         offsets: (V, 3) float32: the positions of the cameras of all photos, relative to the middle
             of the cameras.
         depth: the median depth of the points, in the same unit.
@@ -69,10 +70,9 @@ def in_far_regions(
         best = torch.minimum(best, found)
         if radius <= _NEAR:
             best_near = torch.minimum(best_near, found)
-    brightness = _means(region, brighter[:, None], len(far))[:, 0]
-    size = torch.bincount(region_of_cell)
-    decided = (far * _CLEARLY <= best_near) | (brightness >= _BRIGHTER)
-    known = best_near.isfinite() & (size >= _FEWEST_CELLS)
+    looks_so = _means(region, overcast[:, None].to(torch.float32), len(far))[:, 0]
+    decided = (far * _CLEARLY <= best_near) | (looks_so >= _LOOKS_LIKE_SKY)
+    known = best_near.isfinite() & (torch.bincount(region_of_cell) >= _FEWEST_CELLS)
     return (known & decided & (far * _AS_WELL <= best))[region]
 
 

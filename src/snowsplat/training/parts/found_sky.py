@@ -52,6 +52,8 @@ _PIXELS = 2.0
 _FINE, _PLAIN = 4, 60.0
 #: The parts of a photo within this number of cells around a point show the scene.
 _AROUND = 1.5
+#: An overcast sky is brighter than this share of the scene in the same photo.
+_DARKER = 0.8
 #: The colours of two photos are the same if they differ by at most this, in 0..255.
 _SAME = 20.0
 #: A cell needs this number of photos, and this share of those that show it, of the same colour.
@@ -141,7 +143,9 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     views = dataset.train[:: math.ceil(len(dataset.train) / _VIEWS)]
     points = dataset.points.xyz.cpu()
     points = points[:: max(1, len(points) // _POINTS)]
-    samples = [_Sample.of(view, images, points) for view in views]
+    cameras = [view.camera for view in dataset.train]
+    up = _up(cameras)
+    samples = [_Sample.of(view, images, points, up) for view in views]
     cell = torch.cat([sample.cells for sample in samples])
     color = torch.cat([sample.colors for sample in samples])
     depths = torch.cat([sample.depths for sample in samples])
@@ -150,7 +154,6 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     depth = float(depths.median())
     number = torch.tensor([len(sample.cells) for sample in samples])
     photo = torch.arange(len(samples)).repeat_interleave(number)
-    cameras = [view.camera for view in dataset.train]
     origin, _ = _offsets(cameras)
     positions = torch.stack([view.camera.position.cpu() for view in views])
     offsets = (positions - origin).to(torch.float32)
@@ -159,7 +162,7 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     shown = torch.bincount(cell, minlength=COUNT)
     agreeing = torch.bincount(cell[same], minlength=COUNT)
     is_sky = (
-        _above_the_horizon(cameras)
+        (directions_of(torch.arange(COUNT)) @ up > 0.0)
         & (agreeing >= _FEWEST_VIEWS)
         & (agreeing >= _LEAST_AGREEMENT * shown)
         & (spread_of(cell[same], offsets[photo[same]]) >= _LEAST_BASELINE * depth)
@@ -167,9 +170,9 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     confirmed = same & is_sky[cell]
     if not confirmed.any():
         return None
-    brighter = torch.cat([sample.brighter for sample in samples])
+    overcast = torch.cat([sample.overcast for sample in samples])
     confirmed[confirmed.clone()] = in_far_regions(
-        cell[confirmed], photo[confirmed], color[confirmed], brighter[confirmed], offsets, depth
+        cell[confirmed], photo[confirmed], color[confirmed], overcast[confirmed], offsets, depth
     )
     share = float(confirmed.sum()) / max(1, sum(sample.shown for sample in samples))
     if share < _LEAST_SKY:
@@ -189,11 +192,10 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     )
 
 
-def _above_the_horizon(cameras: Sequence[Camera]) -> Tensor:
-    """(COUNT,) bool: the cells above the horizon of the cameras."""
+def _up(cameras: Sequence[Camera]) -> Tensor:
+    """(3,) float32, a unit vector: away from the ground."""
     rotations = torch.stack([camera.cam_from_world[:, :3].cpu() for camera in cameras])
-    up = torch.from_numpy(up_direction(rotations.to(torch.float64).numpy())).to(torch.float32)
-    return directions_of(torch.arange(COUNT)) @ up > 0.0
+    return torch.from_numpy(up_direction(rotations.to(torch.float64).numpy())).to(torch.float32)
 
 
 def _offsets(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
@@ -209,7 +211,8 @@ class _Sample:
     Attributes:
         cells: (M,) int64, without those of the scene.
         colors: (M, 3) float32 in 0..255, their mean colours.
-        brighter: (M,) float32: the share of the pixels near points that are darker; 0 without any.
+        overcast: (M,) bool: cells that are brighter than most of the scene, and have none of it
+            above.
         depths: (P,) of the points that the photo shows.
         shown: the number of all cells that the photo shows.
         pixels: (H, W) int64: the row in ``cells`` of each pixel; -1: the scene.
@@ -219,14 +222,14 @@ class _Sample:
     camera: Camera
     cells: Tensor
     colors: Tensor
-    brighter: Tensor
+    overcast: Tensor
     depths: Tensor
     shown: int
     pixels: Tensor
     plain: Tensor
 
     @staticmethod
-    def of(view: View, images: Photos, points: Tensor) -> _Sample:
+    def of(view: View, images: Photos, points: Tensor, up: Tensor) -> _Sample:
         scale = min(1.0, _PIXELS / ANGLE / max(view.camera.fx, view.camera.fy))
         width, height = (
             max(1, round(scale * side)) for side in (view.camera.width, view.camera.height)
@@ -251,18 +254,32 @@ class _Sample:
         total = torch.zeros(len(cell), 3).index_add_(0, own, photo.rgb[used].to(torch.float32))
         pixels = torch.full((height, width), -1).masked_scatter_(used, own)
         colors = total / torch.bincount(own, minlength=len(cell))[:, None]
-        ranks = torch.searchsorted(
-            photo.rgb[near].to(torch.float32).mean(1).sort().values, colors.mean(1)
-        )
-        brighter = ranks / max(1, int(near.sum()))
+        scene_light = photo.rgb[near].to(torch.float32).mean(1).sort().values
+        darker = torch.searchsorted(scene_light, colors.mean(1))
+        overcast = (darker > _DARKER * len(scene_light)) & _is_open(cell, cells[near], up)
         plain = (contrast <= _PLAIN).all(1)[0]
         shown = len(cells.unique())
-        return _Sample(camera, cell, colors, brighter, depth[visible], shown, pixels, plain)
+        return _Sample(camera, cell, colors, overcast, depth[visible], shown, pixels, plain)
 
     def mask(self, confirmed: Tensor) -> Tensor:
         """(H, W) bool: the plain pixels of the cells (M,) bool, without those at their borders."""
         sky = torch.cat([confirmed, torch.zeros(1, dtype=torch.bool)])[self.pixels] & self.plain
         return max_pool2d((~sky)[None, None].float(), 3, stride=1, padding=1)[0, 0] == 0.0
+
+
+def _is_open(cells: Tensor, scene: Tensor, up: Tensor) -> Tensor:
+    """(M,) bool: the cells (M,) that have none of the cells ``scene`` (S,) above."""
+    east, north = torch.linalg.svd(up[None])[2][1:]
+
+    def azimuth_and_height(cells: Tensor) -> tuple[Tensor, Tensor]:
+        directions = directions_of(cells)
+        azimuth = torch.atan2(directions @ north, directions @ east) + math.pi
+        return (azimuth / (2.0 * ANGLE)).long(), directions @ up
+
+    highest = torch.full((math.ceil(math.pi / ANGLE) + 1,), -torch.inf)
+    highest.scatter_reduce_(0, *azimuth_and_height(scene), "amax")
+    azimuth, height = azimuth_and_height(cells)
+    return height > highest[azimuth]
 
 
 def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
