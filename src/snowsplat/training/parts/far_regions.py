@@ -1,8 +1,8 @@
 """`in_far_regions`: which regions of the sphere of directions are much farther away than the scene.
 
-A wall of one colour, too, has the same colour in the same direction, wherever the camera is. But the
-light falls off along a wall, and a sky has clouds and gradients. If a region is very far away, all
-photos show them in the same directions; otherwise, parallax displaces them. So the photos are
+A wall of one colour, too, has the same colour in the same direction, wherever the camera is. But
+the light falls off along a wall, and a sky has clouds and gradients. If a region is very far away,
+all photos show them in the same directions; otherwise, parallax displaces them. So the photos are
 compared as if the region were on a sphere around the cameras, with several radii, the largest one
 infinite: a sweep as in plane-sweep stereo. A region is far if the photos agree best at infinity.
 
@@ -33,7 +33,7 @@ _FEWEST_CELLS = 16
 #: The offsets of the photos are found in this number of rounds.
 _ROUNDS = 5
 #: The residual at a radius is known if at least this share of the colours can be compared there.
-_LEAST_OVERLAP = 0.1
+_LEAST_OVERLAP = 0.3
 #: A rotation by 60°. Colours have been found to be the same within cells; those of the sweep are
 #: turned, so that infinity has no advantage.
 _TURN = torch.tensor([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3.0
