@@ -24,6 +24,9 @@ _RADII = (0.7, 1.0, 1.4, 2.0, 4.0, 8.0)
 #: Photos agree clearly less at a radius up to this one if their residual is this many times as
 #: large, and as well if it is at least this many times as large.
 _NEAR, _CLEARLY, _AS_WELL = 2.0, 1.2, 0.95
+#: The largest residual of photos that agree, in 0..255. The colours of foliage and gravel are the
+#: same in some directions by chance; their residual is about 10.
+_AGREE = 6.0
 #: Standard deviation of the noise of colours in 0..255, which every residual contains.
 _NOISE = 2.0
 #: A region looks like an overcast sky if at least this share of its observations does.
@@ -71,9 +74,10 @@ def in_far_regions(
         if radius <= _NEAR:
             best_near = torch.minimum(best_near, found)
     looks_so = _means(region, overcast[:, None].to(torch.float32), len(far))[:, 0]
+    agree = (far <= _AGREE) & (far * _AS_WELL <= best)
     decided = (far * _CLEARLY <= best_near) | (looks_so >= _LOOKS_LIKE_SKY)
     known = best_near.isfinite() & (torch.bincount(region_of_cell) >= _FEWEST_CELLS)
-    return (known & decided & (far * _AS_WELL <= best))[region]
+    return (known & agree & decided)[region]
 
 
 def _distances(origins: Tensor, directions: Tensor, radius: float) -> Tensor:

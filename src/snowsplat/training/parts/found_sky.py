@@ -52,6 +52,8 @@ _PIXELS = 2.0
 _FINE, _PLAIN = 4, 60.0
 #: The parts of a photo within this number of cells around a point show the scene.
 _AROUND = 1.5
+#: Sine of the error of the horizon, which is that of the up direction of the cameras: 5°.
+_BELOW_THE_HORIZON = 0.09
 #: An overcast sky is brighter than this share of the scene in the same photo.
 _DARKER = 0.8
 #: The colours of two photos are the same if they differ by at most this, in 0..255.
@@ -162,7 +164,7 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     shown = torch.bincount(cell, minlength=COUNT)
     agreeing = torch.bincount(cell[same], minlength=COUNT)
     is_sky = (
-        (directions_of(torch.arange(COUNT)) @ up > 0.0)
+        (directions_of(torch.arange(COUNT)) @ up > -_BELOW_THE_HORIZON)
         & (agreeing >= _FEWEST_VIEWS)
         & (agreeing >= _LEAST_AGREEMENT * shown)
         & (spread_of(cell[same], offsets[photo[same]]) >= _LEAST_BASELINE * depth)
