@@ -62,6 +62,18 @@ def sideways(count: int = 12) -> Walk:
     return _walk(xyz, centres, turns, random, reach=100.0)
 
 
+def zoomed(walk: Walk, zooms: np.ndarray) -> Walk:
+    """``walk`` with photos of other focal lengths: ``zooms`` (N,) times `FOCAL`."""
+    middle = np.array([WIDTH / 2, HEIGHT / 2])
+    pixels = [middle + zoom * (p - middle) for p, zoom in zip(walk.pixels, zooms, strict=True)]
+    inside = [((p > 0) & (p < [WIDTH, HEIGHT])).all(1) for p in pixels]
+    matches = {
+        (i, j): rows[inside[i][rows[:, 0]] & inside[j][rows[:, 1]]]
+        for (i, j), rows in walk.matches.items()
+    }
+    return Walk(walk.centres, pixels, matches)
+
+
 def _walk(
     xyz: np.ndarray,
     centres: np.ndarray,

@@ -192,11 +192,11 @@ def settled(
         return Settled(model, False, [])
     free = refine(copy.deepcopy(model), [], False)
     held = _held(model, photos, lens, known, refine)
-    if _loss(held) <= (1 + _EQUAL_ERROR) * _loss(free) and not _impossible(held, known):
+    if misfit(held) <= (1 + _EQUAL_ERROR) * misfit(free) and not _impossible(held, known):
         return Settled(held, True, [])
     if not _impossible(free, known):
         return Settled(free, False, _doubts(free, known))
-    if _loss(held) <= _MAX_WORSE * _loss(free) and not _impossible(held, known):
+    if misfit(held) <= _MAX_WORSE * misfit(free) and not _impossible(held, known):
         return Settled(held, True, [])
     return Settled(None, False, _doubts(free, known))
 
@@ -245,7 +245,7 @@ def _used(model: pycolmap.Reconstruction) -> list[int]:
     return sorted({model.image(image_id).camera_id for image_id in model.reg_image_ids()})
 
 
-def _loss(model: pycolmap.Reconstruction) -> float:
+def misfit(model: pycolmap.Reconstruction) -> float:
     """The mean reprojection error in pixels / the number of observations.
 
     Bundle adjustment removes observations with large errors. So a model that agrees less well with

@@ -30,6 +30,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.sfm.colmap import camera_groups
 from snowsplat.sfm.colmap.consistency import check_pairs, share_agreeing
 from snowsplat.sfm.colmap.database import (
     fingerprint_of,
@@ -42,7 +43,7 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
-from snowsplat.sfm.colmap.lens import Lens, Refine, exif_focals, settled
+from snowsplat.sfm.colmap.lens import Lens, Refine, camera_ids, exif_focals, settled
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pair_matching import match_pairs
@@ -112,6 +113,7 @@ class PoseEstimation:
         self.lens = Lens(options.camera_model)
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
+        self.zooms = ""  # the focal lengths, if a camera has several, as text for users
         self.log: list[str] = []  # a description of each attempt, as text for users
 
     def run(self, effort: Effort) -> SfmResult:
@@ -144,7 +146,7 @@ class PoseEstimation:
         if best.matched.database == second:
             replace_database(self.folders.database, by=second)
         remove_database(second)
-        return dataclasses.replace(result, doubts=best.doubts)
+        return dataclasses.replace(result, doubts=best.doubts, zooms=self.zooms)
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
         """Make as many attempts as needed; returns the evidence of the last matching.
@@ -163,6 +165,7 @@ class PoseEstimation:
             matched = self._match(first, effort, effort, lens)
             evidence = self._evidence(matched)
             self._try("as configured", matched, mapper, lens)
+        self._try_zooms(matched, mapper, lens, evidence)
         if self._enough(evidence) or (not self._found and evidence.more_effort_is_useless):
             return evidence
         self._try("as configured", matched, "incremental", lens.simple)
@@ -260,6 +263,32 @@ class PoseEstimation:
             f"pixels, {matched.choice.description}, {_MAPPING[mapper]}: "
             f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
         )
+
+    def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> None:
+        """Make attempts with several focal lengths per camera, if one does not fit all photos."""
+        one, models = self.photos, self._best().models
+        if not camera_groups.may_differ(one):
+            return
+        if not self._enough(evidence):
+            pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
+            set_cameras(matched.database, camera_groups.separate(one), pinhole)
+            models = self._mapping(matched, pinhole).run("incremental")
+        focals = camera_groups.own_focals(models[0], self.threads) if models else {}
+        # The second time, with the photos that had no pose before.
+        for _ in range(2):
+            before, several = self.photos, camera_groups.grouped(one, focals)
+            if several is None or camera_ids(several) == camera_ids(before):
+                break
+            self.photos = several
+            self._try("with several focal lengths", matched, mapper, lens)
+            made, best = self.attempts.pop(), self._best()
+            if not made.models or not camera_groups.better(made.models[0], best.models):
+                self.photos = before
+                break
+            self.attempts = [made]  # the other models are bent
+            focals = camera_groups.focals_of(made.models[0])
+            self.zooms = camera_groups.describe(made.models[0])
+        set_cameras(matched.database, self.photos, lens)
 
     def _mapping(self, matched: Matched, lens: Lens) -> Mapping:
         return Mapping(
