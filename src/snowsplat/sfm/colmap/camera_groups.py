@@ -79,7 +79,7 @@ def own_focals(model: pycolmap.Reconstruction, threads: int) -> dict[int, float]
 
 
 def focals_of(model: pycolmap.Reconstruction) -> dict[int, float]:
-    """The focal length in pixels of each photo with a pose and enough points, by image id."""
+    """The focal length of the camera of each photo that has enough points, by image id."""
     images = (model.image(image_id) for image_id in model.reg_image_ids())
     return {
         image.image_id: model.cameras[image.camera_id].mean_focal_length()

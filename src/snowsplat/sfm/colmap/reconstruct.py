@@ -60,7 +60,8 @@ _NEXT_ATTEMPT = 3.0
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
 _MAX_ERROR = 4.0
-
+# Each attempt with several focal lengths has better estimates of them than the one before.
+_ZOOM_ATTEMPTS = 3
 
 _MAPPING = {
     "incremental": "incremental mapping",
@@ -274,8 +275,7 @@ class PoseEstimation:
             set_cameras(matched.database, camera_groups.separate(one), pinhole)
             models = self._mapping(matched, pinhole).run("incremental")
         focals = camera_groups.own_focals(models[0], self.threads) if models else {}
-        # The second time, with the photos that had no pose before.
-        for _ in range(2):
+        for _ in range(_ZOOM_ATTEMPTS):
             before, several = self.photos, camera_groups.grouped(one, focals)
             if several is None or camera_ids(several) == camera_ids(before):
                 break
@@ -286,8 +286,9 @@ class PoseEstimation:
                 self.photos = before
                 break
             self.attempts = [made]  # the other models are bent
-            focals = camera_groups.focals_of(made.models[0])
-            self.zooms = camera_groups.describe(made.models[0])
+            model = made.models[0]
+            focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
+            self.zooms = camera_groups.describe(model)
         set_cameras(matched.database, self.photos, lens)
 
     def _mapping(self, matched: Matched, lens: Lens) -> Mapping:
