@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,9 @@ GUESSED_FOCAL = 0.8
 _MAX_DISPLACEMENT = 0.1
 # An ordinary lens enlarges no part of the photo by more than this factor, compared with its centre.
 _MAX_STRETCH = 1.3
+# An ordinary lens moves pixels outwards or inwards. If it does both ("moustache" distortion), the
+# second one compensates the first one by at most this share of the distance from the centre.
+_MAX_MOUSTACHE = 0.02
 # Two focal lengths agree equally well with the matches if the reprojection errors differ by less
 # than this share. Small systematic errors (rolling shutter, things that move) have this effect.
 _EQUAL_ERROR = 0.05
@@ -49,7 +52,7 @@ class Lens:
 
     Attributes:
         model: a camera model of COLMAP; "auto": OPENCV if enough photos share a camera to determine
-            its eight parameters, else SIMPLE_RADIAL.
+            its eight parameters and ``held`` is false, else SIMPLE_RADIAL.
         held: the focal length is not changed.
         exif: the focal length is that in EXIF, where known.
     """
@@ -59,9 +62,14 @@ class Lens:
     exif: bool = True
 
     @property
-    def simple(self) -> Lens:
-        """A lens with fewer unknown parameters, for photos that do not determine them."""
-        return Lens("SIMPLE_RADIAL" if self.model == "auto" else self.model, True, self.exif)
+    def fixed(self) -> Lens:
+        """The same with a held focal length, for photos that do not determine it."""
+        return replace(self, held=True)
+
+    @property
+    def detailed(self) -> list[str]:
+        """The camera models that `settled` tries, the one with the most parameters first."""
+        return ["auto", "SIMPLE_RADIAL", "SIMPLE_PINHOLE"] if self.model == "auto" else [self.model]
 
     @property
     def description(self) -> str:
@@ -85,7 +93,9 @@ def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
         _, width, height = key
         count = sum(_key(photo) == key for photo in photos)
         model = lens.model
-        if model == "auto":
+        if model == "auto" and lens.held:
+            model = "SIMPLE_RADIAL"
+        elif model == "auto":
             model = "OPENCV" if count >= _MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
         focal = known.get(number, GUESSED_FOCAL * max(width, height))
         camera = pycolmap.Camera.create_from_model_name(number, model, focal, width, height)
@@ -143,6 +153,12 @@ def _implausible_distortion(camera: pycolmap.Camera) -> str:
     if displaced.max() > _MAX_DISPLACEMENT or (displaced - fisheye).min() < -_MAX_DISPLACEMENT:
         worst = max(displaced.min(), displaced.max(), key=abs)
         return f"the lens distortion moves pixels at the border by {worst:.0%}"
+    rise, fall = displaced.max(1) - displaced[:, 0], displaced.max(1) - displaced[:, -1]
+    if np.minimum(rise, fall).max() > _MAX_MOUSTACHE:
+        return (
+            f"the lens distortion moves pixels outwards by {rise.max():.1%}, but those at the "
+            f"border inwards"
+        )
     if slope.max() > _MAX_STRETCH:
         return f"the lens distortion enlarges a part of the photo {slope.max():.1f} times"
     return ""
@@ -171,50 +187,49 @@ class Settled:
     notes: list[str]
 
 
-#: Runs bundle adjustment on a model, changes it and returns it. If cameras are given, the model
-#: gets them before. The last argument: whether the focal length is held.
+#: Gives a model other cameras, runs bundle adjustment, and returns it. The last argument: whether
+#: the focal length is held.
 Refine = Callable[
     [pycolmap.Reconstruction, Sequence[pycolmap.Camera], bool], pycolmap.Reconstruction
 ]
 
 
 def settled(
-    model: pycolmap.Reconstruction, photos: Sequence[Photo], lens: Lens, refine: Refine
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo],
+    lens: Lens,
+    refine: Refine,
 ) -> Settled:
     """Replace a lens in doubt by a possible one.
+
+    A lens that was held during the mapping is always in doubt.
 
     Args:
         model: from the mapper; it is not changed.
         lens: that of the attempt which made ``model``.
     """
-    known = exif_focals(photos)
-    if not lens.held and not _doubts(model, known):
+    known = exif_focals(photos) if lens.exif else {}
+    if not (lens.held or _doubts(model, exif_focals(photos))):
         return Settled(model, False, [])
-    free = refine(copy.deepcopy(model), [], False)
-    held = _held(model, photos, lens, known, refine)
-    if misfit(held) <= (1 + _EQUAL_ERROR) * misfit(free) and not _impossible(held, known):
+
+    def refined(held: bool) -> pycolmap.Reconstruction:
+        """With the most detailed lens that is possible; if there is none, with the last one."""
+        for name in lens.detailed:
+            cameras = cameras_of(photos, Lens(name, exif=lens.exif))
+            made = refine(copy.deepcopy(model), cameras, held)
+            if not _impossible(made, known):
+                break
+        return made
+
+    free, held = refined(False), refined(True)
+    ratio = misfit(held) / misfit(free)
+    if not _impossible(held, known) and ratio <= 1 + _EQUAL_ERROR:
         return Settled(held, True, [])
     if not _impossible(free, known):
-        return Settled(free, False, _doubts(free, known))
-    if misfit(held) <= _MAX_WORSE * misfit(free) and not _impossible(held, known):
+        return Settled(free, False, _doubts(free, exif_focals(photos)))
+    if not _impossible(held, known) and ratio <= _MAX_WORSE:
         return Settled(held, True, [])
     return Settled(None, False, _doubts(free, known))
-
-
-def _held(
-    model: pycolmap.Reconstruction,
-    photos: Sequence[Photo],
-    lens: Lens,
-    known: Mapping[int, float],
-    refine: Refine,
-) -> pycolmap.Reconstruction:
-    """``model`` with a held focal length; with a simpler lens if the distortion is impossible."""
-    for name in (lens.model, lens.simple.model, "SIMPLE_PINHOLE"):
-        begin = cameras_of(photos, Lens(name, True, lens.exif))
-        made = refine(copy.deepcopy(model), begin, True)
-        if not _impossible(made, known):
-            break
-    return made
 
 
 def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import pycolmap
 
-from snowsplat.sfm.colmap.database import count_rows
+from snowsplat.sfm.colmap.database import closing_database, count_rows
 from snowsplat.sfm.colmap.feature_alignment import align_features
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.incremental import IncrementalMapper
@@ -140,6 +140,9 @@ class Mapping:
 
     def add_points(self, model: pycolmap.Reconstruction) -> None:
         """Add points that only two photos of ``model`` see, for the training. Changes ``model``."""
+        with closing_database(self.database) as database:  # they may have another camera model now
+            for camera in model.cameras.values():
+                database.update_camera(camera)
         mapper = self._mapper(ViewGraph.read(self.database), relaxed=False)
         mapper.triangulate_pairs(model)
         self._remove_outliers(model, _MIN_POINTS_ALIGNED)

@@ -1,7 +1,7 @@
 """Estimates camera poses from photos, in up to seven attempts with increasing effort.
 
     1  features, pairs and mapper as configured
-    2  the same matches; the focal length is held, and the camera may move forward (`Lens.simple`)
+    2  the same matches; the focal length is held, and the camera may move forward (`Lens.fixed`)
     3  the same matches, registered in COLMAP's own order
     4  the same features, more pairs; weaker matches are accepted
     5  twice as many features, from larger photos; about 4 times the work of the first attempt
@@ -169,7 +169,7 @@ class PoseEstimation:
         self._try_zooms(matched, mapper, lens, evidence)
         if self._enough(evidence) or (not self._found and evidence.more_effort_is_useless):
             return evidence
-        self._try("as configured", matched, "incremental", lens.simple)
+        self._try("as configured", matched, "incremental", lens.fixed)
         if not self._enough(evidence):
             self._try("as configured", matched, "plain", lens)
         if self._enough(evidence):
@@ -183,7 +183,7 @@ class PoseEstimation:
             how = "with more features, from larger photos"
             self._try(how, matched, mapper, lens, True)
             if not self._enough(evidence):
-                self._try(how, matched, "incremental", lens.simple)
+                self._try(how, matched, "incremental", lens.fixed)
         if not self._enough(evidence) and not evidence.flat:
             other: Mapper = "incremental" if mapper == "global" else "global"
             self._try("with the other mapper", matched, other, lens, True)
