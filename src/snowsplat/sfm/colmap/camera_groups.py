@@ -110,6 +110,15 @@ def grouped(photos: Sequence[Photo], focals: Mapping[int, float]) -> list[Photo]
     return None if made == list(photos) else made
 
 
+def by_camera(photos: Sequence[Photo], focals: Mapping[int, float]) -> dict[int, float]:
+    """The median focal length of the photos of each camera; ``focals`` as in `grouped`."""
+    values: dict[int, list[float]] = {}
+    for i, camera in enumerate(camera_ids(photos)):
+        if i + 1 in focals:
+            values.setdefault(camera, []).append(focals[i + 1])
+    return {camera: float(np.median(known)) for camera, known in values.items()}
+
+
 def better(model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> bool:
     """Whether ``model`` is better than the first of ``others``, which has other cameras.
 

@@ -166,7 +166,7 @@ class PoseEstimation:
             matched = self._match(first, effort, effort, lens)
             evidence = self._evidence(matched)
             self._try("as configured", matched, mapper, lens)
-        self._try_zooms(matched, mapper, lens, evidence)
+        lens = self._try_zooms(matched, mapper, lens, evidence)
         if self._enough(evidence) or (not self._found and evidence.more_effort_is_useless):
             return evidence
         self._try("as configured", matched, "incremental", lens.fixed)
@@ -265,11 +265,14 @@ class PoseEstimation:
             f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
         )
 
-    def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> None:
-        """Make attempts with several focal lengths per camera, if one does not fit all photos."""
+    def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> Lens:
+        """Make attempts with several focal lengths per camera, if one does not fit all photos.
+
+        Returns the lens of further attempts.
+        """
         one, models = self.photos, self._best().models
         if not camera_groups.may_differ(one):
-            return
+            return lens
         if not self._enough(evidence):
             pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
             set_cameras(matched.database, camera_groups.separate(one), pinhole)
@@ -280,16 +283,18 @@ class PoseEstimation:
             if several is None or camera_ids(several) == camera_ids(before):
                 break
             self.photos = several
-            self._try("with several focal lengths", matched, mapper, lens)
+            begin = dataclasses.replace(lens, focals=camera_groups.by_camera(several, focals))
+            self._try("with several focal lengths", matched, mapper, begin)
             made, best = self.attempts.pop(), self._best()
             if not made.models or not camera_groups.better(made.models[0], best.models):
                 self.photos = before
                 break
-            self.attempts = [made]  # the other models are bent
+            self.attempts, lens = [made], begin  # the other models are bent
             model = made.models[0]
             focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
             self.zooms = camera_groups.describe(model)
         set_cameras(matched.database, self.photos, lens)
+        return lens
 
     def _mapping(self, matched: Matched, lens: Lens) -> Mapping:
         return Mapping(
