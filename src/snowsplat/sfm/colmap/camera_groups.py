@@ -136,9 +136,11 @@ def better(model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruct
 
 
 def describe(model: pycolmap.Reconstruction) -> str:
-    """The focal lengths of the cameras of ``model``, as text for users."""
+    """The focal lengths of the cameras of ``model``, as text for users; empty: only one."""
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     distinct = sorted({round(model.cameras[i.camera_id].mean_focal_length()) for i in images})
+    if len(distinct) < 2:
+        return ""
     if len(distinct) > _NAMED:
         return f"focal lengths from {distinct[0]} to {distinct[-1]} pixels"
     return f"focal lengths of {', '.join(map(str, distinct[:-1]))} and {distinct[-1]} pixels"

@@ -8,6 +8,9 @@
     6  these, with a held focal length
     7  the other mapper, with the existing matches
 
+After the first three, bundle adjustment shows whether one focal length fits all photos of a camera.
+If not, the attempt is made with several, which remain for the others (`camera_groups`).
+
 The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
 are verified again without it.
 
@@ -107,14 +110,13 @@ class PoseEstimation:
         progress: WorkerProgress,
     ) -> None:
         self.folders = folders
-        self.photos = photos
+        self.photos = photos  # `_try_zooms` may change their groups
         self.options = options
         self.threads = threads
         self.progress = progress
         self.lens = Lens(options.camera_model)
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
-        self.zooms = ""  # the focal lengths, if a camera has several, as text for users
         self.log: list[str] = []  # a description of each attempt, as text for users
 
     def run(self, effort: Effort) -> SfmResult:
@@ -125,6 +127,7 @@ class PoseEstimation:
         """
         shutil.rmtree(self.folders.sparse, ignore_errors=True)
         second = self.folders.distorted / "database_strong.db"
+        given = self.photos
         evidence = self._make_attempts(effort, second)
         best = self._best()
         if not best.models:
@@ -147,7 +150,8 @@ class PoseEstimation:
         if best.matched.database == second:
             replace_database(self.folders.database, by=second)
         remove_database(second)
-        return dataclasses.replace(result, doubts=best.doubts, zooms=self.zooms)
+        zooms = "" if self.photos is given else camera_groups.describe(best.models[0])
+        return dataclasses.replace(result, doubts=best.doubts, zooms=zooms)
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
         """Make as many attempts as needed; returns the evidence of the last matching.
@@ -166,12 +170,13 @@ class PoseEstimation:
             matched = self._match(first, effort, effort, lens)
             evidence = self._evidence(matched)
             self._try("as configured", matched, mapper, lens)
-        lens = self._try_zooms(matched, mapper, lens, evidence)
-        if self._enough(evidence) or (not self._found and evidence.more_effort_is_useless):
+        if not self._found and evidence.more_effort_is_useless:
             return evidence
-        self._try("as configured", matched, "incremental", lens.fixed)
+        if not self._enough(evidence):
+            self._try("as configured", matched, "incremental", lens.fixed)
         if not self._enough(evidence):
             self._try("as configured", matched, "plain", lens)
+        lens = self._try_zooms(matched, mapper, lens, evidence)
         if self._enough(evidence):
             return evidence
         if not (self._found and evidence.matched_all):
@@ -292,7 +297,6 @@ class PoseEstimation:
             self.attempts, lens = [made], begin  # the other models are bent
             model = made.models[0]
             focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
-            self.zooms = camera_groups.describe(model)
         set_cameras(matched.database, self.photos, lens)
         return lens
 
