@@ -10,6 +10,7 @@ import pytest
 from snowsplat.sfm.colmap.camera_groups import (
     better,
     describe,
+    focals_of,
     grouped,
     own_focals,
     separate,
@@ -79,19 +80,22 @@ def test_photos_of_one_zoom_keep_their_camera(tmp_path, walk):
         assert database.num_cameras() == 1
 
 
-def test_the_focal_lengths_of_one_zoom_agree(tmp_path):
-    model = mapped(tmp_path, WALK)
+def test_photos_of_one_zoom_gain_nothing_from_focal_lengths_of_their_own(tmp_path):
+    assert own_focals(mapped(tmp_path, WALK), 1) == {}
+
+
+def test_bundle_adjustment_finds_the_focal_lengths_of_a_bent_model(tmp_path):
+    model = mapped(tmp_path, walks.zoomed(WALK, np.tile([1.0, 1.15], 6)))
     focals = own_focals(model, 1)
     assert len(focals) == model.num_reg_images()
-    np.testing.assert_allclose(list(focals.values()), walks.FOCAL, rtol=0.02)
-    assert grouped(WALK.photos(None), focals) is None
+    ratios = [focals[i] / focals[i + 1] for i in focals if i + 1 in focals and i % 2]
+    np.testing.assert_allclose(ratios, 1 / 1.15, rtol=0.04)
 
 
 def test_each_photo_of_a_slow_zoom_gets_a_camera(tmp_path):
     zooms = np.geomspace(1.0, 1.5, 12)
     walk = walks.zoomed(WALK, zooms)
-    model = mapped(tmp_path, walk, separate)
-    focals = own_focals(model, 1)
+    focals = focals_of(mapped(tmp_path, walk, separate))
     found = [focals[i + 1] for i in range(12)]
     np.testing.assert_allclose(found, walks.FOCAL * zooms, rtol=0.03)
     assert len(set(camera_ids(grouped(walk.photos(None), focals)))) == 12

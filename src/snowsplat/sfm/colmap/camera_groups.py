@@ -62,7 +62,8 @@ def own_focals(model: pycolmap.Reconstruction, threads: int) -> dict[int, float]
     changed.
 
     Returns:
-        image id -> focal length in pixels, of photos that have a pose and enough points.
+        image id -> focal length in pixels, of photos that have a pose and enough points. Empty: the
+        focal lengths of ``model`` agree nearly as well with the matches.
     """
     part = _with_separate_cameras(model)
     part.update_point_3d_errors()
@@ -73,9 +74,12 @@ def own_focals(model: pycolmap.Reconstruction, threads: int) -> dict[int, float]
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.function_tolerance = 1e-4
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = part.compute_mean_reprojection_error()
+    before = part.compute_mean_reprojection_error()
+    options.ceres.loss_function_scale = before
     pycolmap.bundle_adjustment(part, options)
-    return focals_of(part)
+    part.update_point_3d_errors()
+    gain = 1 - part.compute_mean_reprojection_error() / before if before else 0.0
+    return focals_of(part) if gain > _MIN_GAIN else {}
 
 
 def focals_of(model: pycolmap.Reconstruction) -> dict[int, float]:

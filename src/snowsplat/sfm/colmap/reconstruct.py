@@ -275,14 +275,16 @@ class PoseEstimation:
 
         Returns the lens of further attempts.
         """
-        one, models = self.photos, self._best().models
+        one, best = self.photos, self._best()
         if not camera_groups.may_differ(one):
             return lens
         if not self._enough(evidence):
             pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
             set_cameras(matched.database, camera_groups.separate(one), pinhole)
             models = self._mapping(matched, pinhole).run("incremental")
-        focals = camera_groups.own_focals(models[0], self.threads) if models else {}
+            focals = camera_groups.focals_of(models[0]) if models else {}
+        else:
+            focals = camera_groups.own_focals(best.models[0], self.threads)
         for _ in range(_ZOOM_ATTEMPTS):
             before, several = self.photos, camera_groups.grouped(one, focals)
             if several is None or camera_ids(several) == camera_ids(before):
