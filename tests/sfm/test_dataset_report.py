@@ -188,6 +188,12 @@ def test_problems_are_reported(dataset):
     assert "groups" not in without_problems
 
 
+def test_several_focal_lengths_of_a_camera_are_said(dataset):
+    zooms = "focal lengths of 455 and 727 pixels"
+    assert f"The photos have {zooms}" in visible_text(write_report(dataset, facts(zooms=zooms)))
+    assert "The photos have" not in visible_text(write_report(dataset, facts()))
+
+
 def test_long_lists_are_shortened_and_any_name_is_accepted(dataset):
     lost = {f"p{i}\udcff\x07.jpg": "blurred" for i in range(900)}
     page = write_report(dataset, facts(unregistered=lost, reprojection_error=None))

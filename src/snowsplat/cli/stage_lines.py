@@ -40,6 +40,8 @@ def _poses(sfm: dict[str, Any]) -> list[str]:
             f"the photos form {len(sfm['sub_models'])} groups without common points ({sizes} "
             "photos); the largest group is used"
         )
+    if sfm.get("zooms"):
+        details.append(f"the photos have {sfm['zooms']}: each group of them has its own lens")
     if len(sfm["attempts"]) > 1:
         details.append("attempts: " + "; ".join(sfm["attempts"]))
     return [line, *details, *_listed([f"{name}: {why}" for name, why in lost.items()])]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _maps(photos, xyz, rgb, more.places, placement),
         _placed(placement),
         _strip(dataset, [photo.name for photo in photos]),
-        _lenses(facts["sfm"]["cameras"], facts["undistorted"]),
+        _lenses(facts["sfm"], facts["undistorted"]),
         _left_out(facts),
         _timing(facts),
         _next_step(dataset),
@@ -242,9 +242,9 @@ def _thumbnail(path: Path) -> Image.Image:
     return small
 
 
-def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> str:
+def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     rows = []
-    for camera in cameras:
+    for camera in sfm["cameras"]:
         width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
         # The angle of view of a pinhole camera; that of the distorted lens differs a little.
         angle = math.degrees(2 * math.atan(max(width, height) / 2 / focal)) if focal > 0 else 0.0
@@ -260,7 +260,12 @@ def _lenses(cameras: Iterable[dict[str, Any]], undistorted: dict[str, Any]) -> s
     sizes = ", ".join(f"{w} × {h}" for w, h, *_ in undistorted["sizes"])
     how = "undistorted" if undistorted["resampled"] else "copied, as there is no distortion"
     lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
-    return f'<h2>Lenses</h2>\n{lenses}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
+    zooms = sfm.get("zooms", "")
+    said = f"<p>The photos have {text(zooms)}, so each group of them has its own lens.</p>\n"
+    return (
+        f"<h2>Lenses</h2>\n{said if zooms else ''}{lenses}\n"
+        f'<p class="soft">Images for training: {sizes}, {how}.</p>'
+    )
 
 
 def _left_out(facts: dict[str, Any]) -> str:

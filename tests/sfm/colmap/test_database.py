@@ -1,5 +1,6 @@
 """The COLMAP database: one camera per group, and reuse only if photos and settings are the same."""
 
+import dataclasses
 import sqlite3
 from contextlib import closing
 
@@ -15,6 +16,7 @@ from snowsplat.sfm.colmap.database import (
     open_database,
     read_descriptors,
     replace_database,
+    set_cameras,
     set_names,
     verified_pairs,
 )
@@ -69,6 +71,23 @@ def test_photos_of_a_group_share_a_camera(path):
         True,
     )
     assert zoom.mean_focal_length() == 905
+
+
+def test_photos_change_their_groups(path):
+    add_features(path)
+    alone = [dataclasses.replace(p, group=f"{p.group} {i}") for i, p in enumerate(PHOTOS)]
+    for photos, count in ((alone, len(PHOTOS)), (PHOTOS, 2)):
+        set_cameras(path, photos, Lens("auto"))
+        with closing_database(path) as database:
+            assert database.num_cameras() == database.num_rigs() == count
+            used = {i.camera_id: i for i in database.read_all_images()}
+            assert set(used) == {c.camera_id for c in database.read_all_cameras()}
+            frames = {frame.frame_id: frame for frame in database.read_all_frames()}
+            for image in database.read_all_images():
+                frame = frames[image.image_id]
+                assert frame.rig_id == image.camera_id
+                assert image.data_id in frame.data_ids
+    assert feature_counts(path, len(PHOTOS))[0] == 5
 
 
 def test_features_are_reused_for_the_same_settings_only(path):

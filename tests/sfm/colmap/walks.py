@@ -52,14 +52,26 @@ def forward(count: int = 12, step: float = 1.5) -> Walk:
     return _walk(xyz, centres + 2 * sway, 0.5 * sway, random, reach=25.0)
 
 
-def sideways(count: int = 12) -> Walk:
+def sideways(count: int = 12, points: int = 1500) -> Walk:
     """Past a room, with turns: the photos determine the focal length."""
     random = np.random.default_rng(0)
-    xyz = random.uniform([-6, -2.5, 4], [6, 2.5, 9], (1500, 3))
+    xyz = random.uniform([-6, -2.5, 4], [6, 2.5, 9], (points, 3))
     angle = np.linspace(-0.5, 0.5, count)
     centres = np.stack([6 * np.sin(angle), 0.3 * np.cos(5 * angle), 6 - 6 * np.cos(angle)], 1)
     turns = np.stack([0.1 * np.sin(9 * angle), angle, 0 * angle], 1)
     return _walk(xyz, centres, turns, random, reach=100.0)
+
+
+def zoomed(walk: Walk, zooms: np.ndarray) -> Walk:
+    """``walk`` with photos of other focal lengths: ``zooms`` (N,) times `FOCAL`."""
+    middle = np.array([WIDTH / 2, HEIGHT / 2])
+    pixels = [middle + zoom * (p - middle) for p, zoom in zip(walk.pixels, zooms, strict=True)]
+    inside = [((p > 0) & (p < [WIDTH, HEIGHT])).all(1) for p in pixels]
+    matches = {
+        (i, j): rows[inside[i][rows[:, 0]] & inside[j][rows[:, 1]]]
+        for (i, j), rows in walk.matches.items()
+    }
+    return Walk(walk.centres, pixels, matches)
 
 
 def _walk(

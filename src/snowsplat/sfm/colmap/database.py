@@ -61,10 +61,23 @@ def open_database(path: Path, photos: list[Photo], lens: Lens, fingerprint: str)
 
 
 def set_cameras(path: Path, photos: list[Photo], lens: Lens) -> None:
-    """Replace the cameras in the database by those with which an attempt begins."""
+    """Replace the cameras in the database by those with which an attempt begins.
+
+    The photos may be in other groups than before.
+    """
     with closing_database(path) as database:
-        for camera in cameras_of(photos, lens):
-            database.update_camera(camera)
+        _write_cameras(database, photos, lens)
+    ids = camera_ids(photos)
+    rows = [(camera_id, image_id) for image_id, camera_id in enumerate(ids, start=1)]
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for table, column, key in (
+            ("images", "camera_id", "image_id"),
+            ("frames", "rig_id", "frame_id"),
+            ("frame_data", "sensor_id", "frame_id"),
+        ):
+            connection.executemany(f"UPDATE {table} SET {column} = ? WHERE {key} = ?", rows)
+        for table, column in (("rigs", "rig_id"), ("cameras", "camera_id")):
+            connection.execute(f"DELETE FROM {table} WHERE {column} > ?", (max(ids),))
 
 
 def forget_verification(path: Path) -> None:
@@ -122,14 +135,17 @@ def closing_database(path: Path) -> Iterator[pycolmap.Database]:
 
 
 def fingerprint_of(images: Path, photos: list[Photo], settings: object) -> str:
-    """A hash of all that features and matches depend on: files, settings, versions of libraries."""
+    """A hash of all that features and matches depend on: files, settings, versions of libraries.
+
+    They do not depend on the groups of photos, of which the first is only a guess.
+    """
     files = [(images / photo.name).stat() for photo in photos]
     facts = [
         pycolmap.__version__,
         cv2.__version__,
         repr(settings),
         [
-            [p.name, p.width, p.height, p.group, p.focal, p.mask, s.st_size, s.st_mtime_ns]
+            [p.name, p.width, p.height, p.focal, p.mask, s.st_size, s.st_mtime_ns]
             for p, s in zip(photos, files, strict=True)
         ],
     ]
@@ -151,12 +167,7 @@ def _is_valid(path: Path, fingerprint: str) -> bool:
 
 
 def _write_photos(database: pycolmap.Database, photos: list[Photo], lens: Lens) -> None:
-    for camera in cameras_of(photos, lens):
-        database.write_camera(camera, use_camera_id=True)
-        rig = pycolmap.Rig()
-        rig.rig_id = camera.camera_id
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
+    _write_cameras(database, photos, lens)
     for image_id, (photo, camera_id) in enumerate(
         zip(photos, camera_ids(photos), strict=True), start=1
     ):
@@ -168,6 +179,19 @@ def _write_photos(database: pycolmap.Database, photos: list[Photo], lens: Lens) 
         frame.add_data_id(image.data_id)
         frame.finalize_data_ids()
         database.write_frame(frame, use_frame_id=True)
+
+
+def _write_cameras(database: pycolmap.Database, photos: list[Photo], lens: Lens) -> None:
+    """Write the cameras, each with a rig of the same id, or replace those with the same ids."""
+    for camera in cameras_of(photos, lens):
+        if database.exists_camera(camera.camera_id):
+            database.update_camera(camera)
+        else:
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig()
+            rig.rig_id = camera.camera_id
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
 
 
 def set_names(path: Path, names: list[str]) -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -56,11 +56,14 @@ class Lens:
             its eight parameters and ``held`` is false, else SIMPLE_RADIAL.
         held: the focal length is not changed.
         exif: the focal length is that in EXIF, where known.
+        focals: those with which cameras without EXIF begin, in pixels, by camera id; the others
+            begin with a guess.
     """
 
     model: str = "auto"
     held: bool = False
     exif: bool = True
+    focals: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def fixed(self) -> Lens:
@@ -98,7 +101,8 @@ def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
             model = "SIMPLE_RADIAL"
         elif model == "auto":
             model = "OPENCV" if count >= _MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
-        focal = known.get(number, GUESSED_FOCAL * max(width, height))
+        guess = lens.focals.get(number, GUESSED_FOCAL * max(width, height))
+        focal = known.get(number, guess)
         camera = pycolmap.Camera.create_from_model_name(number, model, focal, width, height)
         camera.has_prior_focal_length = number in known
         cameras.append(camera)
@@ -216,14 +220,14 @@ def settled(
     def refined(held: bool) -> pycolmap.Reconstruction:
         """With the most detailed lens that is possible; if there is none, with the last one."""
         for name in lens.detailed:
-            cameras = cameras_of(photos, Lens(name, exif=lens.exif))
+            cameras = cameras_of(photos, replace(lens, model=name, held=False))
             made = refine(copy.deepcopy(model), cameras, held)
             if not _impossible(made, known):
                 break
         return made
 
     free, held = refined(False), refined(True)
-    ratio = _loss(held) / _loss(free)
+    ratio = misfit(held) / misfit(free)
     if not _impossible(held, known) and ratio <= 1 + _EQUAL_ERROR:
         return Settled(held, True, [])
     if not _impossible(free, known):
@@ -261,7 +265,7 @@ def _used(model: pycolmap.Reconstruction) -> list[int]:
     return sorted({model.image(image_id).camera_id for image_id in model.reg_image_ids()})
 
 
-def _loss(model: pycolmap.Reconstruction) -> float:
+def misfit(model: pycolmap.Reconstruction) -> float:
     """The mean reprojection error in pixels / the number of observations.
 
     Bundle adjustment removes observations with large errors. So a model that agrees less well with

@@ -59,6 +59,8 @@ class SfmResult:
     attempts: list[str]  # a description of each attempt, as text for users, in order
     # What is in doubt about the lenses, as text for users; earlier versions did not have this.
     doubts: list[str] = field(default_factory=list)
+    # The focal lengths, as text for users, if those of photos of one group differ (`Photo.group`).
+    zooms: str = ""
 
 
 @dataclass(frozen=True)

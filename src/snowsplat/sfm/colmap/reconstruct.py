@@ -11,6 +11,9 @@ With further matches:
     7  these, with a held focal length
     8  these, with the other mapper
 
+After the first four, bundle adjustment shows whether one focal length fits all photos of a camera.
+If not, the attempt is made with several, which remain for the others (`camera_groups`).
+
 The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
 are verified again without it.
 
@@ -34,6 +37,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.sfm.colmap import camera_groups
 from snowsplat.sfm.colmap.consistency import agreement_of, check_pairs
 from snowsplat.sfm.colmap.database import (
     fingerprint_of,
@@ -46,7 +50,7 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
-from snowsplat.sfm.colmap.lens import Lens, Refine, exif_focals, settled
+from snowsplat.sfm.colmap.lens import Lens, Refine, camera_ids, exif_focals, settled
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.pair_matching import match_pairs
@@ -66,7 +70,8 @@ _NEXT_ATTEMPT = 3.0
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
 _MAX_ERROR = 4.0
-
+# Each attempt with several focal lengths has better estimates of them than the one before.
+_ZOOM_ATTEMPTS = 3
 
 _MAPPING = {
     "incremental": "incremental mapping",
@@ -113,7 +118,7 @@ class PoseEstimation:
         progress: WorkerProgress,
     ) -> None:
         self.folders = folders
-        self.photos = photos
+        self.photos = photos  # `_try_zooms` may change their groups
         self.options = options
         self.threads = threads
         self.progress = progress
@@ -130,6 +135,7 @@ class PoseEstimation:
         """
         shutil.rmtree(self.folders.sparse, ignore_errors=True)
         second = self.folders.distorted / "database_strong.db"
+        given = self.photos
         evidence = self._make_attempts(effort, second)
         best = self._best()
         if not best.models:
@@ -152,13 +158,14 @@ class PoseEstimation:
         if best.matched.database == second:
             replace_database(self.folders.database, by=second)
         remove_database(second)
+        zooms = "" if self.photos is given else camera_groups.describe(best.models[0])
         doubts = list(best.doubts)
         if best.agreement < _CONSISTENT:
             doubts.append(
                 f"the poses may be bent: {best.agreement:.0%} of the matches between neighbouring "
                 "photos agree with them"
             )
-        return dataclasses.replace(result, doubts=doubts)
+        return dataclasses.replace(result, doubts=doubts, zooms=zooms)
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
         """Make as many attempts as needed; returns the evidence of the last matching.
@@ -177,15 +184,16 @@ class PoseEstimation:
             matched = self._match(first, effort, effort, lens)
             evidence = self._evidence(matched)
             self._try("as configured", matched, mapper, lens)
-        if self._good(evidence) or (not self._found and evidence.more_effort_is_useless):
+        if not self._found and evidence.more_effort_is_useless:
             return evidence
         other: Mapper = "incremental" if mapper == "global" else "global"
-        if not evidence.flat:
+        if not (self._good(evidence) or evidence.flat):
             self._try("as configured", matched, other, lens)
         if not self._good(evidence):
             self._try("as configured", matched, "incremental", lens.fixed)
         if not self._enough(evidence):
             self._try("as configured", matched, "plain", lens)
+        lens = self._try_zooms(matched, mapper, lens, evidence)
         if self._enough(evidence):
             return evidence
         if not (self._found and evidence.matched_all):
@@ -273,6 +281,38 @@ class PoseEstimation:
             f"pixels, {matched.choice.description}, {_MAPPING[mapper]}: "
             f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
         )
+
+    def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> Lens:
+        """Make attempts with several focal lengths per camera, if one does not fit all photos.
+
+        Returns the lens of further attempts.
+        """
+        one, best = self.photos, self._best()
+        if not camera_groups.may_differ(one):
+            return lens
+        if not self._enough(evidence):
+            pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
+            set_cameras(matched.database, camera_groups.separate(one), pinhole)
+            models = self._mapping(matched, pinhole).run("incremental")
+            focals = camera_groups.focals_of(models[0]) if models else {}
+        else:
+            focals = camera_groups.own_focals(best.models[0], self.threads)
+        for _ in range(_ZOOM_ATTEMPTS):
+            before, several = self.photos, camera_groups.grouped(one, focals)
+            if several is None or camera_ids(several) == camera_ids(before):
+                break
+            self.photos = several
+            begin = dataclasses.replace(lens, focals=camera_groups.by_camera(several, focals))
+            self._try("with several focal lengths", matched, mapper, begin)
+            made, best = self.attempts.pop(), self._best()
+            if not made.models or not camera_groups.better(made.models[0], best.models):
+                self.photos = before
+                break
+            self.attempts, lens = [made], begin  # the other models are bent
+            model = made.models[0]
+            focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
+        set_cameras(matched.database, self.photos, lens)
+        return lens
 
     def _mapping(self, matched: Matched, lens: Lens) -> Mapping:
         return Mapping(
