@@ -11,6 +11,7 @@ from snowsplat.sfm.colmap.consistency import (
     CheckedPair,
     _without_bridged_tears,
     agreement,
+    agreement_of,
     find_parts,
     unconfirmed_photos,
 )
@@ -243,3 +244,13 @@ def test_matches_do_not_agree_with_another_pose(two_views):
     turn = pycolmap.Rotation3d(np.array([0, np.radians(20), 0]))
     wrong = pycolmap.Rigid3d(turn * pose.rotation, pose.translation)
     assert agreement(wrong, rays1, rays2, 1e-3) < 0.1
+
+
+def test_agreement_of_a_model_is_that_of_the_strongest_pairs():
+    """Pairs of photos that look alike have fewer matches, which may be false."""
+    right = [CheckedPair(i, i + 1, 300, 250, agreeing=1.0) for i in range(1, 9)]
+    false = [CheckedPair(1, i, 200, 0, agreeing=0.0) for i in range(4, 9)]
+    assert agreement_of(right + false) == 1.0
+    bent = [replace(pair, agreeing=0.8) if pair.first < 5 else pair for pair in right]
+    assert agreement_of(bent + false) == pytest.approx(0.9)
+    assert agreement_of([]) == 0.0

@@ -28,3 +28,20 @@ def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registe
     job.started = time.monotonic() - elapsed
     job.attempts = [SimpleNamespace(registered=registered)]
     assert job._enough(SimpleNamespace(usable=10)) == enough
+
+
+@pytest.mark.parametrize(
+    ("attempts", "good", "best"),
+    [
+        ([(9, 0.99)], True, 0),
+        ([(9, 0.93)], False, 0),  # enough photos, but the model is bent
+        ([(10, 0.93), (10, 0.99)], True, 1),
+        ([(10, 0.93), (4, 0.99)], False, 0),
+    ],
+)
+def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
+    progress = WorkerProgress(silent, lambda *table: None)
+    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, progress)
+    job.attempts = [SimpleNamespace(registered=n, agreement=share) for n, share in attempts]
+    assert job._good(SimpleNamespace(usable=10)) == good
+    assert job._best() is job.attempts[best]
