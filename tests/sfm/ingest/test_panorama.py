@@ -11,7 +11,7 @@ from snowsplat.sfm.ingest.panorama import (
     PANORAMA,
     STITCHED,
     is_spherical_video,
-    panorama_in_metadata,
+    panorama_in_xmp,
     shows_all_around,
 )
 from snowsplat.sfm.progress import silent
@@ -74,14 +74,12 @@ def test_ordinary_photos_twice_as_wide_as_high():
 
 
 def test_metadata_of_panoramas():
-    assert panorama_in_metadata({"xmp": _WHOLE}) == PANORAMA
-    assert panorama_in_metadata({"XML:com.adobe.xmp": _WHOLE.decode()}) == PANORAMA
-    assert panorama_in_metadata({"xmp": _PART}) == STITCHED
+    assert panorama_in_xmp(_WHOLE) == PANORAMA
+    assert panorama_in_xmp(_PART) == STITCHED
     element = b"<GPano:ProjectionType>cylindrical</GPano:ProjectionType>"
-    assert panorama_in_metadata({"xmp": element}) == STITCHED
-    assert panorama_in_metadata({"xmp": _XMP % b'GPano:UsePanoramaViewer="False"'}) is None
-    assert panorama_in_metadata({"xmp": 3}) is None
-    assert panorama_in_metadata({}) is None
+    assert panorama_in_xmp(element) == STITCHED
+    assert panorama_in_xmp(_XMP % b'GPano:UsePanoramaViewer="False"') is None
+    assert panorama_in_xmp(b"") is None
 
 
 def with_box(path, *boxes):

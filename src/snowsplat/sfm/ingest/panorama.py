@@ -8,9 +8,7 @@ row are one point each. No pinhole camera takes such a picture: its poses would 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +30,6 @@ _PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
 _PIXELS = re.compile(
     rb"GPano:(FullPanoWidthPixels|CroppedAreaImageWidthPixels)\s*(?:=\s*[\"']|>)\s*(\d+)"
 )
-_XMP_KEYS = ("xmp", "XML:com.adobe.xmp")  # in `Image.info`: JPEG, WebP and HEIF; PNG
 # Spherical video, version 1 (XML) and 2 (a box with an "equi" box inside), in the header of an mp4.
 _SPHERICAL = re.compile(
     rb"<GSpherical:Spherical>\s*true|sv3d.{1,400}?(?:equi|cbmp)", re.DOTALL | re.IGNORECASE
@@ -50,21 +47,16 @@ _POINT = 0.5
 _MIN_CONTRAST = 4.0  # grey levels; in a border without structure, a seam is not visible
 
 
-def panorama_in_metadata(info: Mapping[str, Any]) -> str | None:
-    """`PANORAMA` or `STITCHED`, if the XMP of a photo says so; ``info`` is that of Pillow."""
-    for key in _XMP_KEYS:
-        xmp = info.get(key, b"")
-        xmp = xmp.encode() if isinstance(xmp, str) else xmp
-        if not isinstance(xmp, bytes):
-            continue
-        found = _PROJECTION.search(xmp)
-        if found and found[1].lower() in (b"equirectangular", b"cylindrical"):
-            widths = {name: int(value[:9]) for name, value in _PIXELS.findall(xmp)}
-            whole = widths.get(b"FullPanoWidthPixels", 0)
-            part = widths.get(b"CroppedAreaImageWidthPixels", whole)
-            all_around = found[1].lower() == b"equirectangular" and part >= whole
-            return PANORAMA if all_around else STITCHED
-    return None
+def panorama_in_xmp(xmp: bytes) -> str | None:
+    """`PANORAMA` or `STITCHED`, if the XMP packet of a photo says so."""
+    found = _PROJECTION.search(xmp)
+    if found is None or found[1].lower() not in (b"equirectangular", b"cylindrical"):
+        return None
+    widths = {name: int(value[:9]) for name, value in _PIXELS.findall(xmp)}
+    whole = widths.get(b"FullPanoWidthPixels", 0)
+    part = widths.get(b"CroppedAreaImageWidthPixels", whole)
+    all_around = found[1].lower() == b"equirectangular" and part >= whole
+    return PANORAMA if all_around else STITCHED
 
 
 def is_twice_as_wide(width: int, height: int) -> bool:

@@ -19,7 +19,7 @@ from PIL import Image, ImageOps
 from snowsplat.data import image_file
 from snowsplat.data.image_file import reason_of
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
-from snowsplat.sfm.ingest.panorama import panorama_in_metadata
+from snowsplat.sfm.ingest.panorama import panorama_in_xmp
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
 # Formats that COLMAP reads, by file extension.
@@ -99,6 +99,7 @@ def read_header(path: Path) -> Header:
             transparent = image.mode in _TRANSPARENT or "transparency" in image.info
             plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
+            xmp = _xmp(image)
             header = Header(
                 format=image.format or "",
                 width=width,
@@ -107,10 +108,8 @@ def read_header(path: Path) -> Header:
                 and "transparency" not in image.info
                 and _bits(path, image) == 8,
                 transparent=transparent,
-                exif=read_exif(
-                    exif, width, height, _xmp(image), image.info.get("original_orientation")
-                ),
-                panorama=panorama_in_metadata(image.info),
+                exif=read_exif(exif, width, height, xmp, image.info.get("original_orientation")),
+                panorama=panorama_in_xmp(xmp),
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
@@ -120,7 +119,8 @@ def read_header(path: Path) -> Header:
 
 
 def _xmp(image: Image.Image) -> bytes:
-    packet = image.info.get("xmp", b"")
+    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")  # the latter: PNG
+    packet = packet.encode() if isinstance(packet, str) else packet
     return packet if isinstance(packet, bytes) else b""
 
 

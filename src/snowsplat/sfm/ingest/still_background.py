@@ -20,6 +20,7 @@ _STILL, _OBJECT = 0.3, 0.03
 _SAME_LEVEL = 6.0  # grey levels; compression and noise change a pixel by less
 _NOISE = 3.0  # changes of less than this multiple of the noise are no changes
 _PATCH = np.ones((5, 5), np.uint8)  # what has to be the same as in another photo, around a pixel
+_TEXTURED = 0.3  # share of the pixels of a part of the backdrop with texture
 # Share of the photos that have the same patch, if it belongs to the backdrop.
 _SEEN = 0.2
 
@@ -51,8 +52,12 @@ class Backdrop:
         opened = cv2.morphologyEx(shown, cv2.MORPH_OPEN, _PATCH)
         _, labels = cv2.connectedComponents(opened)
         mean = np.asarray(cv2.blur(self.level, _PATCH.shape), np.uint8)
-        texture = _difference(self.level, mean) > self.tolerance
-        outside = np.unique(labels[self.never_covered | (texture & (opened > 0))])
+        texture = cv2.absdiff(self.level, mean) > self.tolerance / 2
+        textured = np.bincount(labels[texture], minlength=labels.max() + 1)
+        outside = np.union1d(
+            labels[self.never_covered],
+            np.flatnonzero(textured >= _TEXTURED * np.bincount(labels.ravel())),
+        )
         # `_difference` compares patches, so it stops short of the silhouette by half a patch.
         connected = np.isin(labels, outside[outside > 0]).astype(np.uint8)
         return (cv2.dilate(connected, _PATCH) > 0) | self.never_covered
@@ -90,7 +95,14 @@ def find_backdrop(
         if boxes[i, cv2.CC_STAT_AREA] < 0.05 * largest:
             changed[labels == i] = 0
     level, known = _common_level(copies, tolerance)
-    return Backdrop(changed == 0, level, known, tolerance)
+    return Backdrop(_from_border(changed == 0), level, known, tolerance)
+
+
+def _from_border(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The parts of ``still`` (H, W) that reach the border; the others are uniform object."""
+    _, labels = cv2.connectedComponents(still.astype(np.uint8))
+    border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    return np.isin(labels, np.unique(border[border > 0]))
 
 
 def _object_before_background(
