@@ -7,15 +7,19 @@ import shutil
 import time
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
 
 from snowsplat.cli.main import main
 from snowsplat.data import load_dataset
+from snowsplat.data.placement import read_placement
 from snowsplat.sfm import dataset_folder
+from snowsplat.sfm.gps import location_of
 
 from ..sfm.colmap import scenes
+from ..sfm.pictures import exif
 
 STAGES = ("photos", "poses", "images", "report")
 QUICK = ("--quality", "draft", "--threads", "1")
@@ -136,6 +140,40 @@ def test_photos_in_place(garden, photos, run, refused, tmp_path):
     assert result.code == 0, result.err
     assert (given / "distorted" / "sparse" / "0" / "images.bin").read_bytes() == model
     assert len(load_dataset(given).train) == len(load_dataset(garden).train)
+
+
+def test_positions_in_the_photos_make_the_dataset_metric(garden, photos, run, tmp_path):
+    """The same poses, and EXIF positions that are 50 times as far apart: −y of the model is up."""
+    place = tmp_path / "place"
+    shutil.copytree(garden / "sparse", place / "distorted" / "sparse")
+    shutil.copytree(garden / "images", place / "input")
+    model = pycolmap.Reconstruction(place / "distorted" / "sparse" / "0")
+    home = np.array([52.5, 13.4, 40.0])
+    for number in model.reg_image_ids():
+        name, centre = model.images[number].name, model.images[number].projection_center()
+        latitude, longitude, altitude = location_of(50 * centre[[0, 2, 1]] * (1, 1, -1), home)
+        gps = {1: "N", 2: dms(latitude), 3: "E", 4: dms(longitude), 5: b"\0", 6: altitude}
+        path = place / "input" / name
+        with Image.open(path) as image:
+            image.load()
+        image.save(path, exif=exif(gps=gps))
+    result = run("sfm", "-s", place, "--skip-matching")
+    assert result.code == 0, result.err
+    assert "\nlevel: from the way the photos were held" in result.out
+    assert "\nnorth: +z is north, +x is east; from GPS positions of 6 photos" in result.out
+    assert "\nmetric: 1 unit is 1 m, scale from GPS positions of 6 photos" in result.out
+    placement = read_placement(place)
+    assert placement.is_metric
+    record = json.loads((place / "sfm.json").read_text())
+    scale = record["stages"]["images"]["result"]["scene_from_sfm"]["scale"]
+    assert scale == pytest.approx(50, rel=0.02)
+    assert "Level, north and scale" in (place / "dataset_report.html").read_text()
+
+
+def dms(degrees: float) -> tuple[float, float, float]:
+    """Degrees, minutes and seconds."""
+    minutes = 60 * (degrees % 1)
+    return float(int(degrees)), float(int(minutes)), 60 * (minutes % 1)
 
 
 def test_a_folder_with_other_files_stays_unchanged(garden, refused, photos, tmp_path):

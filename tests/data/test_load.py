@@ -14,7 +14,7 @@ from snowsplat.data import ImageLoader, Points, load_dataset, read_files
 from snowsplat.data.bounds import scene_bounds
 from snowsplat.data.dataset import safe_name, scene_extent
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 
 
 def resize_folder(source, target, size):
@@ -39,6 +39,12 @@ def test_every_eighth_image_by_name_is_held_out(pristine):
     assert [view.name for view in dataset.test] == ["view_00.png", "view_08.png"]
     assert [view.name for view in dataset.train] == [f"view_0{i}.png" for i in range(1, 8)]
     assert len(load_dataset(pristine["colmap-bin"], hold_out=3).test) == 3
+    between = load_dataset(pristine["colmap-bin"], hold_out=3, first_held_out=1)
+    assert [view.name for view in between.test] == ["view_01.png", "view_04.png", "view_07.png"]
+    (middle,) = load_dataset(pristine["colmap-bin"], first_held_out=20).test
+    assert middle.name == "view_04.png"
+    with pytest.raises(SettingError, match="-1 is not valid"):
+        load_dataset(pristine["colmap-bin"], first_held_out=-1)
     everything = load_dataset(pristine["colmap-bin"], hold_out=None)
     assert (len(everything.train), len(everything.test)) == (9, 0)
 

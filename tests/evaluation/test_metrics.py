@@ -89,9 +89,24 @@ def test_views_without_visible_gaussians(tmp_path):
     assert [view.name for view in seen] == ["0.png", "1.png", "2.png", "3.png"]
 
 
+def test_the_explained_share_does_not_depend_on_exposure_and_contrast():
+    photo = torch.rand(30, 40, 3, generator=torch.Generator().manual_seed(0))
+    noise = 0.1 * torch.randn(30, 40, 3, generator=torch.Generator().manual_seed(1))
+    same = compare(0.5 * photo + 0.2, photo).explained
+    assert same == pytest.approx(1.0, abs=1e-9)
+    # The variance of the photo is 1/12; the least squares fit explains 1 / (1 + 12 · 0.01) of it.
+    clear = compare(0.3 + 0.4 * photo + 0.4 * noise, photo).explained
+    assert clear == pytest.approx(1 / 1.12, abs=0.01)
+    dull = compare(0.3 + 0.4 * photo + 0.4 * noise, 0.45 + 0.1 * photo).explained
+    assert dull == pytest.approx(clear, abs=0.01)  # the fit is clipped at 0 and 1
+    mask = torch.zeros(30, 40, dtype=torch.bool)
+    assert compare(photo, photo, mask).explained == 0.0  # no pixel
+    assert compare(photo, torch.full_like(photo, 0.5)).explained == 0.0  # no contrast
+
+
 def test_means_and_json():
     evaluation = Evaluation(
-        [ViewMetrics("a", 20.0, 0.5, 21.0, 0.25), ViewMetrics("b", 30.0, 0.75, 33.0, 0.5)]
+        [ViewMetrics("a", 20.0, 0.5, 21.0, 0.25), ViewMetrics("b", 30.0, 0.75, 33.0, 0.5, 0.9)]
     )
     assert (evaluation.psnr, evaluation.ssim, evaluation.lpips) == (25.0, 0.625, 0.375)
     values = json.loads(json.dumps(evaluation.as_json()))
@@ -101,6 +116,7 @@ def test_means_and_json():
         "ssim": 0.75,
         "psnr_aligned": 33.0,
         "lpips": 0.5,
+        "explained": 0.9,
     }
     assert values["psnr_aligned"] == 27.0
     assert math.isnan(Evaluation([]).psnr)

@@ -1,4 +1,4 @@
-"""The up direction from synthetic cameras. For complete models see tests/sfm/test_orient.py."""
+"""The up direction from synthetic cameras. For complete models see tests/sfm/orient."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.scene.geometry import look_at
-from snowsplat.scene.orientation import up_direction, up_of_surfaces
+from snowsplat.scene.geometry import look_at, rotation_from_quat
+from snowsplat.scene.orientation import scene_up, up_direction, up_of_surfaces
 
 UP = torch.nn.functional.normalize(torch.tensor([0.2, -0.9, 0.3], dtype=torch.float64), dim=0)
 
@@ -119,3 +119,38 @@ def test_an_object_on_a_plate_at_the_lowest_z_has_z_up(end):
         assert found.tolist() == [0.0, 0.0, 1.0]
     else:
         assert found is None
+
+
+MINUS_Y = np.array([0.0, -1.0, 0.0])
+
+
+def turned(found, axis=0, degrees=0.0):
+    """The cameras in a frame in which up is −y, turned about one of its axes."""
+    east = np.cross(UP.numpy(), [1.0, 0.0, 0.0])
+    east /= np.linalg.norm(east)
+    level_from_world = np.stack([east, -UP.numpy(), np.cross(east, -UP.numpy())])
+    angle = torch.tensor(math.radians(degrees) / 2)
+    quat = torch.zeros(4, dtype=torch.float64)
+    quat[0], quat[1 + axis] = angle.cos(), angle.sin()
+    return found @ level_from_world.T @ rotation_from_quat(quat).numpy()
+
+
+def angle_to_minus_y(up):
+    return math.degrees(math.acos(min(1.0, float(up @ MINUS_Y))))
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.8])
+def test_a_scene_keeps_its_up_direction_if_most_cameras_are_level(pitch):
+    np.testing.assert_array_equal(scene_up(turned(rotations(pitch, 0.02, 0.1))), MINUS_Y)
+
+
+def test_a_scene_turns_as_far_as_its_cameras_are_certain():
+    """Cameras on a circle are certain about roll and pitch, parallel ones only about the roll."""
+    circle, wall = rotations(0.3, 0.02, 6.0), rotations(0.0, 0.02, 0.01)
+    for axis in (0, 2):
+        assert angle_to_minus_y(scene_up(turned(circle, axis, 20.0))) == pytest.approx(20, abs=2)
+    facing = next(axis for axis in (0, 2) if abs(turned(wall)[0, 2, axis]) > 0.7)
+    np.testing.assert_array_equal(scene_up(turned(wall, 2 - facing, 20.0)), MINUS_Y)
+    assert angle_to_minus_y(scene_up(turned(wall, facing, 20.0))) == pytest.approx(20, abs=3)
+    # The usual frame of synthetic scenes, in which z is up.
+    assert angle_to_minus_y(scene_up(turned(wall, 0, 90.0))) > 80

@@ -14,8 +14,10 @@ import torch
 from PIL import Image
 
 from snowsplat.data.colmap import read_model, read_points, write_model
+from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.scene.geometry import look_at
 from snowsplat.sfm.dataset_report import write_report
+from snowsplat.sfm.photo_problems import DARK
 
 NAMES = [
     "one.jpg",
@@ -77,6 +79,8 @@ def facts(**sfm: Any) -> dict[str, Any]:
         | sfm,
         "undistorted": {"sizes": [[158, 118, 30]], "resampled": True},
         "seconds": {"photos": 3.21, "poses": 6000.0, "images": 130.0},
+        "problems": {},
+        "verdict": Verdict.of([Reason("usable", "30 photos < 31", "take <more>")]).as_json(),
     }
 
 
@@ -95,6 +99,13 @@ def test_page_is_well_formed_and_self_contained(dataset):
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
     assert "<script" not in text
     assert "url(" not in text
+
+
+def test_page_says_what_is_fixed_to_the_frame(dataset):
+    known = facts()
+    known["gathered"]["notes"] = ["v <1>.mp4: bars at the left and right: cut off in all frames"]
+    shown = visible_text(write_report(dataset, known))
+    assert "Fixed to the frame: v <1>.mp4: bars at the left and right: cut off" in shown
 
 
 def test_page_reports_the_results(dataset):
@@ -118,6 +129,9 @@ def test_page_reports_the_results(dataset):
         "incremental: 30 of 31 photos",
         "158 × 118",
         "snowsplat train '",
+        "The photos: usable, with limits",
+        "30 photos < 31",
+        "Take <more>",
     ):
         assert expected in shown
 
@@ -145,12 +159,7 @@ def test_thumbnails_are_small_images(dataset):
 
 def test_photos_with_problems_are_shown(dataset):
     assert "may be better" not in visible_text(write_report(dataset, facts()))
-    good = (dataset / "images" / NAMES[0]).read_bytes()
-    Image.new("RGB", (160, 120), (9, 12, 4)).save(dataset / "images" / NAMES[0])
-    try:
-        page = write_report(dataset, facts())
-    finally:
-        (dataset / "images" / NAMES[0]).write_bytes(good)
+    page = write_report(dataset, facts() | {"problems": {NAMES[0]: DARK}})
     assert f"1 of {len(NAMES)} photos may be better" in visible_text(page)
     assert "is too dark; use more light" in visible_text(page)
 
@@ -171,16 +180,12 @@ def test_gaps_are_numbered_in_the_drawing(dataset, tmp_path):
 
 
 def test_problems_are_reported(dataset):
-    shown = visible_text(
-        write_report(dataset, facts(sub_models=[30, 12, 4], reprojection_error=2.5))
-    )
+    shown = visible_text(write_report(dataset, facts(sub_models=[30, 12, 4])))
     assert "form 3 separate groups" in shown
     assert "30, 12, 4 photos" in shown
-    assert "reprojection error is high" in shown
     without_problems = visible_text(write_report(dataset, facts(unregistered={})))
     assert "The poses of all 30 photos were found." in without_problems
     assert "groups" not in without_problems
-    assert "error is high" not in without_problems
 
 
 def test_several_focal_lengths_of_a_camera_are_said(dataset):
@@ -196,3 +201,27 @@ def test_long_lists_are_shortened_and_any_name_is_accepted(dataset):
     assert "p199" in shown
     assert "p200" not in shown
     assert "and 701 more" in shown  # one of them is a photo that could not be decoded
+
+
+def test_level_north_and_scale_are_told(dataset):
+    """In metres, the scale bars name the unit too."""
+    before = write_report(dataset, facts()).read_text()
+    assert "Level, north" not in before
+    assert " units</text>" in before
+    placement = {
+        "up_from": ["the <gimbal> angles of 18 photos"],
+        "level_error": 0.7,
+        "metres_per_unit": 1.0,
+        "scale_from": "GPS positions of 18 photos",
+        "scale_error": 0.026,
+        "position_error": 1.2,
+        "doubts": ["GPS & gimbal disagree"],
+    }
+    record = facts()
+    record["undistorted"]["placement"] = placement
+    after = write_report(dataset, record).read_text()
+    assert "from the &lt;gimbal&gt; angles of 18 photos, to about 0.7°" in after
+    assert "scale from GPS positions of 18 photos (1.2 m typical error), to about 2.6%" in after
+    assert "GPS &amp; gimbal disagree" in after
+    assert " units</text>" not in after
+    assert re.search(r"[0-9] m</text>", after)

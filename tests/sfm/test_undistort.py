@@ -223,7 +223,7 @@ def test_without_distortion_photos_are_copied(tmp_path, model_of):
 
 def test_the_orientation_can_be_inverted(dataset):
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
-    scene_from_sfm = orientation(model)
+    scene_from_sfm = orientation(model).scene_from_sfm
     undistort(dataset, PHOTOS, scene_from_sfm, False, silent)
     after = pycolmap.Reconstruction(dataset / "sparse" / "0")
     back = Similarity.from_json(json.loads(json.dumps(scene_from_sfm.to_json()))).inverse()

@@ -28,7 +28,12 @@ from snowsplat.training.core.batch import BatchView
 from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
-from snowsplat.training.parts.exposure_start import GAMMA, exposure_start, log_gains
+from snowsplat.training.parts.exposure_start import (
+    GAMMA,
+    exposure_start,
+    log_gains,
+    same_everywhere,
+)
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.processes.shards import ALONE
 from snowsplat.training.settings.recipes import recipe
@@ -97,6 +102,18 @@ def test_photos_with_too_few_points_have_no_gain():
     found = log_gains(logs)
     assert found[:2].isfinite().all()
     assert found[2].isnan().all()
+
+
+def test_shiny_surfaces_are_no_exposure():
+    """Half of the points shine, by another amount in each photo; or all points are brighter."""
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.05 * torch.randn(12, 400, 3, generator=generator, dtype=torch.float64)
+    logs = torch.rand(400, 3, generator=generator, dtype=torch.float64) - 1.0 + noise
+    half = torch.arange(400) % 2 == 0
+    brighter = 0.2 * torch.randn(12, 1, 1, generator=generator, dtype=torch.float64)
+    assert same_everywhere(logs + brighter, half)
+    assert not same_everywhere(logs + brighter * half[:, None], half)
+    assert not same_everywhere(logs, half)
 
 
 def test_the_exposures_of_a_dataset(clean, degraded, gains):

@@ -65,14 +65,18 @@ def test_wrong_poses_are_found_and_exact_ones_are_not(tmp_path: Path) -> None:
     scene = true_scene()
     views = views_of(scene, tmp_path, 9)
     black = (0.0, 0.0, 0.0)
-    assert misalignment(scene, views, black) is None
+    assert misalignment(scene, views, black, 1000) is None
     turn = torch.tensor([0.0, 0.02, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
     def turned(view: View) -> View:
         pose = moved(view.camera.cam_from_world, turn)
         return replace(view, camera=replace(view.camera, cam_from_world=pose))
 
-    pixels = misalignment(scene, [turned(view) for view in views], black)
+    wrong = [turned(view) for view in views]
+    pixels = misalignment(scene, wrong, black, 1000)
     assert pixels is not None
     assert 1.0 < pixels < 2.0  # 0.02 radians at a focal length of 78 pixels: 1.56 pixels
-    assert misalignment(scene, [turned(view) for view in views[:7]], black) is None
+    assert misalignment(scene, wrong[:7], black, 1000) is None
+    assert misalignment(scene, wrong, black, 499) is None  # the scene is not finished
+    assert misalignment(scene, 40 * wrong, black, 700) is None  # 360 views
+    assert misalignment(scene, 40 * wrong, black, 720) is not None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,20 +12,23 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import look_at
+from snowsplat.scene.geometry import look_at, rotation_from_quat
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts import found_sky
 from snowsplat.training.parts.direction_cells import (
     ANGLE,
     COUNT,
     cells_of,
     directions_of,
     median_of,
+    regions_of,
     spread_of,
 )
 from snowsplat.training.parts.found_sky import find_sky, sky_distance
@@ -65,8 +70,18 @@ def ground_color(xyz: Tensor) -> Tensor:
     return 0.5 + 0.45 * torch.stack(phases, dim=-1)
 
 
-def photo(camera: Camera, height: float) -> Tensor:
-    """(H, W, 3) in 0..1: the ground at y = ``height`` below the sky; or, above, a ceiling."""
+def plaster(xyz: Tensor) -> Tensor:
+    """One colour; the light falls off."""
+    return (
+        (0.85 - 0.012 * xyz[..., ::2].square().sum(-1, keepdim=True)).clamp(0.6).expand(xyz.shape)
+    )
+
+
+Paint = Callable[[Tensor], Tensor]  # positions or directions (..., 3) -> colours in 0..1
+
+
+def photo(camera: Camera, height: float, above: Paint) -> Tensor:
+    """(H, W, 3) in 0..1: the ground, and above it a ceiling at y = ``height``; -inf: the sky."""
     y, x = torch.meshgrid(*(torch.arange(camera.width) + 0.5,) * 2, indexing="ij")
     ones = torch.ones_like(x)
     rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, ones], -1)
@@ -75,22 +90,27 @@ def photo(camera: Camera, height: float) -> Tensor:
     down = rays[..., 1:2]
     floor = pose[:, 3] + rays * (GROUND - pose[1, 3]) / down
     ceiling = pose[:, 3] + rays * (height - pose[1, 3]) / down
-    above = sky_color(rays) if math.isinf(height) else ground_color(ceiling)
-    return torch.where(down > 0, ground_color(floor), above)
+    upper = above(rays if math.isinf(height) else ceiling)
+    return torch.where(down > 0, ground_color(floor), upper)
 
 
 def dataset(
-    folder: Path, height: float = -math.inf, radius: float = 2.0, size: int = SIZE
+    folder: Path,
+    height: float = -math.inf,
+    radius: float = 2.0,
+    size: int = SIZE,
+    above: Paint = sky_color,
 ) -> Dataset:
+    """Photos, and points on what has details."""
     views = []
     for i, camera in enumerate(ring(radius, size)):
-        pixels = (255.0 * photo(camera, height)).clamp(0, 255).round().numpy().astype(np.uint8)
+        pixels = (255.0 * photo(camera, height, above)).clamp(0, 255).round()
         file = folder / f"{i}.png"
-        Image.fromarray(pixels).save(file)
+        Image.fromarray(pixels.numpy().astype(np.uint8)).save(file)
         views.append(View(f"{i}", camera, ImageSource(file, size, size)))
     xyz = 24.0 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 12.0
     xyz[:, 1] = GROUND
-    if not math.isinf(height):
+    if above is ground_color:
         xyz[::2, 1] = height
     rgb = (255 * ground_color(xyz)).clamp(0, 255).to(torch.uint8)
     return Dataset(views, [], Points(xyz, rgb), 2.2)
@@ -113,6 +133,17 @@ def test_the_middle_of_a_cell_is_in_it_and_cells_are_of_similar_size():
     to_others = torch.acos((some @ directions.T).clamp(-1, 1))
     to_next = to_others.topk(2, largest=False).values[:, 1]
     assert 0.6 * ANGLE < float(to_next.min()) <= float(to_next.max()) < 1.4 * ANGLE
+
+
+def test_regions_continue_across_the_edges_of_the_faces():
+    directions = directions_of(torch.arange(COUNT))
+    corners = normalize(torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 0.0]]), dim=1)
+    caps = directions @ corners.T > math.cos(0.4)
+    cells = caps.any(1).nonzero()[:, 0]
+    region = regions_of(cells)
+    assert region.max() == 1
+    assert torch.equal(region == region[caps[cells, 0].nonzero()[0]], caps[cells, 0])
+    assert torch.equal(regions_of(torch.tensor([5, 6, 8])), torch.tensor([0, 0, 1]))
 
 
 def test_medians_and_spreads_of_cells():
@@ -205,8 +236,60 @@ def test_a_sky_of_the_colour_of_the_background_needs_no_points(tmp_path):
 
 
 def test_a_ceiling_is_not_the_sky(tmp_path):
-    data = dataset(tmp_path, height=-2.0)
+    data = dataset(tmp_path, height=-2.0, above=ground_color)
     assert find_sky(data, images(data)) is None
+
+
+def test_a_plain_ceiling_is_not_the_sky(tmp_path, monkeypatch):
+    data = dataset(tmp_path, height=-2.0, above=plaster)
+    assert find_sky(data, images(data)) is None
+    everything = lambda cells, *others: torch.ones_like(cells, dtype=torch.bool)  # noqa: E731
+    monkeypatch.setattr(found_sky, "in_far_regions", everything)
+    assert find_sky(data, images(data)) is not None  # its colours alone would be those of a sky
+
+
+def test_an_overcast_sky_is_found_and_a_plain_dark_region_is_in_doubt(tmp_path):
+    for light, found in ((0.97, True), (0.3, False)):
+        folder = tmp_path / str(light)
+        folder.mkdir()
+        data = dataset(folder, above=lambda rays, light=light: torch.full_like(rays, light))
+        assert (find_sky(data, images(data)) is not None) is found
+
+
+def test_below_the_horizon_is_no_sky(tmp_path, outdoors):
+    """The same photos, whose cameras are turned over: they show the sky below them."""
+    over = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    views = []
+    for view in outdoors.train:
+        camera = view.camera
+        file = tmp_path / f"{view.name}.png"
+        with Image.open(view.image.path) as upright:
+            upright.rotate(180).save(file)
+        turned = replace(camera, cam_from_world=over @ camera.cam_from_world)
+        views.append(View(view.name, turned, ImageSource(file, SIZE, SIZE)))
+    data = replace(outdoors, train=views)
+    assert find_sky(data, images(data)) is None
+
+
+def test_the_sky_does_not_depend_on_the_frame_and_unit_of_the_world(outdoors):
+    turn = rotation_from_quat(torch.tensor([0.6, -0.4, 0.5, 0.48], dtype=torch.float64))
+    scale = 1000.0
+    shift = torch.tensor([3e5, -2e5, 1e4], dtype=torch.float64)
+    views = []
+    for view in outdoors.train:
+        rotation = view.camera.cam_from_world[:, :3] @ turn.T
+        position = scale * (turn @ view.camera.position) + shift
+        pose = torch.cat([rotation, -(rotation @ position)[:, None]], dim=1)
+        views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
+    points = scale * (outdoors.points.xyz.double() @ turn.T) + shift
+    moved = replace(
+        outdoors, train=views, points=Points(points.float(), outdoors.points.rgb), extent=2200.0
+    )
+    sky = find_sky(outdoors, images(outdoors))
+    other = find_sky(moved, images(moved))
+    assert other.share == pytest.approx(sky.share, rel=0.05)
+    up = turn @ torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    assert float((other.directions.double() @ up > -ANGLE).float().mean()) == 1.0
 
 
 def test_photos_from_one_place_and_datasets_without_points_show_no_sky(tmp_path, outdoors):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,17 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.live_page import LivePage
 
 # The flags that the command for resuming repeats, in this order.
-_RESUMED_FLAGS = ("output", "quality", "minutes", "threads", "device", "memory", "port", "host")
+_RESUMED_FLAGS = (
+    "output",
+    "quality",
+    "minutes",
+    "exposure",
+    "threads",
+    "device",
+    "memory",
+    "port",
+    "host",
+)
 
 
 @dataclass
@@ -56,6 +67,11 @@ class Make:
     """Finish within this time. If there are too many photos for this time, some of them are used,
     evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
     counted, and its training resumes with the time that remained."""
+    exposure: Annotated[
+        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default="auto")
+    ] = None
+    """Whether to learn a gain for each photo and colour channel, for photos with different
+    exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
@@ -82,6 +98,7 @@ class Make:
             quality=self.quality,
             minutes=self.minutes,
             memory=self.memory,
+            exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
         )
         page = PageFlags(self.port, self.host).page(self.view)
@@ -129,15 +146,20 @@ class Make:
 
 
 def print_summary(made: MakeResult) -> None:
-    """Print the files of a finished scene, and its quality."""
+    """Print the files of a finished scene, its quality, and the verdict."""
+    aligned = f"colour-aligned PSNR {made.psnr_aligned:.2f} dB"
+    figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
+    if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
+        figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
     print(
         f"\nThe scene, for any viewer:  {made.scene}\n"
         f"Report on camera poses:     {made.dataset_report}\n"
         f"Report on the training:     {made.folder.report}\n"
         f"Rendered test views:        {made.renders}\n"
         f" and held-out photos:       {made.photos}\n"
-        f"Quality of these views:     PSNR {made.psnr:.2f} dB, SSIM {made.ssim:.3f} "
-        f"({made.views} photos)\n"
-        f"Time:                       {duration(made.seconds)}",
-        flush=True,
+        f"Quality of these views:     {figures} ({made.views} photos)\n"
+        f"Time:                       {duration(made.seconds)}"
     )
+    if made.verdict is not None:
+        print("\n" + "\n".join(made.verdict.lines("The scene")))
+    sys.stdout.flush()

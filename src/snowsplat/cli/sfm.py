@@ -79,6 +79,8 @@ class Sfm:
     def run(self) -> int:
         """Returns the exit code, 0."""
         inputs, folder = self._inputs_and_folder()
+        from snowsplat.data.placement import placement_of
+        from snowsplat.evaluation.verdict import Verdict
         from snowsplat.sfm.dataset_folder import make_dataset
 
         options = self._options()
@@ -90,6 +92,12 @@ class Sfm:
             f"{folder}: {found} of {found + count} photos placed, {poses['points']:,} points; "
             f"see {folder / outcomes['report'].result['file']}"
         )
+        placement = placement_of(outcomes["images"].result)
+        for line in placement.lines() if placement is not None else []:
+            print(line)
+        verdict = Verdict.from_json(outcomes["report"].result["verdict"])
+        for line in [] if verdict is None else verdict.lines("the photos"):
+            print(line)
         print(f"train it with: snowsplat train {folder} -o OUT --eval")
         return 0
 

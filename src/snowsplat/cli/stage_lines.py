@@ -22,7 +22,8 @@ def _photos(gathered: dict[str, Any]) -> list[str]:
     line = f"{len(photos)} photos"
     if skipped:
         line += f", {len(skipped)} skipped"
-    return [line, *_listed([f"{source}: {why}" for source, why in skipped])]
+    notes = gathered.get("notes", [])
+    return [line, *notes, *_listed([f"{source}: {why}" for source, why in skipped])]
 
 
 def _poses(sfm: dict[str, Any]) -> list[str]:

@@ -61,10 +61,12 @@ class Train(TrainFlags):
         with TerminalObserver(self.quiet) as observer, page or nullcontext():
             try:
                 if self.resume:
-                    resume(self.output, options, dataset=dataset, observer=observer, page=page)
+                    result = resume(
+                        self.output, options, dataset=dataset, observer=observer, page=page
+                    )
                 else:
                     assert dataset is not None
-                    train(
+                    result = train(
                         dataset,
                         self.output,
                         options,
@@ -78,6 +80,8 @@ class Train(TrainFlags):
                     raise
                 print(f"resume with: snowsplat train -o {self.output} --resume")
                 return 130
+            if result.verdict is not None:
+                print("\n".join(result.verdict.lines("the scene")), flush=True)
             if page is not None:
                 with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
                     print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)

@@ -63,6 +63,9 @@ class JobFlags:
     """Memory limit of the training, for example 4GB. On a GPU, this is memory of the GPU; on the
     CPU, it is memory in addition to that of Python and its libraries. To stay within the limit,
     photos are decoded each time they are used, and the maximum number of Gaussians is reduced."""
+    trust_cameras: Annotated[bool, switch()] = False
+    """Train even if the cameras of the dataset contradict its photos or points, or have an
+    impossible lens."""
     resume: Annotated[bool, switch()] = False
     """Continue from the newest checkpoint in OUT. The result is the same as without the
     interruption."""
@@ -111,6 +114,7 @@ class TrainFlags(ConfigFlags, JobFlags):
             test_list=self.test_list,
             minutes=self.minutes,
             memory=self.memory,
+            trust_cameras=self.trust_cameras,
             save_iterations=self.save_iterations,
             compute=Compute(self.device, self.threads, self.deterministic),
         )

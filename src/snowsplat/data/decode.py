@@ -130,6 +130,29 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
     return torch.from_numpy(resize_area(planes, source.width, source.height))
 
 
+def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
+    """Decode an image to (4, h, w) uint8 RGBA, not premultiplied, with a longer side of ``side``.
+
+    A JPEG file is decoded at a fraction of its size, which is several times faster. The pixels are
+    close to those of `load_image`, but not equal. Smaller images are not enlarged.
+
+    Raises:
+        UserError: the file is missing, damaged, or not an image.
+    """
+    scale = min(1.0, side / max(source.width, source.height))
+    size = max(1, round(source.width * scale)), max(1, round(source.height * scale))
+    try:
+        with open_image(source.path, _FORMATS) as opened:
+            opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
+            image = ImageOps.exif_transpose(opened) if source.apply_orientation else opened
+            planes = [Image.fromarray(plane) for plane in _planes(image)]
+    except Exception as error:  # as above
+        raise _unreadable(source.path, error) from None
+    small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in planes]
+    opaque = np.full((size[1], size[0]), 255, np.uint8)
+    return np.stack(small if len(small) == 4 else [*small, opaque])
+
+
 def load_mask(source: ImageSource) -> Tensor:
     """Decode a mask to (H, W) bool: True where its largest channel is 128 or more.
 

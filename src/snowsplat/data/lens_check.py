@@ -1,42 +1,31 @@
-"""Whether the intrinsics of a camera can be those of a lens.
-
-A dataset may have been made by another program, or converted by a script with a mistake. Structure
-from motion may return an arbitrary lens, too, if the photos do not determine it. A training run
-with such a lens makes a bent scene, and no error appears.
-"""
+"""`lens_findings`: whether the intrinsics of a pinhole camera are those of a real one."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-# In degrees, along the longer side: from a 400 mm telephoto lens (on 35 mm film) to the widest
-# rectilinear lens of 10 mm. Beyond the second limits, a number is wrong: the unit, or a digit.
-_USUAL_VIEW = (5.0, 125.0)
-_POSSIBLE_VIEW = (0.5, 160.0)
-# fx / fy: pixels of cameras are square. Photos that were stretched may differ more.
-_SQUARE, _STRETCHED = 1.03, 2.5
-# Distance of the principal point from the middle, in units of the width or height. The distance is
-# larger if photos were cropped on one side.
-_CENTRAL = 0.2
-# The estimate of a focal length and that in EXIF agree if their ratio is less than this. EXIF has
-# it in whole millimetres, for the uncropped photo.
-_AGREES_WITH_EXIF = 1.25
+from snowsplat.data.finding import Finding
+
+# Degrees, of the longer side of a photo. A pinhole image of more than 150° has less than a
+# seventh of its pixels within the central 60°: no lens is corrected to that. Below 5° (more than
+# 400 mm on a full-frame camera) are telescopes and satellites.
+_WIDEST, _NARROWEST = 150.0, 5.0
+# A telescope on a camera has about 0.5°; below is a unit that is not the pixel.
+_NARROWEST_TELESCOPE = 0.1
+# fx / fy. Sensors have square pixels within 0.1%; calibration is good to 1 or 2%. Some videos are
+# anamorphic or were scaled in one direction.
+_SQUARE = 0.97, 1.03
+# Distance of the principal point from the centre, relative to the size of the photo. Cropping
+# moves it.
+_OFF_CENTRE = 0.2
+# Ratio to the focal length of the EXIF data. Undistortion, and the rounding to a whole millimetre,
+# change it by a few percent; another lens or zoom by more.
+_AS_KNOWN = 0.75, 1.25
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A reason to doubt the cameras of a dataset.
-
-    Attributes:
-        about: a short name, such as "focal length".
-        text: the reason with its numbers, as text for users, without a full stop.
-        impossible: no scene can agree with it; otherwise it is unusual.
-    """
-
-    about: str
-    text: str
-    impossible: bool
+def field_of_view(size: float, focal: float) -> float:
+    """The angle in degrees that ``size`` pixels span at a focal length in pixels."""
+    return 2.0 * math.degrees(math.atan(0.5 * size / focal))
 
 
 def lens_findings(
@@ -49,51 +38,62 @@ def lens_findings(
     *,
     known_focal: float | None = None,
 ) -> list[Finding]:
-    """What is impossible or unusual about a pinhole camera; an empty list: nothing.
+    """What is impossible or doubtful about the intrinsics of a pinhole camera.
 
     Args:
-        width, height: of the photo, in pixels.
-        fx, fy, cx, cy: focal lengths and principal point, in pixels.
-        known_focal: the focal length in EXIF, in pixels.
+        width, height: of the photo in pixels.
+        fx, fy: positive focal lengths in pixels.
+        cx, cy: the principal point in pixels from the upper left corner.
+        known_focal: the focal length in pixels from another source, such as the EXIF data.
     """
-    found = []
-    view = 2 * math.degrees(math.atan(max(width / fx, height / fy) / 2))
-    if not _USUAL_VIEW[0] <= view <= _USUAL_VIEW[1]:
-        found.append(
-            Finding(
-                "focal length",
-                f"the focal length of {max(fx, fy):.4g} pixels for photos of {width}x{height} "
-                f"is a field of view of {view:.3g}°",
-                not _POSSIBLE_VIEW[0] <= view <= _POSSIBLE_VIEW[1],
-            )
-        )
-    ratio = max(fx / fy, fy / fx)
-    if ratio > _SQUARE:
-        found.append(
-            Finding(
-                "pixels",
-                f"the pixels are not square: fx is {fx:.5g} and fy {fy:.5g} pixels",
-                ratio > _STRETCHED,
-            )
-        )
-    offset = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
-    if offset > _CENTRAL:
-        found.append(
-            Finding(
-                "principal point",
-                f"the principal point is at {cx:.5g}, {cy:.5g}, and the middle of the photo at "
-                f"{width / 2:g}, {height / 2:g}",
-                offset > 0.5,
-            )
-        )
-    if known_focal is not None:
-        focal = math.sqrt(fx * fy)
-        if max(focal / known_focal, known_focal / focal) > _AGREES_WITH_EXIF:
-            found.append(
-                Finding(
-                    "focal length in EXIF",
-                    f"the focal length is {focal:.0f} pixels, but {known_focal:.0f} in EXIF",
-                    False,
-                )
-            )
-    return found
+    return [
+        *_field_of_view(width, height, fx, fy),
+        *_aspect(fx, fy),
+        *_principal_point(width, height, cx, cy),
+        *_known(math.sqrt(fx * fy), known_focal),
+    ]
+
+
+def _field_of_view(width: int, height: int, fx: float, fy: float) -> list[Finding]:
+    angle = max(field_of_view(width, fx), field_of_view(height, fy))
+    if _NARROWEST <= angle <= _WIDEST:
+        return []
+    text = (
+        f"a focal length of {fx:.5g} pixels for photos of {width}x{height} is a field of view of "
+        f"{angle:.3g}°"
+    )
+    if angle > _WIDEST:
+        text += "; a pinhole camera has less than 150°; the focal length must be in pixels"
+        return [Finding("field of view", text, impossible=True)]
+    text += "; the focal length must be in pixels of these photos"
+    return [Finding("field of view", text, impossible=angle < _NARROWEST_TELESCOPE)]
+
+
+def _aspect(fx: float, fy: float) -> list[Finding]:
+    if _SQUARE[0] <= fx / fy <= _SQUARE[1]:
+        return []
+    text = f"fx is {fx / fy:.3f} of fy, but pixels are square ({fx:.5g} and {fy:.5g})"
+    return [Finding("pixel aspect", text)]
+
+
+def _principal_point(width: int, height: int, cx: float, cy: float) -> list[Finding]:
+    where = f"the principal point ({cx:.5g}, {cy:.5g})"
+    size = f"photos of {width}x{height}"
+    if not (0.0 <= cx <= width and 0.0 <= cy <= height):
+        text = f"{where} is outside of {size}; it must be in pixels of these photos"
+        return [Finding("principal point", text, impossible=True)]
+    off = max(abs(cx / width - 0.5), abs(cy / height - 0.5))
+    if off <= _OFF_CENTRE:
+        return []
+    text = f"{where} is {off:.0%} of the size away from the centre of {size}"
+    return [Finding("principal point", text)]
+
+
+def _known(focal: float, known: float | None) -> list[Finding]:
+    if known is None or _AS_KNOWN[0] <= focal / known <= _AS_KNOWN[1]:
+        return []
+    text = (
+        f"the focal length is {focal:.5g} pixels, but {known:.5g} by the EXIF data of the photos "
+        f"({focal / known:.2f} of it)"
+    )
+    return [Finding("focal length", text)]

@@ -32,6 +32,7 @@ def load_dataset(
     images: str = "images",
     resolution: int | None = None,
     hold_out: int | None = 8,
+    first_held_out: int = 0,
     test_list: Path | str | Sequence[str] | None = None,
 ) -> Dataset:
     """Read a dataset of posed images. Image headers are checked; pixels are not decoded.
@@ -44,20 +45,27 @@ def load_dataset(
         resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
             they are complete. Any other number is a width in pixels to which wider images are
             scaled down. None or −1 keeps the size.
-        hold_out: every ``hold_out``-th image is held out for testing, starting with the first in
-            the order of names. If the dataset has its own split, this split is used instead. None:
-            no image is held out, even if the dataset has its own split.
+        hold_out: every ``hold_out``-th image in the order of names is held out for testing. If the
+            dataset has its own split, this split is used instead. None: no image is held out, even
+            if the dataset has its own split.
+        first_held_out: index of the first of these images. 0 is the protocol of the papers. If
+            there are not so many images, the middle one is held out.
         test_list: names of the test images, or a text file with one name per line. It replaces
             ``hold_out`` and the dataset's own split.
 
     Raises:
         UserError: ``path`` is not a dataset; a file is damaged; a camera has lens distortion; an
             image is missing, damaged, or does not have the size of its camera.
-        SettingError: ``images`` is not the folder of the images, or ``resolution`` or ``hold_out``
-            is invalid.
+        SettingError: ``images`` is not the folder of the images, or ``resolution``, ``hold_out`` or
+            ``first_held_out`` is invalid.
     """
     return read_files(
-        path, images=images, resolution=resolution, hold_out=hold_out, test_list=test_list
+        path,
+        images=images,
+        resolution=resolution,
+        hold_out=hold_out,
+        first_held_out=first_held_out,
+        test_list=test_list,
     ).dataset(resolution)
 
 
@@ -107,6 +115,7 @@ def read_files(
     images: str = "images",
     resolution: int | None = None,
     hold_out: int | None = 8,
+    first_held_out: int = 0,
     test_list: Path | str | Sequence[str] | None = None,
 ) -> DatasetFiles:
     """Read and check the files of a dataset, once for several resolutions.
@@ -134,7 +143,7 @@ def read_files(
         list(zip(posed, headers, sizes, strict=True)),
         points,
         description,
-        _test_names(posed, hold_out, test_list),
+        _test_names(posed, hold_out, first_held_out, test_list),
     )
 
 
@@ -305,7 +314,10 @@ def _check_mask(image: PosedImage, header: Header, mask: Header) -> None:
 
 
 def _test_names(
-    posed: list[PosedImage], hold_out: int | None, test_list: Path | str | Sequence[str] | None
+    posed: list[PosedImage],
+    hold_out: int | None,
+    first: int,
+    test_list: Path | str | Sequence[str] | None,
 ) -> set[str]:
     names = sorted(image.name for image in posed)
     if test_list is not None:
@@ -314,9 +326,11 @@ def _test_names(
         return set()
     if hold_out < 1:
         raise SettingError("hold_out", f"{hold_out} is not valid; use 2 or more")
+    if first < 0:
+        raise SettingError("first_held_out", f"{first} is not valid; use 0 or more")
     if any(image.split == "test" for image in posed):
         return {image.name for image in posed if image.split == "test"}
-    return set(names[::hold_out])
+    return set(names[first::hold_out]) or {names[len(names) // 2]}
 
 
 def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]:

@@ -41,6 +41,9 @@ _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE
 # Converts OpenGL's camera axes to OpenCV's; it is its own inverse.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
+# Two statements of a focal length differ by less than this factor, or contradict each other.
+_SAME_LENS = 1.05
+
 _Json = dict[str, Any]
 _Split = Literal["train", "test"]
 
@@ -77,6 +80,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
     first_scene: _Json = {}
     for index, path in enumerate(files):
         scene = _read_json(path)
+        _warn_of_contradictions(path, scene)
         first_scene = first_scene or scene
         split: _Split | None = None
         if len(files) > 1:
@@ -272,19 +276,36 @@ def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float
     It is read from ``fl_x``, ``camera_angle_x`` (radians) or ``x_fov`` (degrees).
     """
     pixels = _number(where, values, f"fl_{axis}")
-    if pixels is not None:
-        return pixels
     angle = _number(where, values, f"camera_angle_{axis}")
     degrees = _number(where, values, f"{axis}_fov")
     if angle is None and degrees is not None:
         angle = math.radians(degrees)
-    if angle is None:
-        return None
+    if angle is None or (pixels is not None and not 0 < angle < math.pi):
+        return pixels
     if not 0 < angle < math.pi:
         raise UserError(
             f"{where}: the field of view {math.degrees(angle):g}° is not valid; correct it"
         )
-    return 0.5 * size / math.tan(0.5 * angle)
+    return 0.5 * size / math.tan(0.5 * angle) if pixels is None else pixels
+
+
+def _warn_of_contradictions(path: Path, scene: _Json) -> None:
+    """Warn if ``fl_x`` and ``camera_angle_x`` of the file are of different lenses."""
+    for axis, side in (("x", "w"), ("y", "h")):
+        focal, size, angle = (
+            scene.get(key) for key in (f"fl_{axis}", side, f"camera_angle_{axis}")
+        )
+        numbers = [n for n in (focal, size, angle) if isinstance(n, int | float)]
+        if len(numbers) < 3 or min(numbers) <= 0 or numbers[2] >= math.pi:
+            continue
+        stated = 0.5 * numbers[1] / math.tan(0.5 * numbers[2])
+        if not 1 / _SAME_LENS < numbers[0] / stated < _SAME_LENS:
+            logger.warning(
+                "%s: fl_%s is %g pixels, but camera_angle_%s (%g°) is a focal length of %.5g "
+                "pixels; fl_%s is used; remove the wrong one",
+                *(path, axis, numbers[0], axis, math.degrees(numbers[2]), stated, axis),
+            )
+            return
 
 
 def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
@@ -295,6 +316,11 @@ def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < 1e15).all():
         raise UserError(f"{where}: transform_matrix must be 4 rows of 4 numbers; export it again")
+    if matrix.shape == (4, 4) and matrix[3, :3].any() and not matrix[:3, 3].any():
+        raise UserError(
+            f"{where}: transform_matrix is transposed: its last row must be 0 0 0 1, and its last "
+            "column the position; export it again"
+        )
     axes = matrix[:3, :3]
     # A scaled camera object in Blender has a scaled matrix; only the directions are used. The
     # nearest rotation corrects rounding errors of exporters. Larger differences are an error.

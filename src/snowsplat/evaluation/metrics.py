@@ -43,6 +43,9 @@ class ViewMetrics:
     ssim: float
     psnr_aligned: float  # dB; colour-aligned
     lpips: float | None = None
+    # Share of the variance of the photo that the colour-aligned image explains, at most 1. Unlike a
+    # PSNR, it does not depend on the contrast of the photo. None: not measured.
+    explained: float | None = None
 
 
 @dataclass(frozen=True)
@@ -129,15 +132,25 @@ def compare(
         name: the name of the view.
     """
     image = image.clamp(0.0, 1.0)
+    aligned = color_aligned(image, target, mask)
     if mask is not None:
         image = torch.where(mask[:, :, None], image, target)
     return ViewMetrics(
         name=name,
         psnr=psnr(image, target, mask),
         ssim=float(ops.ssim(image, target)),
-        psnr_aligned=psnr(color_aligned(image, target, mask), target, mask),
+        psnr_aligned=psnr(aligned, target, mask),
         lpips=None if lpips is None else lpips(image, target),
+        explained=_explained(aligned, target, mask),
     )
+
+
+def _explained(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    """`ViewMetrics.explained`; 0 for a photo of one colour."""
+    x, y = (each.to(torch.float64) for each in (image, target))
+    x, y = (x.flatten(0, 1), y.flatten(0, 1)) if mask is None else (x[mask], y[mask])
+    variance = float((y - y.mean(0)).square().sum()) if len(y) else 0.0
+    return 1.0 - float((x - y).square().sum()) / variance if variance > 0.0 else 0.0
 
 
 @torch.no_grad()

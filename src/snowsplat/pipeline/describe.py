@@ -34,7 +34,8 @@ def describe(path: Path | str) -> dict[str, Any]:
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
       ``path`` is the output folder of `train` or of `make`.
-    - "dataset": number and sizes of the photos, focal lengths, number of points, extent.
+    - "dataset": number and sizes of the photos, focal lengths, number of points, extent, and
+      what is impossible or doubtful about the cameras.
 
     Bounds and lengths are in world units, in the frame of the file. torch is imported only for
     datasets.
@@ -161,9 +162,11 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
 
 def _dataset(path: Path) -> dict[str, Any]:
     from snowsplat.data import load_dataset  # torch; the other kinds do not need it
+    from snowsplat.data.judge import judge
 
     dataset = load_dataset(path)
     views = [*dataset.train, *dataset.test]
+    findings = judge(dataset)
     sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)
     focal = sorted(view.camera.fx for view in views)
     return {
@@ -178,4 +181,6 @@ def _dataset(path: Path) -> dict[str, Any]:
         "points": 0 if dataset.points is None else len(dataset.points),
         "extent": float(f"{dataset.extent:.5g}"),
         "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],
+        "impossible": [finding.text for finding in findings if finding.impossible],
+        "doubtful": [finding.text for finding in findings if not finding.impossible],
     }

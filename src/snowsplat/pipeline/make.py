@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat import ops
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
@@ -38,7 +39,8 @@ from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
-from snowsplat.training.settings.declare import Settings
+from snowsplat.training.settings.config import AutoOnOff, TrainConfig
+from snowsplat.training.settings.declare import Settings, same
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
@@ -46,7 +48,9 @@ from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
 RECORD = "make.json"
-HOLD_OUT = 8
+# Every 8th photo is held out, from the fifth on. The first photo of a walk is at its end: it shows
+# places that no other photo shows, so it says little about the scene.
+HOLD_OUT, FIRST_HELD_OUT = 8, 4
 # The fields of a preset that affect the training.
 _TRAINING_FIELDS = (
     "side",
@@ -80,6 +84,7 @@ class MakeOptions(Settings):
             Stages that an earlier run has finished are not counted. A resumed training run has the
             time that was left at its interruption.
         memory: memory limit of the training; see `TrainOptions`.
+        exposure: whether to learn a gain for each photo and channel; see ``TrainConfig.exposure``.
         compute: device and threads.
 
     Raises:
@@ -89,6 +94,7 @@ class MakeOptions(Settings):
     quality: Quality | None = None
     minutes: float | None = option.minutes()
     memory: int | str | None = option.memory()
+    exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
     compute: Compute = field(default_factory=Compute)
 
 
@@ -101,8 +107,12 @@ class MakeResult:
         folder: the output folder of the training.
         dataset_report: the HTML page about the camera poses.
         renders, photos: folders with the rendered test views and the held-out photos.
-        psnr, ssim: means over the held-out photos; PSNR in dB.
+        psnr, ssim, psnr_aligned: means over the held-out photos; PSNR in dB. If gains of exposure
+            are learnt, the colour-aligned PSNR tells the quality.
         views: number of held-out photos.
+        exposures: whether gains of exposure are learnt.
+        verdict: whether the scene is good, usable or poor, and why; None if it is not known, as for
+            a scene of an earlier version.
         seconds: duration of this call.
     """
 
@@ -113,7 +123,10 @@ class MakeResult:
     photos: Path
     psnr: float
     ssim: float
+    psnr_aligned: float
     views: int
+    exposures: bool
+    verdict: Verdict | None
     seconds: float
 
 
@@ -272,6 +285,11 @@ class _Job:
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
         else:
             settings |= {"minutes": self.options.minutes}
+        settings |= {
+            "hold_out": HOLD_OUT,
+            "first_held_out": FIRST_HELD_OUT,
+            "exposure": self.options.exposure,
+        }
         folder = OutputFolder(self.out / SCENE)
         outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
         scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
@@ -286,7 +304,10 @@ class _Job:
             photos=target / "gt",
             psnr=scene["psnr"],
             ssim=scene["ssim"],
+            psnr_aligned=scene["psnr_aligned"],
             views=scene["views"],
+            exposures=scene["exposures"],
+            verdict=Verdict.from_json(scene["verdict"]),
             seconds=self._elapsed(),
         )
 
@@ -329,32 +350,35 @@ class _Job:
         )
         same = self.stages.about.get("training") == settings
         if same and checkpoint.exists(folder.checkpoints):
-            resume(folder.path, options, observer=self.observer, page=self.page)
+            trained = resume(folder.path, options, observer=self.observer, page=self.page)
         else:
             shutil.rmtree(folder.path, ignore_errors=True)
             self.stages.about["training"] = settings
             self.stages.save()
             new = self._new_training(options)
-            train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
+            trained = train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
         metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
             shutil.copyfile(folder.scene_path(metrics["iteration"]), temporary)
-        result = {key: metrics[key] for key in ("iteration", "psnr", "ssim")}
-        return result | {"views": len(metrics["views"])}
+        result = {key: metrics[key] for key in ("iteration", "psnr", "ssim", "psnr_aligned")}
+        return result | {
+            "views": len(metrics["views"]),
+            "exposures": (folder.path / "exposure.json").is_file(),
+            "verdict": trained.verdict and trained.verdict.as_json(),
+        }
 
     def _new_training(self, options: TrainOptions) -> TrainOptions:
+        settings: dict[str, Any] = {
+            "leave_out_after": _LEAVE_OUT_AFTER,
+            "exposure": self.options.exposure,
+        }
+        options = replace(options, hold_out=HOLD_OUT, first_held_out=FIRST_HELD_OUT)
         if self.options.minutes is not None:
             minutes = self._minutes_left(60.0 * self.options.minutes)
-            settings: dict[str, Any] = {"leave_out_after": _LEAVE_OUT_AFTER}
-            return replace(options, hold_out=HOLD_OUT, minutes=minutes, settings=settings)
+            return replace(options, minutes=minutes, settings=settings)
         preset = PRESETS[self.plan.quality]
-        settings = {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
-        return replace(
-            options,
-            hold_out=HOLD_OUT,
-            resolution=_width(self.dataset, preset),
-            settings=settings | {"leave_out_after": _LEAVE_OUT_AFTER},
-        )
+        settings |= {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
+        return replace(options, resolution=_width(self.dataset, preset), settings=settings)
 
     def _minutes_left(self, given: float) -> float:
         """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""

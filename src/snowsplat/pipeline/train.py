@@ -15,6 +15,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run import option
+from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
@@ -57,6 +58,9 @@ class TrainOptions(Settings):
             number: the new width in pixels; default: unchanged.
         hold_out: hold out every ``hold_out``-th photo for testing, if the dataset has no split of
             its own; default: none.
+        first_held_out: index of the first of these photos in the order of names; default: 0, as in
+            the papers. There, the first photo of a walk is at its end, where the fewest photos
+            show the scene.
         test_list: a text file with the names of the photos to hold out; replaces ``hold_out``.
         minutes: finish within this time. The number of steps, the size of the photos and the
             maximum number of Gaussians are chosen for this time, unless other options set them. In
@@ -64,6 +68,7 @@ class TrainOptions(Settings):
         memory: memory limit of the training, in bytes or as a text such as "4GB". On a GPU, this is
             memory of the GPU; on the CPU, it is memory in addition to that of Python and its
             libraries. Default: no limit.
+        trust_cameras: train even if the cameras are impossible, see `check_cameras`.
         save_iterations: steps after which to save the scene, in addition to the last step.
         checkpoint_seconds: time between checkpoints, if ``settings`` does not contain
             checkpoint_every; default: no checkpoints.
@@ -78,9 +83,11 @@ class TrainOptions(Settings):
     images: str | None = None
     resolution: int | None = option.resolution()
     hold_out: int | None = option.hold_out()
+    first_held_out: int | None = option.first_held_out()
     test_list: Path | None = None
     minutes: float | None = option.minutes()
     memory: int | str | None = option.memory()
+    trust_cameras: bool = False
     save_iterations: tuple[int, ...] = setting((), "Steps after which to save.", least=-1)
     checkpoint_seconds: float | None = setting(None, "Time between checkpoints.", least=0.0)
     compute: Compute = field(default_factory=Compute)
@@ -106,6 +113,7 @@ class TrainOptions(Settings):
             "hold_out": 8
             if self.hold_out is None and self.test_list is not None
             else self.hold_out,
+            "first_held_out": self.first_held_out,
             "test_list": None if self.test_list is None else str(Path(self.test_list).absolute()),
         }
         settings = before or DatasetSettings(path="")
@@ -139,7 +147,8 @@ def train(
         The files of the scene, and statistics of the training run.
 
     Raises:
-        UserError: an unusable dataset, setting, device or folder; too little memory; a loss or
+        UserError: an unusable dataset, impossible cameras (see `TrainOptions`); an unusable
+            setting, device or folder; too little memory; a loss or
             parameters that are not finite. A new folder is removed if it contains no results.
         TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
         KeyboardInterrupt: Ctrl-C before the first step; nothing is saved.
@@ -229,6 +238,7 @@ class _Job:
         self.device = options.compute.apply()
         reset_peak()
         self.memory_before = resident_bytes()
+        self.doubts: tuple[str, ...] = ()  # about the cameras of the dataset
 
     def train(self, path: Path | str) -> TrainResult:
         options = self.options
@@ -238,6 +248,7 @@ class _Job:
         config = recipe(name, **options.settings)
         files = settings.read_files()
         dataset = files.dataset(settings.resolution)
+        self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
         plan = None
         if budget is not None:
             plan = budget.plan(
@@ -280,6 +291,9 @@ class _Job:
         settings = _resumed_dataset(options, path, start, meta)
         config = _resumed_config(options, start, meta)
         dataset = settings.load()
+        self.doubts = check_cameras(
+            dataset, settings.path, trusted=True
+        )  # the first run has refused, or not
         memory = self._memory(dataset, config, _gaussians_in(start))
         self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
         trainer = self._trainer(dataset, memory.plan.config, schedule, start.tensors)
@@ -337,6 +351,7 @@ class _Job:
             save_iterations=self.options.save_iterations,
             checkpoint_seconds=self.options.checkpoint_seconds,
             page=self.page,
+            doubts=self.doubts,
         )
         if self.page is not None:
             self.page.open_training(trainer, self.out.path.name, self.observer)
@@ -374,7 +389,8 @@ def _resumed_dataset(
     def relevant(settings: DatasetSettings) -> tuple[Any, ...]:
         resolution = max(1, settings.resolution)  # -1 is full resolution too
         tests = settings.test_list and Path(settings.test_list).name
-        return settings.images, resolution, settings.hold_out, tests
+        split = settings.hold_out, settings.first_held_out, tests
+        return settings.images, resolution, split
 
     settings = options.dataset_settings(path, meta.dataset)
     if relevant(settings) != relevant(meta.dataset):

@@ -16,6 +16,14 @@ VIEWING_DISTANCE = 3.0
 # are weak evidence. These are the assumed standard deviations.
 _ROLL = math.radians(3)
 _COMMON_PITCH = math.radians(30)
+# A photographer also has a habit, which is the same in all photos.
+_HABIT = math.radians(1.5)
+# A scene keeps its up direction −y if most cameras are level to within this angle, or if their up
+# direction differs by less, in standard deviations and as an angle. Datasets that are made with
+# sensors are level even if the cameras were not.
+_LEVEL = math.sin(math.radians(5))
+_UPWARD = math.sin(math.radians(1))  # the upper edges of photos that do not look straight down
+_CONTRADICTION, _SAME = 3.0, math.radians(30)
 # Largest angle between the up direction and the normals of surfaces parallel to the ground.
 _PARALLEL = math.radians(8)
 # Largest angle between the usual up direction and that of a scene without cameras.
@@ -35,16 +43,41 @@ _NO_DIRECTION = 0.3
 def up_direction(rotations: np.ndarray) -> np.ndarray:
     """The up direction of the world: the one most perpendicular to the x axes of the cameras.
 
+    (3,) unit vector in the world frame; see `level_of_cameras`.
+    """
+    return level_of_cameras(rotations)[0]
+
+
+def scene_up(rotations: np.ndarray) -> np.ndarray:
+    """The up direction of a scene with cameras: −y, unless the cameras contradict it.
+
+    Many datasets, such as those of COLMAP, have an arbitrary frame. Their up direction is that of
+    the cameras. ``rotations`` as in `level_of_cameras`; (3,) unit vector in the world frame.
+    """
+    usual = np.array([0.0, -1.0, 0.0])
+    tilts, upper = np.abs(rotations[:, 0] @ usual), -rotations[:, 1].mean(axis=0)
+    if np.median(tilts) < _LEVEL and upper @ usual > _UPWARD:
+        return usual
+    up, precision = level_of_cameras(rotations)
+    away = usual - up
+    same = up @ usual > math.cos(_SAME) and away @ precision @ away < _CONTRADICTION**2
+    return usual if same else up
+
+
+def level_of_cameras(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The up direction of the world, and how certain the cameras are about it.
+
     It is the most likely direction if the roll of each photo has the standard deviation `_ROLL` and
     the mean pitch of all photos has `_COMMON_PITCH`. If all x axes are parallel, for example in
     front of a wall, the mean pitch decides. Photos whose roll is much larger than `_ROLL` have a
-    small weight (Cauchy weights).
+    small weight (Cauchy weights). The covariance includes `_HABIT`.
 
     Args:
         rotations: (N, 3, 3) rotations of cam_from_world.
 
     Returns:
-        (3,) unit vector in the world frame.
+        (3,) unit vector in the world frame, and the inverse (3, 3) of its covariance, in 1/rad²,
+        perpendicular to it.
     """
     x, upper, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
     # If the upper edges of the photos point in all directions, the photos look straight down (not
@@ -66,7 +99,8 @@ def up_direction(rotations: np.ndarray) -> np.ndarray:
     # If there are few photos that look down, their upper edges may have a common direction by
     # chance. Then the sign of `up` comes from the viewing directions.
     looks_down = abs(upper @ up) < _NO_DIRECTION
-    return -up if looks_down and forward @ up > 0 else up
+    precision = across.T @ np.linalg.inv(np.linalg.inv(matrix) + _HABIT**2 * np.eye(2)) @ across
+    return (-up if looks_down and forward @ up > 0 else up), precision
 
 
 def up_of_surfaces(

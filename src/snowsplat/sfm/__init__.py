@@ -3,7 +3,7 @@
     stage     what it does                                code                files
     photos    copies photos, video frames and masks       ingest/             input/
     poses     estimates the camera poses                  colmap/             distorted/
-    images    removes the distortion, orients the scene   orient, undistort   images/, sparse/0/
+    images    removes the distortion, orients the scene   orient/, undistort  images/, sparse/0/
     report    writes dataset_report.html                  dataset_report
 
 Each stage reads the files of the earlier stages and writes its own. `dataset_folder.make_dataset`

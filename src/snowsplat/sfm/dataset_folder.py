@@ -26,13 +26,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
+from snowsplat.data.placement import PLACEMENT
+from snowsplat.sfm.capture_verdict import capture_verdict
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import thread_count
+from snowsplat.sfm.coverage import measure_coverage
 from snowsplat.sfm.dataset_report import REPORT, write_report
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sources import RECORDS, Sources, find_sources
 from snowsplat.sfm.orient import orientation
+from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
@@ -100,7 +104,8 @@ def make_dataset(
 
     Returns:
         The outcome of each stage. Its result is a JSON value: a `Gathered` for "photos", an
-        `SfmResult` for "poses", an `Undistorted` for "images", the file name for "report".
+        `SfmResult` for "poses", an `Undistorted` for "images"; for "report", the file name and a
+        `Verdict`.
 
     Raises:
         UserError: the photos cannot be used, ``folder`` contains other files, no poses were found,
@@ -193,17 +198,22 @@ def _run(
     stage("images", {"resize": options.resize}, _IMAGE_FOLDERS, make_images)
 
     def write(report: Report) -> dict[str, Any]:
+        sfm, coverage = outcomes["poses"].result, measure_coverage(folder / "sparse" / "0")
+        bad = problems(folder / "images", coverage.names)
+        verdict = capture_verdict(coverage, sfm, bad)
         facts = {
             "inputs": stages.about["inputs"],
             "settings": _settings_as_json(options),
             "gathered": outcomes["photos"].result,
-            "sfm": outcomes["poses"].result,
+            "sfm": sfm,
             "undistorted": outcomes["images"].result,
             "seconds": {name: outcome.seconds for name, outcome in outcomes.items()},
+            "problems": bad,
+            "verdict": verdict.as_json(),
         }
-        return {"file": write_report(folder, facts).name}
+        return {"file": write_report(folder, facts).name, "verdict": facts["verdict"]}
 
-    stage("report", {}, [REPORT], write)
+    stage("report", {"verdict": 1}, [REPORT], write)  # earlier versions gave no verdict
     return outcomes
 
 
@@ -243,11 +253,14 @@ def _undistort(
 
     for name in _IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
-    scene_from_sfm = orientation(pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0"))
-    made = undistort(
-        folder, photos, scene_from_sfm, options.resize, report, threads=options.sfm.threads
-    )
-    return asdict(made) | {"scene_from_sfm": scene_from_sfm.to_json()}
+    model = pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0")
+    oriented = orientation(model, photos)
+    scene_from_sfm, threads = oriented.scene_from_sfm, options.sfm.threads
+    made = undistort(folder, photos, scene_from_sfm, options.resize, report, threads=threads)
+    return asdict(made) | {
+        "scene_from_sfm": scene_from_sfm.to_json(),
+        PLACEMENT: asdict(oriented.placement),
+    }
 
 
 # Checks of the folder

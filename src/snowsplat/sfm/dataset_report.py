@@ -14,8 +14,9 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
+from snowsplat.data.placement import Placement, placement_of
+from snowsplat.evaluation import verdict
 from snowsplat.sfm.more_photos import Advice, advice
-from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -26,7 +27,6 @@ REPORT = "dataset_report.html"
 _MAX_THUMBNAILS = 24  # evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
-_MAX_ERROR = 1.5  # pixels; a larger reprojection error is reported. Good models are below 1
 
 _FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}
 _STAGES = {"photos": "reading photos", "poses": "estimating poses", "images": "undistorting"}
@@ -45,7 +45,8 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
 
     Args:
         facts: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
-            an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage.
+            an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage;
+            "problems", what is wrong with single photos, by name; "verdict", a `Verdict`.
 
     Raises:
         UserError: the model in ``sparse/0`` or an image cannot be read.
@@ -56,11 +57,14 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
     rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
     more = advice(photos, xyz)
+    placement = placement_of(facts["undistorted"])
     body = [
         _headline(name, facts),
+        _verdict(facts["verdict"]),
         _cards(facts),
         _your_photos(dataset, [photo.name for photo in photos], facts, more),
-        _maps(photos, xyz, rgb, more.places),
+        _maps(photos, xyz, rgb, more.places, placement),
+        _placed(placement),
         _strip(dataset, [photo.name for photo in photos]),
         _lenses(facts["sfm"], facts["undistorted"]),
         _left_out(facts),
@@ -68,7 +72,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _next_step(dataset),
     ]
     path = dataset / REPORT
-    write_text(path, page(f"{name} – dataset", body, _STYLE))
+    write_text(path, page(f"{name} – dataset", body, _STYLE + verdict.STYLE))
     return path
 
 
@@ -102,13 +106,12 @@ def _headline(name: str, facts: dict[str, Any]) -> str:
             f'<p class="bad">The photos form {len(sfm["sub_models"])} separate groups ({sizes} '
             "photos); only the largest is used. Take more photos in between to connect them.</p>"
         )
-    error = sfm["reprojection_error"]
-    if error is not None and error > _MAX_ERROR:
-        lines.append(
-            '<p class="bad">The reprojection error is high. Remove photos that are blurred or show '
-            "moving objects, or try another camera model.</p>"
-        )
     return "\n".join(lines)
+
+
+def _verdict(values: dict[str, Any]) -> str:
+    judged = verdict.Verdict.from_json(values)
+    return "" if judged is None else judged.html("the photos")
 
 
 def _cards(facts: dict[str, Any]) -> str:
@@ -128,10 +131,10 @@ def _cards(facts: dict[str, Any]) -> str:
 def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], more: Advice) -> str:
     """What was wrong, and what to do better, for the person who took the photos."""
     lines = []
-    bad = problems(dataset / "images", names)
+    bad = facts["problems"]
     without = len(facts["sfm"]["unregistered"]) + len(facts["gathered"]["skipped"])
-    if not bad and not without:
-        lines.append("<p>All photos are sharp, well exposed, and have a pose.</p>")
+    if not bad:
+        lines.append("<p>No photo is blurred, too dark or too bright.</p>")
     if bad:
         count = f"{len(bad)} of {len(names)} photos"
         lines.append(
@@ -140,6 +143,9 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
         )
     if without:
         lines.append(f"<p>{without} photos were not used; the reasons are below.</p>")
+    lines += [
+        f"<p>Fixed to the frame: {text(note)}.</p>" for note in facts["gathered"].get("notes", [])
+    ]
     lines += _more_photos(more)
     return "<h2>Your photos</h2>\n" + "\n".join(lines)
 
@@ -179,8 +185,13 @@ def _more_photos(more: Advice) -> list[str]:
 
 
 def _maps(
-    photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray, marks: np.ndarray
+    photos: Sequence[PlacedPhoto],
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    marks: np.ndarray,
+    placement: Placement | None,
 ) -> str:
+    unit = "m" if placement is not None and placement.is_metric else "units"
     captions = (
         "From above. Orange: the cameras; white: the first camera.",
         "From the side.",
@@ -189,14 +200,23 @@ def _maps(
         captions = (captions[0] + " Numbers: places for more photos.", captions[1])
     if any(photo.sequence is not None for photo in photos):
         captions = (captions[0] + " Blue: the path of the video.", captions[1])
+    drawings = draw_scene(photos, xyz, rgb, marks, unit)
     # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
     figures = "\n".join(
         f'<figure style="flex:{drawing.width} 1 {drawing.width // 2}px;'
         f'max-width:{2 * drawing.width}px">{drawing.svg}'
         f"<figcaption>{caption}</figcaption></figure>"
-        for drawing, caption in zip(draw_scene(photos, xyz, rgb, marks), captions, strict=True)
+        for drawing, caption in zip(drawings, captions, strict=True)
     )
     return f'<h2>Cameras and points</h2>\n<div class="maps">{figures}</div>'
+
+
+def _placed(placement: Placement | None) -> str:
+    """What the frame of the scene was found from."""
+    if placement is None:  # a dataset of an earlier version
+        return ""
+    rows = [[text(part) for part in line.split(": ", 1)] for line in placement.lines()]
+    return f"<h2>Level, north and scale</h2>\n{table([], rows)}"
 
 
 def _strip(dataset: Path, names: Sequence[str]) -> str:

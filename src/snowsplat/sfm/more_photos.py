@@ -1,6 +1,6 @@
 """Where more photos would help: gaps between the cameras, and parts that too few photos show.
 
-The frame is that of `orient`: x right, y down, z forward.
+The frame is that of `orient`: y points down.
 """
 
 from __future__ import annotations

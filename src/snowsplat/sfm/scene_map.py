@@ -1,23 +1,23 @@
 """Cameras and points of a dataset as SVG drawings from above and from the side, at one scale.
 
-The frame is that of `orient`: x right, y down, z forward. The median distance from a camera to the
-points is about `VIEWING_DISTANCE` units.
+The frame is that of `orient`: y points down.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
-from snowsplat.scene.orientation import VIEWING_DISTANCE
-
 _WIDTH = 520  # of the largest drawing, in SVG units
 _HEIGHT = 400
 _MARGIN = 16
 _MAX_POINTS = 6000  # per drawing; with more points, the file is larger but the drawing not clearer
+_REACH = 3.0  # points farther outside are not drawn, in units of the usual distance to a camera
+_POINTS_SAMPLED = 2000  # for the usual distance
 _SHADES = 12  # levels of red, green and blue: all points of one colour become one SVG path
 
 
@@ -72,11 +72,12 @@ def draw_scene(
     xyz: np.ndarray,
     rgb: np.ndarray,
     marks: np.ndarray = _NO_MARKS,
+    unit: str = "units",
 ) -> list[Drawing]:
     """One drawing for each projection, of points (P, 3) and their colours (P, 3) uint8.
 
     All cameras are drawn, and numbered ``marks`` (K, 3). Points are drawn if they are near the
-    cameras and not outliers.
+    cameras and not outliers. ``unit`` is the unit of length, which the scale bars name.
     """
     centres = np.array([photo.centre for photo in photos]).reshape(-1, 3)
     low, high = _box(np.concatenate([centres, marks]), xyz)
@@ -101,6 +102,7 @@ def draw_scene(
             extent * scale,
             scale,
             depth,
+            unit,
         )
         for projection, extent in zip(_PROJECTIONS, extents, strict=True)
     ]
@@ -115,12 +117,21 @@ def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest coordinates (3,) of what is drawn, without outliers and distant points."""
     low, high = centres.min(axis=0), centres.max(axis=0)
     if len(xyz):
-        reach = 3 * VIEWING_DISTANCE
+        reach = _REACH * _usual_distance(centres, xyz)
         points_low, points_high = np.quantile(xyz, [0.02, 0.98], axis=0)
         low = np.minimum(low, np.maximum(points_low, low - reach))
         high = np.maximum(high, np.minimum(points_high, high + reach))
-    margin = np.maximum(0.04 * float((high - low).max()), 0.05 * VIEWING_DISTANCE)
+    margin = 0.04 * (float((high - low).max()) or 1.0)
     return low - margin, high + margin
+
+
+def _usual_distance(centres: np.ndarray, xyz: np.ndarray) -> float:
+    """The median distance of the points (P, 3) from the nearest camera."""
+    some = xyz[:: -(-len(xyz) // _POINTS_SAMPLED)]
+    nearest = np.full(len(some), np.inf)
+    for centre in centres:
+        nearest = np.minimum(nearest, np.linalg.norm(some - centre, axis=1))
+    return float(np.median(nearest))
 
 
 def _frustum_depth(centres: np.ndarray, size: np.ndarray) -> float:
@@ -142,6 +153,7 @@ def _draw(
     extent: np.ndarray,
     scale: float,
     depth: float,
+    unit: str,
 ) -> Drawing:
     width, height = (float(value) + 2 * _MARGIN for value in extent)
     axes = np.stack([projection.right, projection.down], 1)
@@ -166,7 +178,8 @@ def _draw(
             f'<path{first} d="M{a}L{b}L{c}L{d}ZM{a}L{eye}L{b}M{c}L{eye}L{d}">'
             f"<title>{escape(photo.name)}</title></path>"
         )
-    svg = "\n".join([*parts, "</g>", *_marks(project(marks)), _scale_bar(height, scale), "</svg>"])
+    bar = _scale_bar(height, scale, unit)
+    svg = "\n".join([*parts, "</g>", *_marks(project(marks)), bar, "</svg>"])
     return Drawing(svg, round(width))
 
 
@@ -208,10 +221,10 @@ def _marks(xy: np.ndarray) -> list[str]:
     ]
 
 
-def _scale_bar(height: float, scale: float) -> str:
-    length = next(v for v in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 1e9) if v * scale > 25)
+def _scale_bar(height: float, scale: float, unit: str) -> str:
+    power = 10.0 ** math.floor(math.log10(25 / scale))
+    length = next(digit * power for digit in (1, 2, 5, 10) if digit * power * scale > 25)
     y, x = height - 10, 12.0
-    unit = "unit" if length == 1 else "units"
     start = _svg_position((x, y))
     return (
         f'<path d="M{start}h{length * scale:.1f}" stroke="#aab4c0" stroke-width="2"/>'

@@ -10,14 +10,11 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.orientation import scene_up
 
 #: The up direction of an oriented scene.
 DEFAULT_UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
-# A camera is considered level if the sine of its roll is at most this. People hold cameras at least
-# as level as this.
-_LEVEL = math.sin(math.radians(5))
 # Optical axes within about 8° of each other are considered parallel. This value is the squared sine
 # of the angle; it is compared with an eigenvalue.
 _PARALLEL = math.sin(math.radians(8)) ** 2
@@ -43,16 +40,8 @@ def typical(cameras: Sequence[Camera]) -> Camera:
 
 
 def up_of(cameras: Sequence[Camera]) -> Tensor:
-    """The up direction, a unit vector (3,) in the world frame.
-
-    It is −y if most cameras are level with respect to it. Otherwise it is estimated from the
-    cameras, because many COLMAP datasets are not oriented.
-    """
-    rotations = rotations_of(cameras)
-    right, upper = rotations[:, 0], -rotations[:, 1].mean(0)
-    if float((right @ DEFAULT_UP).abs().median()) < _LEVEL and float(upper @ DEFAULT_UP) > 0:
-        return DEFAULT_UP
-    return torch.from_numpy(up_direction(rotations.cpu().numpy()))
+    """The up direction, a unit vector (3,) in the world frame; see `scene_up`."""
+    return torch.from_numpy(scene_up(rotations_of(cameras).cpu().numpy()))
 
 
 def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:

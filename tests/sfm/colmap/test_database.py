@@ -9,7 +9,9 @@ import pycolmap
 import pytest
 
 from snowsplat.sfm.colmap.database import (
+    Pair,
     closing_database,
+    displacement_of,
     feature_counts,
     open_database,
     read_descriptors,
@@ -164,3 +166,20 @@ def test_descriptors_of_the_largest_features_are_read(path):
 
 def test_a_photo_without_features_has_no_descriptors(path):
     assert read_descriptors(path, 3, 100).shape == (0, 128)
+
+
+@pytest.mark.parametrize(("moving", "expected"), [(0, 0.5), (10, 0.5), (40, 80.0), (100, 80.0)])
+def test_matches_of_a_logo_do_not_hide_the_displacement(path, moving, expected):
+    """``moving`` of 100 matches move by 80 pixels; the others are fixed to the frame."""
+    first = np.random.default_rng(0).uniform(100, 400, (100, 2)).astype(np.float32)
+    second = first + np.array([0.5, 0])
+    second[:moving, 0] += 79.5
+    indices = np.arange(100, dtype=np.uint32)
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = np.stack([indices, indices], axis=1)
+    with closing_database(path) as database:
+        database.write_keypoints(1, first)
+        database.write_keypoints(2, second.astype(np.float32))
+        database.write_two_view_geometry(1, 2, geometry)
+    pair = Pair(0, 1, 100, False)
+    assert displacement_of(path, [pair], still=6.4) == pytest.approx(expected, abs=1e-3)

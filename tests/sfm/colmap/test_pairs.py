@@ -62,6 +62,29 @@ def test_photos_with_gps_are_matched_with_the_nearest():
     assert near > 0.6 * len(chosen)
 
 
+@pytest.mark.parametrize("error", [0.0, 4.0])
+def test_positions_that_do_not_differ_choose_no_pairs(error):
+    """Indoors, phones store the last position, or positions with an error of metres."""
+    noise = np.random.default_rng(0).normal(0, error / 111_320, (200, 2))
+    places = [(52.0 + north, 4.0 + east, 500.0) for north, east in noise]
+    located = choose_pairs(
+        [photo(i, location=place) for i, place in enumerate(places)], EFFORT, lambda: ring(200, 200)
+    )
+    without = choose_pairs([photo(i) for i in range(200)], EFFORT, lambda: ring(200, 200))
+    if error == 0.0:
+        assert located == without
+    assert set(without.pairs) <= set(located.pairs)
+
+
+def test_photos_at_a_stored_position_need_similar_photos():
+    """Half of the photos were taken along a street, the others in a house at its end."""
+    places = [(52.0, 4.0 + 1e-4 * max(0, i - 100), 0.0) for i in range(200)]
+    photos = [photo(i, location=place) for i, place in enumerate(places)]
+    similar = ring(200, 200)
+    chosen = set(choose_pairs(photos, EFFORT, lambda: similar).pairs)
+    assert all((i, i + step) in chosen for i in range(80) for step in range(1, 11))
+
+
 def test_many_photos_are_matched_with_similar_ones():
     count = 200
     choice = choose_pairs([photo(i) for i in range(count)], EFFORT, lambda: ring(count, count))

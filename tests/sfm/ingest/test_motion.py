@@ -124,3 +124,20 @@ def test_black_frames_and_frames_of_another_size_are_cuts():
 def test_narrow_and_tiny_frames(shape):
     picture = np.ascontiguousarray(wall(width=900, height=900)[: shape[0], : shape[1]])
     assert path([picture, picture]) == [0, 0]
+
+
+def test_what_is_fixed_to_the_frame_does_not_hide_the_motion():
+    pictures = [picture.copy() for picture in pan(10, step=4)]
+    fixed = np.zeros(pictures[0].shape[:2], bool)
+    for top in range(8, 240, 32):  # a grid over most blocks, stronger than the scene
+        fixed[top : top + 16] = True
+    for picture in pictures:
+        picture[fixed] = wall(seed=7)[fixed] // 128 * 255
+    first, last = grey(pictures[0]), grey(pictures[3])
+    assert not has_moved(first, last)
+    assert has_moved(first, last, fixed)
+    assert not has_moved(first, first, fixed)
+    motion = FrameMotion(fixed)
+    values = [motion.add(np.asarray(Image.fromarray(p).convert("L"))) for p in pictures]
+    assert path(pictures)[-1] < 0.02
+    assert values[-1] == pytest.approx(36 / 320, rel=0.35)

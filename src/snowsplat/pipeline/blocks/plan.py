@@ -22,6 +22,7 @@ from snowsplat.pipeline.blocks.cells import Axes, Cell
 from snowsplat.pipeline.blocks.content import block_content
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run import option
+from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.train import TrainOptions
 from snowsplat.training.parts.found_sky import sky_distance
 from snowsplat.training.settings.declare import Settings, setting
@@ -139,6 +140,8 @@ def plan_blocks(
         dataset: see `snowsplat.data.load_dataset`.
         folder: a new or an empty folder for the plan, the blocks and the merged scene.
 
+    Logs a warning if the cameras are impossible or doubtful, see `check_cameras`.
+
     Raises:
         UserError: an unusable dataset or setting; more blocks than photos; ``folder`` contains a
             plan or other files.
@@ -158,6 +161,7 @@ def plan_blocks(
     settings = train_options.dataset_settings(dataset)
     files = settings.read_files()
     whole = files.dataset(settings.resolution)
+    check_cameras(whole, settings.path, trusted=True)
     if options.blocks > len(whole.train):
         raise SettingError(
             "blocks", f"{options.blocks} is too large; there are {len(whole.train)} training photos"

@@ -102,6 +102,7 @@ def _train(
         settings={**plan.settings, "max_gaussians": block.max_gaussians},
         resolution=plan.dataset.resolution,
         memory=memory,
+        trust_cameras=True,  # `plan_blocks` has checked the whole dataset
         checkpoint_seconds=_CHECKPOINT_SECONDS,
         compute=compute,
     )

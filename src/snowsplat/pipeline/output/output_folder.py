@@ -77,6 +77,7 @@ class DatasetSettings:
     images: str = "images"
     resolution: int = -1
     hold_out: int | None = None
+    first_held_out: int = 0
     test_list: str | None = None
 
     def load(self) -> Dataset:
@@ -100,6 +101,7 @@ class DatasetSettings:
             images=self.images,
             resolution=self.resolution,
             hold_out=self.hold_out,
+            first_held_out=self.first_held_out,
             test_list=self.test_list,
         )
 

@@ -46,6 +46,11 @@ def hold_out() -> int | None:
     return setting(None, "Hold out every N-th photo.", least=1, allowed="2 or more")
 
 
+def first_held_out() -> int | None:
+    """The index of the first photo that is held out; None: 0."""
+    return setting(None, "Index of the first held-out photo.", least=0)
+
+
 def recipe() -> str | None:
     """The name of a recipe; None: the default one, or that of the checkpoint."""
     return setting(None, "Name of the recipe.", check=check_recipe)

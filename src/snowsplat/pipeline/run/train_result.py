@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snowsplat.evaluation.metrics import Evaluation
+from snowsplat.evaluation.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class TrainResult:
             the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
         poses: the line about the camera poses: how far they were refined, or that they are not
             exact; None if there is nothing to say.
+        verdict: whether the scene is good, usable or poor, and why; None if no photos were held
+            out.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
             None without a time budget.
     """
@@ -48,6 +51,7 @@ class TrainResult:
     moving: Mapping[str, float]
     ended_early: str | None
     poses: str | None
+    verdict: Verdict | None
     time: tuple[float, float] | None
 
 

@@ -6,10 +6,13 @@ import time
 import warnings
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import pstdev
 
 from PIL.Image import Image
 
-from snowsplat.evaluation.metrics import Evaluation
+from snowsplat.data import Dataset
+from snowsplat.evaluation.metrics import Evaluation, evaluate_views
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
@@ -20,6 +23,7 @@ from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.sfm.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.pace import Pace
 from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.budgets.steps_left import StepsLeft
@@ -35,9 +39,14 @@ from snowsplat.training.parts.overfitting import OverfittingCheck
 from snowsplat.training.parts.pose_refinement import PoseRefinement
 from snowsplat.training.parts.transients import Transients
 from snowsplat.training.report import Trained, write_training_report
+from snowsplat.training.report.scene_verdict import scene_verdict
 from snowsplat.training.settings.stored import config_to_json
 from snowsplat.util.errors import UserError
+from snowsplat.util.process import single_threaded
 from snowsplat.util.process_memory import peak_bytes
+
+#: Number of training views with which the held-out ones are compared.
+_TRAINING_VIEWS = 4
 
 
 @dataclass
@@ -51,6 +60,7 @@ class TrainingRun:
         save_iterations: steps after which the scene is written, in addition to the last step.
         checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
         page: shows the training in the browser.
+        doubts: what is doubtful about the cameras of the dataset, for the report.
     """
 
     out: OutputFolder
@@ -64,6 +74,7 @@ class TrainingRun:
     save_iterations: tuple[int, ...] = ()
     checkpoint_seconds: float | None = None
     page: LivePage | None = None
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.config = self.trainer.config
@@ -246,7 +257,8 @@ class TrainingRun:
             self.out.write_exposure(exposures)
         self.out.write_masks(self._masks())
         poses = self._about_poses(gaussians)
-        report = self._write_report(gaussians, poses)
+        verdict = self._verdict(gaussians, poses)
+        report = self._write_report(gaussians, poses, verdict)
         time_used = None
         if self.budget is not None:
             self.out.write_config(self.settings, replace(self.config, iterations=step))
@@ -265,6 +277,7 @@ class TrainingRun:
             moving={} if self.transients is None else self.transients.shares(),
             ended_early=self._ended_early(),
             poses=poses,
+            verdict=verdict,
             time=time_used,
         )
         self.observer.trained(result)
@@ -288,7 +301,7 @@ class TrainingRun:
             return None
         views = self.trainer.dataset.train
         used = [view for i, view in enumerate(views) if i not in self.trainer.left_out]
-        pixels = misalignment(gaussians, used, self.out.settings()[1])
+        pixels = misalignment(gaussians, used, self.out.settings()[1], self.trainer.step)
         if pixels is None:
             return None
         return (
@@ -296,7 +309,40 @@ class TrainingRun:
             "exact; try --refine-poses"
         )
 
-    def _write_report(self, gaussians: Gaussians, about_poses: str | None) -> Path:
+    def _verdict(self, gaussians: Gaussians, about_poses: str | None) -> Verdict | None:
+        """The verdict on the scene; see `TrainResult.verdict`."""
+        if self.evaluation is None:
+            return None
+        dataset, left_out = self._dataset(), self._left_out()
+        used = [view for view in dataset.train if view.name not in left_out]
+        with single_threaded():
+            trained_on = evaluate_views(
+                gaussians,
+                used[:: -(-len(used) // _TRAINING_VIEWS)],
+                background=self.out.settings()[1],
+            )
+        return scene_verdict(
+            self.evaluation[1],
+            trained_on,
+            dataset,
+            left_out=left_out,
+            spread=_spread(self._mean_exposures()),
+            poses=about_poses if self.poses is None else None,  # refined poses are no fault
+            capture=recorded_verdict(Path(self.settings.path)),
+        )
+
+    def _dataset(self) -> Dataset:
+        """The dataset with the present cameras."""
+        cameras = self.trainer.cameras
+        return replace(self.trainer.dataset, train=cameras.views(), test=cameras.test_views())
+
+    def _mean_exposures(self) -> tuple[float, ...]:
+        """The exposure of each training photo in EV, the mean over the channels."""
+        return tuple(sum(ev) / 3 for ev in self._exposures().values())
+
+    def _write_report(
+        self, gaussians: Gaussians, about_poses: str | None, verdict: Verdict | None
+    ) -> Path:
         # Users may share the report, so it contains names of files but no paths.
         out = self.out.path
         dataset = asdict(self.settings)
@@ -306,21 +352,19 @@ class TrainingRun:
             self.out.report,
             Trained(
                 name=out.resolve().name if out.is_absolute() else str(out),
-                dataset=replace(
-                    self.trainer.dataset,
-                    train=self.trainer.cameras.views(),
-                    test=self.trainer.cameras.test_views(),
-                ),
+                dataset=self._dataset(),
                 gaussians=gaussians,
                 step=self.trainer.step,
                 background=self.out.settings()[1],
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=self._left_out(),
-                exposures=tuple(sum(ev) / 3 for ev in self._exposures().values()),
+                exposures=self._mean_exposures(),
                 masks=self._masks(),
                 ended_early=self._ended_early(),
                 poses=about_poses,
+                doubts=self.doubts,
+                verdict=verdict,
                 settings={
                     "recipe": self.recipe,
                     "dataset": dataset,
@@ -330,3 +374,8 @@ class TrainingRun:
             ),
         )
         return self.out.report
+
+
+def _spread(exposures: tuple[float, ...]) -> float:
+    """The standard deviation of the exposures, in EV; 0 if there are none."""
+    return pstdev(exposures) if exposures else 0.0

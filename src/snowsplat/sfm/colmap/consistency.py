@@ -107,10 +107,20 @@ class CheckedPair(VerifiedPair):
         return self.counts and self.contradicted
 
 
-def share_agreeing(pairs: Sequence[CheckedPair]) -> float:
-    """The share of all verified matches of ``pairs`` that agree with the poses: 0 to 1."""
-    total = sum(pair.matches for pair in pairs)
-    return sum(pair.matches * pair.agreeing for pair in pairs) / total if total else 0.0
+def agreement_of(pairs: Sequence[CheckedPair]) -> float:
+    """The share of the matches of the strongest pairs that agree with the poses: 0 to 1.
+
+    The strongest pair of each photo counts: its matches are rarely false. In a model that is bent,
+    or whose parts have different scales, a part of these matches does not agree.
+    """
+    strongest: dict[int, CheckedPair] = {}
+    for pair in pairs:
+        for photo in (pair.first, pair.second):
+            if photo not in strongest or pair.weight > strongest[photo].weight:
+                strongest[photo] = pair
+    chosen = {(pair.first, pair.second): pair for pair in strongest.values()}.values()
+    total = sum(pair.matches for pair in chosen)
+    return sum(pair.matches * pair.agreeing for pair in chosen) / total if total else 0.0
 
 
 def check_pairs(

@@ -26,6 +26,10 @@ from snowsplat.sfm.ingest.photo import Photo
 
 _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
 
+# Share of the matches of a pair that move if the camera does. Others may be fixed to the frame. If
+# the camera stands still, people and leaves that move have fewer matches.
+_MOVING_SHARE = 0.25
+
 
 @dataclass(frozen=True)
 class Pair:
@@ -261,12 +265,13 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
     return descriptors[_largest(keypoints, limit)]
 
 
-def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:
+def displacement_of(path: Path, pairs: Sequence[Pair], still: float) -> float:
     """Typical distance in pixels between the positions of a match in the two photos.
 
     For each pair, this is the median over its matches; of these medians, it is the 90% quantile. A
     lower quantile would be nearly zero in a slow video, where the frames of many pairs are nearly
-    equal.
+    equal. If a quarter of the matches moves by more than ``still`` pixels, the median is that of
+    these matches: the others may be those of a logo, which does not move with the scene.
     """
     medians = []
     with closing_database(path) as database:
@@ -275,5 +280,8 @@ def displacement_of(path: Path, pairs: Sequence[Pair]) -> float:
             matches = database.read_two_view_geometry(*ids).inlier_matches
             first, second = (database.read_keypoints(i)[:, :2] for i in ids)
             shift = first[matches[:, 0]] - second[matches[:, 1]]
-            medians.append(float(np.median(np.linalg.norm(shift, axis=1))))
+            lengths = np.linalg.norm(shift, axis=1)
+            moving = lengths > still
+            lengths = lengths[moving] if moving.mean() >= _MOVING_SHARE else lengths
+            medians.append(float(np.median(lengths)))
     return float(np.quantile(medians, 0.9))

@@ -86,7 +86,7 @@ def gather_evidence(database: Path, photos: Sequence[Photo], matched: int) -> Ev
     size = max(max(photo.width, photo.height) for photo in photos)
     # About 100 evenly chosen pairs are enough.
     some = pairs[:: max(1, len(pairs) // 100)]
-    displacement = displacement_of(database, some) / size if some else None
+    displacement = displacement_of(database, some, _STILL * size) / size if some else None
     return Evidence(feature_counts(database, len(photos)), pairs, displacement, matched)
 
 
@@ -152,7 +152,8 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
     if evidence.still:
         return UserError(
             "photos: the camera hardly moved between the photos, so depth cannot be estimated; "
-            "walk around the scene while taking them"
+            "walk around the scene while taking them, or put an object that turns before a plain "
+            "background"
         )
     if evidence.flat:
         return UserError(

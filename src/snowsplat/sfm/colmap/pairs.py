@@ -4,7 +4,8 @@
     frames of a video    each frame with the next frames, with later frames at growing distances,
                          and with frames that look similar. Similar frames close loops: the camera
                          comes back to a place where it was before
-    photos with GPS      each photo with the nearest photos, and with some that look similar
+    photos with GPS      each photo with the nearest photos, and with some that look similar, if
+                         the positions differ by more than their error
     many photos          each photo with those that look similar. A photo with a number in its name
                          is also paired with the photos that have the next numbers, which were
                          usually taken directly after it
@@ -25,9 +26,9 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.colmap.retrieval import nearest
+from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
 
-_METRES_PER_DEGREE = 111_320.0
 # Share of `Effort.neighbours` that is used for similar photos if all photos already have pairs from
 # one video or from GPS.
 _LOOP_SHARE = 0.4
@@ -72,14 +73,11 @@ def choose_pairs(
     if numbered:
         pairs |= set().union(*numbered)
         rules.append("photos with the next photos by name")
-    located = [i for i, photo in enumerate(photos) if photo.location is not None]
-    if len(located) > effort.neighbours:
-        places = _positions_in_metres(np.array([photos[i].location for i in located]))
-        pairs |= {
-            (located[i], located[j]) for i, j in nearest(-_distances(places), effort.neighbours)
-        }
+    near, located = _near_pairs(photos, effort.neighbours)
+    if near:
+        pairs |= near
         rules.append("photos with the nearest photos by GPS")
-    covered = len(located) == count or sum(map(len, sequences)) == count
+    covered = located == count or sum(map(len, sequences)) == count
     share = _LOOP_SHARE if covered else 1.0
     pairs |= _similar_pairs(photos, similarity(), round(share * effort.neighbours), effort.overlap)
     rules.append("photos with similar photos")
@@ -141,14 +139,24 @@ def _similar_pairs(
     return nearest(similarity, count)
 
 
-def _positions_in_metres(locations: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    # Positions on the plane that is tangent to the earth at the mean location. The altitude of GPS
-    # is too inaccurate to be used.
-    latitude, longitude = locations[:, 0], locations[:, 1]
-    middle = np.radians(latitude.mean())
-    east = (longitude - longitude.mean()) * np.cos(middle)
-    return np.stack([east, latitude - latitude.mean()], 1) * _METRES_PER_DEGREE
+def _near_pairs(photos: Sequence[Photo], neighbours: int) -> tuple[Pairs, int]:
+    """Pairs of photos that are near by GPS, and the number of photos whose neighbours are known.
 
-
-def _distances(places: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    return np.linalg.norm(places[:, None] - places[None], axis=2)
+    If more than ``neighbours`` photos are within the error of a position, GPS cannot tell which of
+    them are nearest. This happens indoors, where phones also store the last position outdoors.
+    """
+    located = [i for i, photo in enumerate(photos) if photo.location is not None]
+    if len(located) <= neighbours:
+        return set(), 0
+    locations = np.array([photos[i].location for i in located])
+    places = east_north_up(locations, middle_of(locations))[:, :2]
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)
+    errors = position_errors([photos[i] for i in located])
+    within = (distances <= errors[:, None]).sum(axis=1) - 1  # the photo itself is not counted
+    clear = np.flatnonzero(within <= neighbours)
+    pairs: Pairs = set()
+    for i in clear:
+        order = np.argsort(distances[i], kind="stable")
+        for j in order[order != i][:neighbours]:
+            pairs.add((located[min(i, j)], located[max(i, j)]))
+    return pairs, len(clear)

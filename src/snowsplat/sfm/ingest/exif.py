@@ -1,4 +1,4 @@
-"""EXIF metadata of a photo: orientation, camera, focal length and location."""
+"""Metadata of a photo: orientation, camera, focal length, location and attitude."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
+
+from snowsplat.sfm.ingest.attitude import read_attitude
+from snowsplat.sfm.ingest.photo import Attitude
 
 # EXIF tags.
 ORIENTATION = 0x0112
@@ -22,6 +25,7 @@ _PLANE_Y = 0xA20F
 _PLANE_UNIT = 0xA210
 _MAKER_NOTE = 0x927C
 _USER_COMMENT = 0x9286
+_GPS_ERROR = 31  # GPSHPositioningError, m
 _PIXEL_WIDTH = 0xA002
 _PIXEL_HEIGHT = 0xA003
 
@@ -38,22 +42,33 @@ class ExifInfo:
     camera: str = ""  # make, model and focal lengths, which identify a lens and its zoom
     focal: float | None = None  # pixels of the stored photo, before any resizing
     location: tuple[float, float, float] | None = None  # latitude, longitude (°), altitude (m)
+    location_error: float | None = None  # m, horizontal, as the receiver states it
+    attitude: Attitude | None = None  # in the frame of the upright photo
 
 
-def read_exif(exif: Image.Exif, width: int, height: int) -> ExifInfo:
+def read_exif(
+    exif: Image.Exif, width: int, height: int, xmp: bytes = b"", taken: int | None = None
+) -> ExifInfo:
     """Read the metadata of a photo with ``width`` × ``height`` stored pixels.
+
+    ``xmp`` is the XMP packet of the file, in which drones store the angles of their gimbal.
+    ``taken`` is the orientation with which the photo was taken, if the pixels have been turned
+    since, as in a HEIC file that is open.
 
     Missing and implausible values have the default of `ExifInfo`.
     """
     details, gps = _ifd(exif, _EXIF_IFD), _ifd(exif, _GPS_IFD)
-    orientation = exif.get(ORIENTATION, 1)
+    stored = exif.get(ORIENTATION, 1)
+    orientation = stored if stored in range(1, 9) else 1
     named = [str(exif.get(tag) or "").strip("\0 ") for tag in (_MAKE, _MODEL)]
     zoom = [_number(details.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_35MM)]
     return ExifInfo(
-        orientation=orientation if orientation in range(1, 9) else 1,
+        orientation=orientation,
         camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
         focal=_focal(details, width, height),
         location=_location(gps),
+        location_error=_number(gps.get(_GPS_ERROR)),
+        attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.sfm.ingest.mask_files import read_mask, write_mask
+from snowsplat.sfm.ingest.panorama import PANORAMA, shows_all_around
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photo_files import (
     Header,
@@ -55,6 +56,9 @@ def plan_photos(
         except Unusable as error:
             skipped.append((shown(source.path), str(error)))
         else:
+            if header.panorama:
+                skipped.append((shown(source.path), header.panorama))
+                continue
             read.append((header.file_name(source.name, longest), source, header))
     read.sort(key=lambda entry: (entry[0] != entry[1].name, entry[0]))
     names = free_names([name for name, _, _ in read])
@@ -119,6 +123,8 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
     else:
         image = decode(source.path, header, longest)
     used = read_mask(source.mask, header, header.size(longest)) if source.mask else None
+    if shows_all_around(image):
+        raise Unusable(PANORAMA)
     alpha = image.mode == "RGBA"
     if alpha:
         opaque = np.asarray(image.getchannel("A")) > 0
@@ -147,6 +153,8 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
         location=exif.location,
         mask=used is not None,
         alpha=alpha,
+        location_error=exif.location_error,
+        attitude=exif.attitude,
     )
 
 

@@ -12,7 +12,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
@@ -22,7 +22,16 @@ from snowsplat.sfm.ingest.gather_photos import (
     plan_photos,
     write_photos,
 )
+from snowsplat.sfm.ingest.panorama import (
+    CUT_INTO_VIEWS,
+    PANORAMA,
+    STITCHED,
+    is_spherical_video,
+    is_twice_as_wide,
+    spherical_video,
+)
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.sources import Source, Sources, find_sources
 from snowsplat.sfm.ingest.video_frames import SAME_VIEW, extract_frames
@@ -42,6 +51,8 @@ class Gathered:
 
     photos: list[Photo]
     skipped: list[tuple[str, str]]  # file, or file and time of a frame; reason
+    # Lines for the user about what was cropped and masked. Earlier versions did neither.
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -93,15 +104,23 @@ def gather(
     planned = plan_photos(sources.photos, options.size, skipped)
     if options.photos is not None:
         planned = evenly_spread(planned, options.photos)
+    for video in sources.videos:
+        if is_spherical_video(video.path):
+            raise spherical_video(video.path)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
     if in_place:
         _refuse_changes(planned, sources.videos, options)
     folder.mkdir(parents=True, exist_ok=True)
+    notes: list[str] = []
     _check_disk_space(dataset, planned, clips, options)
     try:
         photos = write_photos(planned, dataset, options.size, in_place, skipped, report)
+        photos = _without_panoramas(photos, folder, in_place, skipped)
         for source, clip in clips:
-            photos += _take_frames(source, clip, folder, options, skipped, report)
+            photos += _take_frames(source, clip, folder, options, skipped, notes, report)
+        photos.sort(key=lambda photo: photo.name)
+        photos, found = set_fixed_parts_aside(photos, dataset, in_place)
+        notes += found
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
@@ -114,7 +133,7 @@ def gather(
         )
     if len(photos) < _MIN_PHOTOS:
         raise _too_few(len(photos), skipped)
-    return Gathered(sorted(photos, key=lambda photo: photo.name), skipped)
+    return Gathered(photos, skipped, notes)
 
 
 def _check(options: GatherOptions) -> None:
@@ -130,6 +149,23 @@ def _check(options: GatherOptions) -> None:
         raise SettingError("photos", f"{options.photos} is too few; use 1 or more")
     if options.size is not None and options.size < _MIN_SIZE:
         raise SettingError("size", f"{options.size} is too small; use {_MIN_SIZE} or more")
+
+
+def _without_panoramas(
+    photos: list[Photo], folder: Path, in_place: bool, skipped: list[tuple[str, str]]
+) -> list[Photo]:
+    """The photos without those of a panorama's size, if most of this size are panoramas.
+
+    Not every panorama is recognised by its pixels: there may be an edge at a pole.
+    """
+    alike = [photo for photo in photos if is_twice_as_wide(photo.width, photo.height)]
+    if not alike or sum(reason == PANORAMA for _, reason in skipped) < len(alike):
+        return photos
+    skipped += [(photo.source, PANORAMA) for photo in alike]
+    if not in_place:
+        for photo in alike:
+            (folder / photo.name).unlink()
+    return [photo for photo in photos if photo not in alike]
 
 
 def _refuse_changes(
@@ -155,6 +191,7 @@ def _take_frames(
     folder: Path,
     options: GatherOptions,
     skipped: list[tuple[str, str]],
+    notes: list[str],
     report: Report,
 ) -> list[Photo]:
     frame_folder = folder / source.name
@@ -162,6 +199,7 @@ def _take_frames(
     max_frames = max_frame_count(clip, options.fps, options.frames)
     frames = extract_frames(clip, frame_folder, max_frames, options.size, report)
     label = source.path.name if not source.name else source.name
+    notes += [f"{label}: {line}" for line in frames.notes]
     skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
     return [
         Photo(
@@ -228,6 +266,12 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
         return UserError(
             f"{video}: the camera does not move ({who} show the same view), but depth needs "
             "motion; film while walking around the scene"
+        )
+    if reason in (PANORAMA, STITCHED):
+        what = "360° panoramas" if reason == PANORAMA else "stitched panoramas"
+        return UserError(
+            f"photos: {who} are {what}, but poses are estimated for lenses that show a part of "
+            f"the surroundings; {CUT_INTO_VIEWS}"
         )
     if reason in (BLACK, WHITE, FLAT):
         what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]

@@ -32,11 +32,14 @@ _NEW_REFERENCE = 5.0
 _MIN_AGREEMENT = 0.25
 
 
-def has_moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether the camera moved between two frames, given equally large copies of `CONTENT_SIDE`."""
+def has_moved(before: np.ndarray, after: np.ndarray, fixed: np.ndarray | None = None) -> bool:
+    """Whether the camera moved between two frames, given equally large copies of `CONTENT_SIDE`.
+
+    ``fixed``: as for `FrameMotion`.
+    """
     if min(before.shape) < _BLOCK:
         return bool(np.abs(before.astype(np.float32) - after).mean() >= 1.0)
-    first, second = _blocks(before), _blocks(after)
+    first, second = _blocks(before, fixed), _blocks(after, fixed)
     textured = _textured(first)
     if not textured.any():
         return bool(np.abs(first - second).mean() >= 1.0)
@@ -49,9 +52,14 @@ class FrameMotion:
     The motion is the sum of small shifts, whatever their direction. Motion blur hardly affects it,
     because blur hardly changes the phases of a small copy. A cut counts as a shift by about an
     eighth of the frame, and so do other changes that are too large to be measured.
+
+    Args:
+        fixed: (H, W) bool, pixels of a frame that do not move with the scene, such as a time stamp;
+            in any size. They are replaced by the mean of the other pixels of their block.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fixed: np.ndarray | None = None) -> None:
+        self._fixed = fixed
         self._reference: np.ndarray | None = None  # (N, 32, 17) complex: spectra of textured blocks
         self._textured = np.zeros(0, bool)  # (M,): the blocks of the reference that have texture
         self._before = 0.0  # the motion up to the reference
@@ -71,7 +79,7 @@ class FrameMotion:
         small = np.asarray(Image.fromarray(grey).reduce(factor)) if factor > 1 else grey
         if min(small.shape) < _BLOCK:
             return self._motion  # too small to be measured
-        blocks = _blocks(small)
+        blocks = _blocks(small, self._fixed)
         largest = _BLOCK / 2
         if self._reference is None:
             self._set_reference(blocks)
@@ -94,12 +102,27 @@ class FrameMotion:
         self._before = self._motion
 
 
-def _blocks(grey: np.ndarray) -> np.ndarray:
-    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image."""
-    rows, columns = grey.shape[0] // _BLOCK, grey.shape[1] // _BLOCK
-    top = (grey.shape[0] - rows * _BLOCK) // 2
-    left = (grey.shape[1] - columns * _BLOCK) // 2
-    part = grey[top : top + rows * _BLOCK, left : left + columns * _BLOCK].astype(np.float32)
+def _blocks(grey: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
+    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image.
+
+    ``fixed``: as for `FrameMotion`.
+    """
+    blocks = _divided(grey.astype(np.float32))
+    if fixed is None:
+        return blocks
+    size = grey.shape[1], grey.shape[0]
+    resized = Image.fromarray(fixed.astype(np.uint8) * 255).resize(size, Image.Resampling.BOX)
+    free = _divided(np.asarray(resized)) == 0
+    count = np.maximum(free.sum(axis=(1, 2), keepdims=True), 1)
+    mean = np.where(free, blocks, 0).sum(axis=(1, 2), keepdims=True) / count
+    return np.where(free, blocks, mean)
+
+
+def _divided(image: np.ndarray) -> np.ndarray:
+    rows, columns = image.shape[0] // _BLOCK, image.shape[1] // _BLOCK
+    top = (image.shape[0] - rows * _BLOCK) // 2
+    left = (image.shape[1] - columns * _BLOCK) // 2
+    part = image[top : top + rows * _BLOCK, left : left + columns * _BLOCK]
     return part.reshape(rows, _BLOCK, columns, _BLOCK).swapaxes(1, 2).reshape(-1, _BLOCK, _BLOCK)
 
 

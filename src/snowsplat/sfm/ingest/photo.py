@@ -4,6 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+Direction = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """How the camera was held, as its sensors measured it.
+
+    Directions are unit vectors in the frame of the upright photo: x right, y down, z forward.
+    """
+
+    up: Direction | None  # against gravity
+    north: Direction | None  # true north, from the yaw of a gimbal or from a compass
+    gimbal: bool  # a gimbal of a drone; False: the accelerometer and the compass of a phone
+
 
 @dataclass(frozen=True)
 class Photo:
@@ -19,3 +33,5 @@ class Photo:
     location: tuple[float, float, float] | None  # GPS: latitude, longitude (degrees), altitude (m)
     mask: bool  # whether distorted/masks/NAME.png exists
     alpha: bool  # whether the photo has transparent pixels
+    location_error: float | None = None  # m, horizontal, as the receiver states it
+    attitude: Attitude | None = None

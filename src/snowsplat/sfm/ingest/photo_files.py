@@ -19,6 +19,7 @@ from PIL import Image, ImageOps
 from snowsplat.data import image_file
 from snowsplat.data.image_file import reason_of
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
+from snowsplat.sfm.ingest.panorama import panorama_in_metadata
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
 # Formats that COLMAP reads, by file extension.
@@ -47,6 +48,7 @@ class Header:
     plain: bool  # 8 bits per channel; grey, RGB, or RGBA in a PNG
     transparent: bool  # has an alpha channel
     exif: ExifInfo
+    panorama: str | None = None  # `PANORAMA` or `STITCHED`, if the metadata say so
 
     @property
     def sideways(self) -> bool:
@@ -105,13 +107,21 @@ def read_header(path: Path) -> Header:
                 and "transparency" not in image.info
                 and _bits(path, image) == 8,
                 transparent=transparent,
-                exif=read_exif(exif, width, height),
+                exif=read_exif(
+                    exif, width, height, _xmp(image), image.info.get("original_orientation")
+                ),
+                panorama=panorama_in_metadata(image.info),
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
     return header
+
+
+def _xmp(image: Image.Image) -> bytes:
+    packet = image.info.get("xmp", b"")
+    return packet if isinstance(packet, bytes) else b""
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:

@@ -26,10 +26,18 @@ from snowsplat.sfm.ingest.clip import (
     decoded_frames,
     open_video,
     undecodable,
-    upright_size,
+)
+from snowsplat.sfm.ingest.fixed_parts import (
+    ENOUGH_PHOTOS,
+    Crop,
+    FixedParts,
+    box_of,
+    describe_bars,
+    find_fixed_parts,
 )
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
+from snowsplat.sfm.ingest.panorama import shows_all_around, spherical_video
 from snowsplat.sfm.ingest.photo_files import resized, save, scaled_size
 from snowsplat.sfm.ingest.sharpness import (
     CONTENT_SIDE,
@@ -53,6 +61,8 @@ SAME_VIEW = "shows the same view as the previous frame"
 _MIN_STEP = 0.01
 # If fewer frames are requested, there are as many candidates as for this number of frames.
 _MIN_COUNT = 30
+# With fewer key frames, what is fixed to the frame is not found reliably.
+_FEW_KEY_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,7 @@ class Frames:
     # The sharpest frames of windows without a candidate: time (s) and reason.
     skipped: list[tuple[float, str]] = field(default_factory=list)
     read: int = 0  # number of decoded frames
+    notes: list[str] = field(default_factory=list)  # lines for the user
 
 
 def extract_frames(
@@ -88,22 +99,28 @@ def extract_frames(
         size: resize larger frames to this longest side in pixels; None keeps the size.
 
     Raises:
-        UserError: no frame can be decoded.
+        UserError: no frame can be decoded, or the video shows all directions.
         OSError: the disk is full.
     """
     import av
 
     frames = Frames()
     name = clip.path.name
-    candidates = _Candidates(clip, folder, max_frames, size)
-    motion = FrameMotion()
+    try:
+        parts = _fixed_parts(clip)
+    except (av.FFmpegError, ValueError) as error:
+        raise undecodable(clip.path, error) from None
+    crop = parts.crop if parts else None
+    fixed = None if parts is None else _cropped(parts.fixed, crop)
+    candidates = _Candidates(clip, folder, max_frames, size, crop, fixed)
+    motion = FrameMotion(fixed)
     try:
         with open_video(clip.path) as container:
             rate = float(container.streams.video[0].average_rate or 30)
             for frame in decoded_frames(container):
                 timed = frame.time is not None
                 seconds = frame.time - clip.start if timed else frames.read / rate
-                grey = _grey(frame)
+                grey = _cropped(_grey(frame), crop)
                 candidates.offer(frame, grey, max(seconds, 0.0), motion.add(grey))
                 frames.read += 1
                 if frames.read % 10 == 0:
@@ -116,6 +133,8 @@ def extract_frames(
     if not frames.read:
         raise undecodable(clip.path, None)
     frames.skipped = candidates.skipped
+    if parts is not None and crop is not None:
+        frames.notes = [describe_bars(parts, True, "all frames")]
     report(clip.packets, clip.packets, f"frames of {name}")
     _log_summary(clip, frames)
     return frames
@@ -124,9 +143,18 @@ def extract_frames(
 class _Candidates:
     """Divides a video into windows, and writes the sharpest frame of each as a candidate."""
 
-    def __init__(self, clip: Clip, folder: Path, max_frames: int, size: int | None) -> None:
+    def __init__(
+        self,
+        clip: Clip,
+        folder: Path,
+        max_frames: int,
+        size: int | None,
+        crop: Crop | None,
+        fixed: np.ndarray | None,
+    ) -> None:
         self.skipped: list[tuple[float, str]] = []  # time (s) and reason
         self._clip, self._folder, self._max_frames, self._size = clip, folder, max_frames, size
+        self._crop, self._fixed = crop, fixed
         self._count = max(max_frames, _MIN_COUNT)
         # The longest window. Times are rounded to 1 ms.
         self._max_seconds = clip.seconds / max_frames - 1e-3
@@ -141,7 +169,7 @@ class _Candidates:
         """Take the next frame.
 
         Args:
-            grey: (H, W) uint8, its small copy.
+            grey: (H, W) uint8, its small copy, between the bars.
             seconds: its time, from the first frame.
             moved: the result of `FrameMotion.add`.
         """
@@ -184,11 +212,11 @@ class _Candidates:
         reason = why_unusable(small)
         last = self._last
         if reason is None and last is not None and last.shape == small.shape:
-            reason = None if has_moved(last, small) else SAME_VIEW
+            reason = None if has_moved(last, small, self._fixed) else SAME_VIEW
         if reason is None:
             self._written += 1
             path = self._folder / f"candidate_{self._written:06d}.jpg"
-            self._frames[self._written] = _write(best, self._clip, path, self._size)
+            self._frames[self._written] = _write(best, self._clip, path, self._size, self._crop)
             self._candidates.append(Candidate(best.moved, best.sharpness, self._written))
             self._last = small
             if len(self._candidates) > 4 * self._count:
@@ -212,7 +240,7 @@ class _SharpestFrame:
 
     def reset(self) -> None:
         self.frame: VideoFrame | None = None
-        self.grey: np.ndarray | None = None  # (H, W) uint8, not rotated
+        self.grey: np.ndarray | None = None  # (H, W) uint8, not rotated, between the bars
         self.seconds = 0.0
         self.moved = 0.0
         self.sharpness = -1.0
@@ -230,14 +258,59 @@ def _grey(frame: VideoFrame) -> np.ndarray:
     return small.to_ndarray()
 
 
-def _write(best: _SharpestFrame, clip: Clip, path: Path, size: int | None) -> Frame:
+def _fixed_parts(clip: Clip) -> FixedParts | None:
+    """What is fixed to the frame, found before the frames are chosen, as it would hide the motion.
+
+    The copies are not rotated. Only if there are few key frames, all frames are decoded.
+
+    Raises:
+        UserError: the video shows all directions. The rows at its poles would be bars.
+    """
+    copies = _spread_copies(clip, key_frames=True)
+    if len(copies) < _FEW_KEY_FRAMES:
+        copies = _spread_copies(clip, key_frames=False)
+    same = [copy for copy in copies if copy.shape == copies[0].shape]
+    around = sum(shows_all_around(Image.fromarray(copy)) for copy in same)
+    if around > len(same) / 2:
+        raise spherical_video(clip.path)
+    return find_fixed_parts(np.stack(same)) if same else None
+
+
+def _spread_copies(clip: Clip, key_frames: bool) -> list[np.ndarray]:
+    """Grey copies of frames at equal distances, `ENOUGH_PHOTOS` to twice as many, if possible."""
+    copies: list[np.ndarray] = []
+    step = 1
+    with open_video(clip.path) as container:
+        if key_frames:
+            container.streams.video[0].codec_context.skip_frame = "NONKEY"
+        for i, frame in enumerate(decoded_frames(container)):
+            if i % step == 0:
+                copies.append(_grey(frame))
+            if len(copies) == 2 * ENOUGH_PHOTOS:
+                copies, step = copies[::2], 2 * step
+    return copies
+
+
+def _cropped(pixels: np.ndarray, crop: Crop | None) -> np.ndarray:
+    """The part of an image (H, W, …) between the bars."""
+    if crop is None:
+        return pixels
+    left, top, right, bottom = box_of(crop, pixels.shape[1], pixels.shape[0])
+    return np.ascontiguousarray(pixels[top:bottom, left:right])
+
+
+def _write(
+    best: _SharpestFrame, clip: Clip, path: Path, size: int | None, crop: Crop | None
+) -> Frame:
     frame = best.frame
     assert frame is not None
-    image = Image.fromarray(rgb_image(frame))
+    image = Image.fromarray(_cropped(rgb_image(frame), crop))
+    width, height = round(image.width * clip.aspect), image.height
     turns = round(frame.rotation / 90) % 4
     if turns:  # counter-clockwise, as in Pillow
         image = image.transpose(Image.Transpose(1 + turns))
-    image = resized(image, scaled_size(*upright_size(frame, clip.aspect), size))
+        width, height = (height, width) if turns % 2 else (width, height)
+    image = resized(image, scaled_size(width, height, size))
     save(image, path)
     return Frame(path.name, best.seconds, image.width, image.height)
 

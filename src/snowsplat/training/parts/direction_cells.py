@@ -28,16 +28,40 @@ def cells_of(directions: Tensor) -> Tensor:
 
 def directions_of(cells: Tensor) -> Tensor:
     """(M, 3) float32, unit vectors: the middles of cells (M,)."""
-    column, rest = cells % SIDE, cells // SIDE
-    row, face = rest % SIDE, rest // SIDE
-    u, v = (
-        torch.tan(((side + 0.5) * (2.0 / SIDE) - 1.0) * (math.pi / 4)) for side in (column, row)
-    )
-    axis = face[:, None] // 2
-    directions = torch.zeros(len(cells), 3)
-    directions.scatter_(1, axis, 2.0 * (face[:, None] % 2) - 1.0)
-    directions.scatter_(1, (axis + 1) % 3, u[:, None])
-    directions.scatter_(1, (axis + 2) % 3, v[:, None])
+    return _directions(*_places_of(cells))
+
+
+def regions_of(cells: Tensor) -> Tensor:
+    """(M,) int64: the region of each of the different cells (M,), numbered from 0.
+
+    A region is a set of cells each of which has a side in common with another one.
+    """
+    axis, side, column, row = _places_of(cells)
+    place = torch.full((COUNT,), len(cells)).index_put_((cells,), torch.arange(len(cells)))
+    # A cell beyond the edge of a face is on the next face.
+    steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
+    beside = [place[cells_of(_directions(axis, side, column + x, row + y))] for x, y in steps]
+    region = torch.arange(len(cells) + 1)  # the last one stands for all other cells
+    while True:
+        lowest = torch.stack([region[:-1], *(region[next_to] for next_to in beside)]).amin(0)
+        if torch.equal(lowest, region[:-1]):
+            return lowest.unique(return_inverse=True)[1]
+        region[:-1] = lowest[lowest]  # two steps at once: a number is that of a cell of the region
+
+
+def _places_of(cells: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(M,) each: the axis and the side, -1 or 1, of the face of a cell; its column and row."""
+    face, rest = cells // SIDE**2, cells % SIDE**2
+    return face // 2, 2 * (face % 2) - 1, rest % SIDE, rest // SIDE
+
+
+def _directions(axis: Tensor, side: Tensor, column: Tensor, row: Tensor) -> Tensor:
+    """(M, 3) float32, unit vectors: the middles of the cells at these places."""
+    u, v = (torch.tan(((at + 0.5) * (2.0 / SIDE) - 1.0) * (math.pi / 4)) for at in (column, row))
+    directions = torch.zeros(len(axis), 3)
+    directions.scatter_(1, axis[:, None], side[:, None].to(torch.float32))
+    directions.scatter_(1, (axis[:, None] + 1) % 3, u[:, None])
+    directions.scatter_(1, (axis[:, None] + 2) % 3, v[:, None])
     return normalize(directions, dim=1)
 
 

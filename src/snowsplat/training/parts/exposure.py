@@ -76,7 +76,8 @@ class Exposure(Part):
         start = ExposureStart(torch.zeros(len(views), 3), None)
         if not run.resumed:
             start = run.shards.of_first(exposure_start(run.dataset, run.images) if first else None)
-        learnt = start.spread is not None and start.spread >= LEAST_SPREAD
+        spread = start.spread if start.everywhere else None
+        learnt = spread is not None and spread >= LEAST_SPREAD
         self.active = self._setting == "on" or learnt
         if not run.resumed:
             run.note(_reason(start, self.active))
@@ -162,5 +163,7 @@ def _reason(start: ExposureStart, active: bool) -> str:
         found = "not known, because there are neither points nor EXIF data"
     else:
         found = f"photos differ by {start.spread:.2f} EV (standard deviation, from {start.source})"
+        if start.spread >= LEAST_SPREAD and not start.everywhere:
+            found += ", but not by the same in all parts of the scene, as shiny surfaces do"
     what = "one gain for each photo and channel is learnt" if active else "no gains are learnt"
     return f"exposure: {found}; {what}"

@@ -5,9 +5,10 @@ distance, a training run explains it with fog before the cameras. What is very f
 property: all cameras, wherever they are, show the same colour in the same direction.
 
 So the sphere of directions is divided into cells. A cell shows the sky if most of the photos that
-show it, from positions that are far apart, have the same colour there. The parts of a photo near
-points of the dataset show the scene; they are not used. The same photos tell where nothing is: a
-point which several of them would show before the sky is in empty space.
+show it, from positions that are far apart, have the same colour there, if it is above the horizon,
+and if its region is not nearer (`far_regions`): a wall or a ceiling, too, may have one colour. The
+parts of a photo near points of the dataset show the scene; they are not used. The same photos tell
+where nothing is: a point which several of them would show before the sky is in empty space.
 """
 
 from __future__ import annotations
@@ -23,13 +24,16 @@ from torch.nn.functional import max_pool2d
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.orientation import up_direction
 from snowsplat.training.parts.direction_cells import (
     ANGLE,
+    COUNT,
     cells_of,
     directions_of,
     median_of,
     spread_of,
 )
+from snowsplat.training.parts.far_regions import in_far_regions
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 
 #: Distance of the sky from the middle of the cameras, in units of the root mean square of their
@@ -48,6 +52,10 @@ _PIXELS = 2.0
 _FINE, _PLAIN = 4, 60.0
 #: The parts of a photo within this number of cells around a point show the scene.
 _AROUND = 1.5
+#: Sine of the error of the horizon, which is that of the up direction of the cameras: 5°.
+_BELOW_THE_HORIZON = 0.09
+#: An overcast sky is brighter than this share of the scene in the same photo.
+_DARKER = 0.8
 #: The colours of two photos are the same if they differ by at most this, in 0..255.
 _SAME = 20.0
 #: A cell needs this number of photos, and this share of those that show it, of the same colour.
@@ -137,42 +145,59 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     views = dataset.train[:: math.ceil(len(dataset.train) / _VIEWS)]
     points = dataset.points.xyz.cpu()
     points = points[:: max(1, len(points) // _POINTS)]
-    samples = [_Sample.of(view, images, points) for view in views]
+    cameras = [view.camera for view in dataset.train]
+    up = _up(cameras)
+    samples = [_Sample.of(view, images, points, up) for view in views]
     cell = torch.cat([sample.cells for sample in samples])
     color = torch.cat([sample.colors for sample in samples])
     depths = torch.cat([sample.depths for sample in samples])
     if not len(depths):
         return None
+    depth = float(depths.median())
     number = torch.tensor([len(sample.cells) for sample in samples])
-    positions = torch.stack([view.camera.position.cpu() for view in views]).to(torch.float32)
+    photo = torch.arange(len(samples)).repeat_interleave(number)
+    origin, _ = _offsets(cameras)
+    positions = torch.stack([view.camera.position.cpu() for view in views])
+    offsets = (positions - origin).to(torch.float32)
     middle = median_of(cell, color)
     same = ((color - middle[cell]).abs() <= _SAME).all(1)
-    shown = torch.bincount(cell, minlength=len(middle))
-    agreeing = torch.bincount(cell[same], minlength=len(middle))
-    spread = spread_of(cell[same], positions.repeat_interleave(number, 0)[same])
+    shown = torch.bincount(cell, minlength=COUNT)
+    agreeing = torch.bincount(cell[same], minlength=COUNT)
     is_sky = (
-        (agreeing >= _FEWEST_VIEWS)
+        (directions_of(torch.arange(COUNT)) @ up > -_BELOW_THE_HORIZON)
+        & (agreeing >= _FEWEST_VIEWS)
         & (agreeing >= _LEAST_AGREEMENT * shown)
-        & (spread >= _LEAST_BASELINE * float(depths.median()))
+        & (spread_of(cell[same], offsets[photo[same]]) >= _LEAST_BASELINE * depth)
     )
     confirmed = same & is_sky[cell]
+    if not confirmed.any():
+        return None
+    overcast = torch.cat([sample.overcast for sample in samples])
+    confirmed[confirmed.clone()] = in_far_regions(
+        cell[confirmed], photo[confirmed], color[confirmed], overcast[confirmed], offsets, depth
+    )
     share = float(confirmed.sum()) / max(1, sum(sample.shown for sample in samples))
     if share < _LEAST_SKY:
         return None
-    found = is_sky.nonzero()[:, 0]
+    found = cell[confirmed].unique()
     masks = [
         (sample.camera, sample.mask(part))
         for sample, part in zip(samples, confirmed.split(number.tolist()), strict=True)
     ]
-    cameras = [view.camera for view in dataset.train]
     return Sky(
         directions_of(found),
         middle[found].round().to(torch.uint8),
         share,
-        _offsets(cameras)[0].to(torch.float32),
+        origin.to(torch.float32),
         distance or sky_distance(cameras),
         masks,
     )
+
+
+def _up(cameras: Sequence[Camera]) -> Tensor:
+    """(3,) float32, a unit vector: away from the ground."""
+    rotations = torch.stack([camera.cam_from_world[:, :3].cpu() for camera in cameras])
+    return torch.from_numpy(up_direction(rotations.to(torch.float64).numpy())).to(torch.float32)
 
 
 def _offsets(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
@@ -188,6 +213,8 @@ class _Sample:
     Attributes:
         cells: (M,) int64, without those of the scene.
         colors: (M, 3) float32 in 0..255, their mean colours.
+        overcast: (M,) bool: cells that are brighter than most of the scene, and have none of it
+            above.
         depths: (P,) of the points that the photo shows.
         shown: the number of all cells that the photo shows.
         pixels: (H, W) int64: the row in ``cells`` of each pixel; -1: the scene.
@@ -197,13 +224,14 @@ class _Sample:
     camera: Camera
     cells: Tensor
     colors: Tensor
+    overcast: Tensor
     depths: Tensor
     shown: int
     pixels: Tensor
     plain: Tensor
 
     @staticmethod
-    def of(view: View, images: Photos, points: Tensor) -> _Sample:
+    def of(view: View, images: Photos, points: Tensor, up: Tensor) -> _Sample:
         scale = min(1.0, _PIXELS / ANGLE / max(view.camera.fx, view.camera.fy))
         width, height = (
             max(1, round(scale * side)) for side in (view.camera.width, view.camera.height)
@@ -218,22 +246,42 @@ class _Sample:
         scene = torch.zeros(1, 1, height, width)
         scene[0, 0, y[visible], x[visible]] = 1.0
         reach = math.ceil(_AROUND * _PIXELS)
-        used = max_pool2d(scene, 2 * reach + 1, stride=1, padding=reach)[0, 0] == 0.0
+        near = max_pool2d(scene, 2 * reach + 1, stride=1, padding=reach)[0, 0] > 0.0
+        used = ~near
         usable = usable_pixels(photo)
         if usable is not None:
-            used &= usable
+            used, near = used & usable, near & usable
         cells = cells_of(_rays(camera))
         cell, own = cells[used].unique(return_inverse=True)
         total = torch.zeros(len(cell), 3).index_add_(0, own, photo.rgb[used].to(torch.float32))
         pixels = torch.full((height, width), -1).masked_scatter_(used, own)
         colors = total / torch.bincount(own, minlength=len(cell))[:, None]
+        scene_light = photo.rgb[near].to(torch.float32).mean(1).sort().values
+        darker = torch.searchsorted(scene_light, colors.mean(1))
+        overcast = (darker > _DARKER * len(scene_light)) & _is_open(cell, cells[near], up)
         plain = (contrast <= _PLAIN).all(1)[0]
-        return _Sample(camera, cell, colors, depth[visible], len(cells.unique()), pixels, plain)
+        shown = len(cells.unique())
+        return _Sample(camera, cell, colors, overcast, depth[visible], shown, pixels, plain)
 
     def mask(self, confirmed: Tensor) -> Tensor:
         """(H, W) bool: the plain pixels of the cells (M,) bool, without those at their borders."""
         sky = torch.cat([confirmed, torch.zeros(1, dtype=torch.bool)])[self.pixels] & self.plain
         return max_pool2d((~sky)[None, None].float(), 3, stride=1, padding=1)[0, 0] == 0.0
+
+
+def _is_open(cells: Tensor, scene: Tensor, up: Tensor) -> Tensor:
+    """(M,) bool: the cells (M,) that have none of the cells ``scene`` (S,) above."""
+    east, north = torch.linalg.svd(up[None])[2][1:]
+
+    def azimuth_and_height(cells: Tensor) -> tuple[Tensor, Tensor]:
+        directions = directions_of(cells)
+        azimuth = torch.atan2(directions @ north, directions @ east) + math.pi
+        return (azimuth / (2.0 * ANGLE)).long(), directions @ up
+
+    highest = torch.full((math.ceil(math.pi / ANGLE) + 1,), -torch.inf)
+    highest.scatter_reduce_(0, *azimuth_and_height(scene), "amax")
+    azimuth, height = azimuth_and_height(cells)
+    return height > highest[azimuth]
 
 
 def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,7 +14,9 @@ from PIL import Image
 
 from snowsplat import ops
 from snowsplat.data import Dataset
+from snowsplat.evaluation import verdict
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.ops import native
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
@@ -37,6 +39,7 @@ _STYLE = (
     charts.STYLE
     + pictures.STYLE
     + masks.STYLE
+    + verdict.STYLE
     + """
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
   gap: 22px 28px; }
@@ -62,6 +65,8 @@ class Trained:
             `Transients.pictures`.
         ended_early: why the training ended before its last planned step; None if it did not.
         poses: the line about the camera poses; None if there is nothing to say.
+        doubts: what is doubtful about the cameras of the dataset, a sentence each.
+        verdict: the verdict on the scene; None if no photos were held out.
         peak_bytes: peak memory; 0 if unknown.
     """
 
@@ -78,6 +83,8 @@ class Trained:
     masks: Mapping[str, Image.Image] = field(default_factory=dict)
     ended_early: str | None = None
     poses: str | None = None
+    doubts: tuple[str, ...] = ()
+    verdict: Verdict | None = None
     peak_bytes: int = 0
 
 
@@ -99,11 +106,13 @@ def write_training_report(path: Path, trained: Trained) -> None:
             evaluation = evaluate_views(trained.gaussians, views, background=trained.background)
         body = [
             _headline(trained, evaluation, held_out),
+            "" if trained.verdict is None else trained.verdict.html("the scene"),
             _cards(trained, evaluation, held_out),
             _ended_early(trained.ended_early),
             _left_out(trained.left_out),
             masks.masked(trained.dataset.train, trained.masks),
             _poses(trained.poses),
+            *map(_poses, trained.doubts),
             _curves(trained.history),
             _exposures(trained.exposures),
             pictures.compared(trained.gaussians, views, evaluation, trained.background),
@@ -122,13 +131,13 @@ def _headline(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
     count = len(evaluation.views)
     photos = f"{count} photo" if count == 1 else f"{count} photos"
     if held_out:
-        verdict = f"Evaluated on {photos} that were not used for training."
+        how = f"Evaluated on {photos} that were not used for training."
     else:
-        verdict = (
+        how = (
             f"No photos were held out: these are the metrics of {photos} used for training, which "
             "are better than those of new views. Use --eval to hold out every 8th photo."
         )
-    return f"<h1>{text(trained.name)}</h1>\n<p>{verdict}</p>"
+    return f"<h1>{text(trained.name)}</h1>\n<p>{how}</p>"
 
 
 def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:

@@ -22,7 +22,7 @@ from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.scene.initial_view import InitialView, bound, overview, view_of_camera
-from snowsplat.scene.orientation import VIEWING_DISTANCE, up_direction, up_of_surfaces
+from snowsplat.scene.orientation import VIEWING_DISTANCE, scene_up, up_of_surfaces
 from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
@@ -161,7 +161,7 @@ def ready(
         return ReadyScene(gaussians, overview(gaussians), [], stops, background, hiding)
     depth = _depth_ahead(gaussians, cameras[0])
     rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
-    change = _viewing_frame(up_direction(rotations.numpy()), depth)
+    change = _viewing_frame(scene_up(rotations.numpy()), depth)
     if change is not None:
         gaussians = transform(gaussians, change)
         depth *= change.scale

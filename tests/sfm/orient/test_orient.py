@@ -45,7 +45,7 @@ def ring(count: int, height: float, arc: float = 360.0) -> torch.Tensor:
 def oriented(model_of, poses: torch.Tensor, points: torch.Tensor) -> Similarity:
     """``scene_from_true``: the estimated scene frame relative to the true one, which has y down."""
     model = model_of(SFM.apply_to_poses(poses), SFM.apply(points))
-    found = orientation(model)
+    found = orientation(model).scene_from_sfm
     rotation = found.rotation @ SFM.rotation
     shift = found.apply(SFM.apply(torch.zeros(1, 3, dtype=F64)))[0]
     return Similarity(found.scale * SFM.scale, rotation, shift)
@@ -146,7 +146,7 @@ def test_one_camera_and_no_camera(model_of):
 
 def test_the_result_is_deterministic(model_of):
     poses, points = cameras_at(ring(12, 1.0), 0 * UP), 0.4 * normal(100, 3)
-    one, two = (orientation(model_of(poses, points)).to_json() for _ in range(2))
+    one, two = (orientation(model_of(poses, points)).scene_from_sfm.to_json() for _ in range(2))
     assert one == two
 
 
@@ -156,7 +156,7 @@ def test_real_datasets_are_upright(name):
     if not folder.is_dir():
         pytest.skip(f"no real dataset at ../shared/captures/{name}")
     model = pycolmap.Reconstruction(folder)
-    found = orientation(model)
+    found = orientation(model).scene_from_sfm
     poses = torch.stack(
         [torch.from_numpy(image.cam_from_world().matrix()) for image in model.images.values()]
     )

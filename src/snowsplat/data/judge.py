@@ -1,0 +1,230 @@
+"""`judge`: are the cameras of a dataset possible? Asked before every training.
+
+Three witnesses are heard, as far as the dataset has them:
+
+- the numbers: lenses, positions (`lens_check`, `position_check`);
+- the points: have they the colours of the photos where the cameras see them (`ColourEvidence`)?
+- the photos: do matches between them agree with the poses (`MatchEvidence`)?
+
+Each witness is first asked whether it can tell: points at random positions and photos without
+matches say nothing. If a witness contradicts the cameras, the usual mistakes are tried (`repairs`).
+The cameras are impossible only if another explanation fits what they do not fit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+
+from snowsplat.data.colour_evidence import Agreement, ColourEvidence
+from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.data.finding import Finding
+from snowsplat.data.lens_check import lens_findings
+from snowsplat.data.match_evidence import Fit, MatchEvidence
+from snowsplat.data.photo_sample import PhotoSample
+from snowsplat.data.position_check import position_findings
+from snowsplat.data.repairs import Repair, point_repairs, pose_repairs, zooms
+from snowsplat.data.rig import Rig
+
+# Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
+_COLOURS_AGREE = 0.6
+# A correlation above this is none of chance. Photos that look alike may agree no less with others.
+_COLOURS_FIT = 0.4
+# Matches: pairs that are needed, and the share of matches that agree. 0 to 0.4 for wrong poses
+# (0.4 if the cameras nearly look in one direction), 0.9 to 1 for exact ones.
+_FEWEST_PAIRS = 3
+_PAIRS_FOR_PROOF = 6
+_MATCHES_AGREE = 0.5
+_MATCHES_PROVE = 0.8
+_MATCHES_CONTRADICT = 0.15
+# A repair must improve the correlation of colours by this, or the share of matches by twice this.
+_BETTER = 0.2
+# Points that are projected to try a repair.
+_POINTS_TO_TRY = 2000
+# Another focal length must divide the distances of matches by this, in the median of the pairs.
+_SHARPER = 2.0
+
+
+def judge(dataset: Dataset) -> list[Finding]:
+    """What is impossible or doubtful about the cameras of a dataset; empty if nothing is.
+
+    Decodes up to 24 photos at a small size. Takes less than a second for most datasets.
+    """
+    views = sorted([*dataset.train, *dataset.test], key=lambda view: view.name)
+    rig = Rig.of([view.camera for view in views])
+    lenses, positions = _lenses(views), position_findings(rig)
+    if any(finding.impossible for finding in lenses):
+        return lenses
+    poses = _poses(views, rig, dataset.points)
+    # Wrong poses may have any positions; what is wrong with the poses says more.
+    return [*lenses, *poses, *([] if poses else positions)]
+
+
+def _lenses(views: list[View]) -> list[Finding]:
+    """The findings of each distinct lens, with the number of its views if there are others."""
+    lenses = Counter(
+        (c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (view.camera for view in views)
+    )
+    found: dict[tuple[str, bool], tuple[Finding, int]] = {}
+    for lens, count in lenses.most_common():
+        for finding in lens_findings(*lens):
+            kind = finding.about, finding.impossible
+            first, before = found.get(kind, (finding, 0))
+            found[kind] = first, before + count
+    return [
+        Finding(
+            finding.about,
+            finding.text if count == len(views) else f"{count} photos: {finding.text}",
+            finding.impossible,
+        )
+        for finding, count in found.values()
+    ]
+
+
+def _poses(views: list[View], rig: Rig, points: Points | None) -> list[Finding]:
+    sample = PhotoSample.of(views, rig)
+    if len(sample) < 2:
+        return []
+    rig = rig.select(sample.views)
+    colours, agreement = None, None
+    if points is not None:
+        colours = ColourEvidence(sample, points.xyz.numpy(), points.rgb.numpy())
+        if colours.informative():
+            agreement = colours.agreement(rig)
+            if _agrees(agreement, len(sample)):
+                return []
+    matches = MatchEvidence(sample)
+    fit = _fit(rig, matches)
+    if fit is None or fit.share < _MATCHES_AGREE:
+        matches.widen()
+        fit = _fit(rig, matches)
+    if colours is None or agreement is None:
+        return [] if fit is None else _by_matches(rig, matches, fit)
+    if fit is None:
+        return _by_colours(rig, colours, agreement)
+    if fit.share >= _MATCHES_AGREE:
+        return _points(rig, colours, agreement)
+    return _by_both(rig, colours, agreement, matches, fit)
+
+
+def _fit(rig: Rig, matches: MatchEvidence) -> Fit | None:
+    """None: too few photos match to say anything."""
+    return matches.fit(rig) if len(matches.pairs) >= _FEWEST_PAIRS else None
+
+
+def _agrees(agreement: Agreement, views: int) -> bool:
+    return 2 * agreement.judged >= views and agreement.agreeing >= _COLOURS_AGREE
+
+
+def _by_matches(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
+    """Without coloured points: only matches."""
+    if fit.share >= _MATCHES_AGREE:
+        return _focal(rig, matches, fit)
+    if repairs := _explaining(rig, matches, fit):
+        return [_mistake(repairs[0], _of_matches(fit))]
+    proven = len(matches.pairs) >= _PAIRS_FOR_PROOF and fit.share < _MATCHES_CONTRADICT
+    return [_disorder(_of_matches(fit), impossible=proven)]
+
+
+def _by_colours(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Finding]:
+    """Photos without matches: only the colours of the points."""
+    candidates = [*pose_repairs(rig), *point_repairs(rig)]
+    if repair := _coloured(candidates, colours, agreement):
+        return [_mistake(repair, _of_colours(agreement))]
+    return [_disorder(_of_colours(agreement), impossible=False)]
+
+
+def _points(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Finding]:
+    """The poses fit the photos, but the points do not fit both."""
+    if agreement.agreeing >= _COLOURS_AGREE:  # the points cover only a part of the views
+        return []
+    if repair := _coloured(point_repairs(rig), colours, agreement):
+        return [_mistake(repair, _of_colours(agreement))]
+    if agreement.correlation >= _COLOURS_FIT:
+        return []
+    text = f"{_of_colours(agreement)}; the points may be in another frame than the poses"
+    return [Finding("points", text)]
+
+
+def _by_both(
+    rig: Rig, colours: ColourEvidence, agreement: Agreement, matches: MatchEvidence, fit: Fit
+) -> list[Finding]:
+    """Neither the colours nor the matches fit the poses."""
+    evidence = f"{_of_matches(fit)}, and {_of_colours(agreement)}"
+    if repairs := _explaining(rig, matches, fit):
+        return [_mistake(_coloured(repairs, colours, agreement) or repairs[0], evidence)]
+    return [_disorder(evidence, impossible=True)]
+
+
+def _focal(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
+    """Matches may lie near their epipolar lines with any focal length, if all cameras look at one
+    small object. But they are nearest with the right one.
+    """
+    best, best_fit = None, fit
+    for repair in zooms(rig):
+        if (tried := matches.fit(repair.rig)).median < best_fit.median:
+            best, best_fit = repair, tried
+    ratios = fit.medians / best_fit.medians
+    clear = np.median(ratios) >= _SHARPER and np.mean(ratios > 1) >= _MATCHES_PROVE
+    if best is None or not clear or best_fit.share < _MATCHES_PROVE:
+        return []
+    return [Finding("focal length", f"{best.mistake}, as the matches between the photos say")]
+
+
+def _explaining(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Repair]:
+    """The repairs that make the matches agree, the best one first."""
+    found = []
+    for repair in pose_repairs(rig):
+        tried = matches.fit(repair.rig)
+        if tried.share >= max(_MATCHES_PROVE, fit.share + 2 * _BETTER):
+            found.append((tried.median, repair))
+    best = min((median for median, _ in found), default=0.0)
+    # Several names for one mistake fit equally, up to rounding: the usual one stands first.
+    found = [(0.0 if median < 1.05 * best else median, repair) for median, repair in found]
+    return [repair for _, repair in sorted(found, key=lambda pair: pair[0])]
+
+
+def _coloured(
+    repairs: Iterable[Repair], colours: ColourEvidence, agreement: Agreement
+) -> Repair | None:
+    """The repair with which the colours agree best; None if they do with none of them."""
+    best, best_value = None, max(agreement.correlation, 0.0) + _BETTER
+    for repair in repairs:
+        value = colours.correlation(repair.rig, repair.points, _POINTS_TO_TRY)
+        if value > best_value:
+            best, best_value = repair, value
+    if best is None:
+        return None
+    confirmed = _agrees(colours.agreement(best.rig, best.points), len(best.rig))
+    return best if confirmed else None
+
+
+def _of_matches(fit: Fit) -> str:
+    return f"only {np.mean(fit.shares):.0%} of the matches between photos agree with the poses"
+
+
+def _of_colours(agreement: Agreement) -> str:
+    if agreement.judged == 0:
+        return "the points are not in front of the cameras"
+    return (
+        f"the points have other colours than the photos where the cameras see them (correlation "
+        f"{agreement.correlation:.2f})"
+    )
+
+
+def _mistake(repair: Repair, evidence: str) -> Finding:
+    return Finding(
+        repair.about,
+        f"{evidence}; {repair.mistake}; correct the dataset",
+        impossible=True,
+    )
+
+
+def _disorder(evidence: str, *, impossible: bool) -> Finding:
+    text = (
+        f"{evidence}; the poses may belong to other photos, or their axes or focal lengths are "
+        "wrong"
+    )
+    return Finding("poses", f"{text}; export them again" if impossible else text, impossible)

@@ -1,0 +1,72 @@
+"""`PhotoSample`: small copies of some photos of a dataset, spread over it, some of them close."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from snowsplat.data.dataset import View
+from snowsplat.data.decode import load_thumbnail
+from snowsplat.data.rig import Rig
+from snowsplat.util.errors import UserError
+
+# Pixels of the longer side: enough for matches, and for the colours of points.
+SIDE = 320
+# Views spread over the dataset in the order of names. Each brings two neighbours: the next one by
+# name, and the nearest one by pose. If the poses are right, these see the same things.
+_ANCHORS = 8
+
+
+@dataclass(frozen=True)
+class PhotoSample:
+    """Some views of a dataset.
+
+    Attributes:
+        views: their indices in the dataset.
+        groups: (N,) the number of the anchor that a view belongs to; views of one group may look
+            alike.
+        photos: (4, h, w) uint8 RGBA each. Masks are not applied: what is moving in a few photos
+            misleads no witness, and a mask may be wrong.
+    """
+
+    views: list[int]
+    groups: np.ndarray
+    photos: list[np.ndarray]
+
+    @classmethod
+    def of(cls, views: Sequence[View], rig: Rig) -> PhotoSample:
+        """Decode a sample of the photos. Photos that cannot be decoded are left out."""
+        group = _chosen(rig)
+        workers = min(4, os.cpu_count() or 1)
+        with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-judge") as pool:
+            decoded = list(pool.map(lambda i: _photo(views[i]), group))
+        kept = {i: photo for i, photo in zip(group, decoded, strict=True) if photo is not None}
+        return cls(list(kept), np.array([group[i] for i in kept]), list(kept.values()))
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+
+def _chosen(rig: Rig) -> dict[int, int]:
+    """The group of each view of the sample, by its index; sorted."""
+    count = len(rig)
+    anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).round().astype(int))
+    positions = rig.positions
+    group = {int(anchor): number for number, anchor in enumerate(anchors)}
+    for number, anchor in enumerate(anchors):
+        distance = np.linalg.norm(positions - positions[anchor], axis=1)
+        distance[distance == 0] = np.inf
+        for neighbour in (min(anchor + 1, count - 1), distance.argmin()):
+            group.setdefault(int(neighbour), number)
+    return dict(sorted(group.items()))
+
+
+def _photo(view: View) -> np.ndarray | None:
+    try:
+        return load_thumbnail(view.image, SIDE)
+    except UserError:  # the training says so, or leaves the photo out
+        return None

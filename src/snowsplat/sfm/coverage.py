@@ -1,0 +1,93 @@
+"""How well photos cover a scene: steps from photo to photo, and points that several photos show.
+
+Everything is measured on the points of a COLMAP model and the photos that observe them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+#: At most about this number of points is measured.
+_POINTS = 20_000
+#: Two photos are neighbours if they share at least this share of the points of one of them.
+_NEIGHBOURS = 0.05
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The measures of N photos, in the order of their names.
+
+    Attributes:
+        names: of the photos.
+        confirmed: (N,) share of the points of a photo that at least two other photos observe. A
+            point of two photos has no third photo that could contradict a wrong match. NaN without
+            points.
+        step: (N,) distance to the nearest photo that shows the same, divided by the median depth
+            of the points; infinite if no photo shows the same.
+        directions: (N,) angle in degrees between the optical axis and the mean of all axes.
+    """
+
+    names: list[str]
+    confirmed: np.ndarray
+    step: np.ndarray
+    directions: np.ndarray
+
+
+def measure_coverage(model: Path) -> Coverage:
+    """The measures of a COLMAP model.
+
+    Args:
+        model: its folder. Every point has its observations.
+
+    Raises:
+        ValueError: the model cannot be read.
+    """
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction(model)
+    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    row = {image.image_id: i for i, image in enumerate(images)}
+    ids = sorted(reconstruction.point3D_ids())
+    points = [reconstruction.point3D(i) for i in ids[:: -(-len(ids) // _POINTS) or 1]]
+    xyz = np.array([point.xyz for point in points]).reshape(-1, 3)
+    seen = np.zeros((len(images), len(points)), bool)
+    for column, point in enumerate(points):
+        seen[[row[element.image_id] for element in point.track.elements], column] = True
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    names = [image.name for image in images]
+    return Coverage(names, _confirmed(seen), _steps(seen, poses, xyz), _directions(poses))
+
+
+def _confirmed(seen: np.ndarray) -> np.ndarray:
+    """`Coverage.confirmed`; ``seen`` (N, P) is True for the points that a photo observes."""
+    enough = seen.sum(0) >= 3
+    count = seen.sum(1)
+    return np.where(count > 0, (seen & enough).sum(1) / np.maximum(count, 1), np.nan)
+
+
+def _steps(seen: np.ndarray, poses: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """`Coverage.step`; poses (N, 3, 4) are cam_from_world, points (P, 3) are in the world."""
+    centres = -(poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, 3:])[:, :, 0]
+    as_floats = seen.astype(np.float32)
+    shared = as_floats @ as_floats.T
+    neighbours = shared >= np.maximum(1.0, _NEIGHBOURS * seen.sum(1)[:, None])
+    np.fill_diagonal(neighbours, False)
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    nearest = np.where(neighbours, apart, np.inf).min(1)
+    depths = np.full(len(poses), np.nan)
+    for i, (pose, visible) in enumerate(zip(poses, seen, strict=True)):
+        if visible.any():
+            depths[i] = np.median(xyz[visible] @ pose[2, :3] + pose[2, 3])
+    steps: np.ndarray = np.where(depths > 0, nearest / np.where(depths > 0, depths, 1.0), np.inf)
+    return steps
+
+
+def _directions(poses: np.ndarray) -> np.ndarray:
+    """`Coverage.directions`; poses (N, 3, 4) are cam_from_world."""
+    axes = poses[:, 2, :3]
+    mean = axes.mean(0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-12)
+    return np.degrees(np.arccos(np.clip(axes @ mean, -1.0, 1.0)))

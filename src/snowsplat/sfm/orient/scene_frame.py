@@ -1,0 +1,228 @@
+"""The frame of the scene: origin, axes and scale, from all that is known about a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from snowsplat.data.placement import Placement
+from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.orientation import VIEWING_DISTANCE
+from snowsplat.sfm.gps import east_north_up, location_of, middle_of, position_errors
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.orient.cameras import Cameras, read_cameras
+from snowsplat.sfm.orient.ground import of_ground
+from snowsplat.sfm.orient.positions import Alignment, align
+from snowsplat.sfm.orient.up import Evidence, combined, of_cameras, of_sensors, robust_mean
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# GPS is used if it determines the scale to this relative standard deviation.
+_SCALE_ERROR = 0.08
+# North determines the axes of the scene if it is known to this standard deviation.
+_NORTH_ERROR = math.radians(10)
+# Standard deviations of the mean of many gimbals and compasses: metal is near, and yaw drifts.
+_GIMBAL_YAW, _COMPASS = math.radians(3), math.radians(15)
+# Directions of sensors that differ by more than this from their median are wrong, and at most this
+# share of them may be.
+_WRONG_NORTH, _MOST_WRONG = math.radians(30), 0.25
+_FEWEST = 3
+# The level is also that of GPS if GPS makes its error smaller than this share.
+_BETTER = 0.8
+# A larger disagreement about the level, in standard deviations, is said.
+_CONTRADICTION = 3.0
+# Positions are far apart if their standard deviation is this many times their expected error.
+_FAR_APART = 3.0
+# The scene is in metres unless its cameras are nearer than this to their points, in metres: in
+# training and in viewers, nothing is drawn within 0.2 units.
+_NEAREST = 1.0
+
+
+@dataclass(frozen=True)
+class Oriented:
+    """The transform from the world frame of SfM to that of the scene, and where it comes from."""
+
+    scene_from_sfm: Similarity
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class _Gps:
+    alignment: Alignment  # of the cameras to metres east, north and up of `origin`
+    name: str
+    origin: np.ndarray  # (3,) latitude, longitude (°), altitude (m)
+
+
+@dataclass(frozen=True)
+class _North:
+    direction: np.ndarray  # (3,) horizontal unit vector in the world frame of SfM
+    name: str
+    error: float  # radians
+
+
+def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) -> Oriented:
+    """The frame of the scene, in which y points down.
+
+    Up is combined from all evidence; see `up`. If GPS positions or a gimbal tell where north is, z
+    points north and x east. Otherwise, z is the mean viewing direction, made horizontal. The origin
+    is the point that the cameras look at. If they look outwards or all in the same direction, it is
+    the median of the points. If GPS positions determine the scale, the unit is a metre. Otherwise,
+    the median distance from a camera to the points that it sees is `VIEWING_DISTANCE`.
+
+    Args:
+        photos: with the metadata; photos that are not in the model are ignored.
+
+    Raises:
+        ValueError: the model has no cameras.
+    """
+    cameras = read_cameras(model)
+    known = _known(cameras, photos)
+    up, doubts = _up(cameras, known)
+    gps, more = _gps(cameras, known, up)
+    doubts += more
+    up_from, direction, level_error = list(up.names), up.up, up.error
+    if gps is not None:
+        direction = gps.alignment.rotation[2]
+        if gps.alignment.level_error < _BETTER * level_error:
+            up_from.append(gps.name)
+        level_error = gps.alignment.level_error
+    north = _north_of_gps(gps) or _north_of_sensors(cameras, known, direction)
+    if north is not None and north.error < _NORTH_ERROR:
+        ahead = _horizontal(north.direction, direction)
+    else:
+        ahead = _viewing_direction(cameras, direction)
+    rotation = np.stack([np.cross(-direction, ahead), -direction, ahead])
+    scale = VIEWING_DISTANCE / cameras.distance
+    placement = Placement(up_from, math.degrees(level_error), doubts=doubts)
+    if north is not None:
+        x, y, z = (round(float(v), 12) for v in rotation @ _horizontal(north.direction, direction))
+        placement = replace(
+            placement,
+            north=(x, y, z),
+            north_from=north.name,
+            north_error=math.degrees(north.error),
+        )
+    if gps is not None:
+        metres = gps.alignment.scale
+        if metres * cameras.distance >= _NEAREST:
+            scale = metres
+        placement = replace(
+            placement,
+            metres_per_unit=metres / scale,
+            scale_from=gps.name,
+            scale_error=gps.alignment.scale_error,
+            position_error=gps.alignment.error,
+            origin=location_of(gps.alignment.place(cameras.subject[None])[0], gps.origin),
+        )
+    shift = -scale * rotation @ cameras.subject
+    return Oriented(
+        Similarity(scale, torch.from_numpy(rotation), torch.from_numpy(shift)), placement
+    )
+
+
+def _known(cameras: Cameras, photos: Sequence[Photo]) -> list[Photo | None]:
+    """The photo of each camera, or None."""
+    by_name = {photo.name: photo for photo in photos}
+    return [by_name.get(name) for name in cameras.names]
+
+
+def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, list[str]]:
+    """The up direction without GPS, and doubts as text for users."""
+    attitudes = [None if photo is None else photo.attitude for photo in photos]
+    evidence, doubts = of_sensors(cameras, attitudes)
+    measured = bool(evidence)
+    evidence.append(of_cameras(cameras))
+    if not measured:
+        ground = of_ground(cameras, evidence[-1])
+        evidence += [] if ground is None else [ground]
+    up, contradictions = combined(evidence)
+    return up, doubts + contradictions
+
+
+def _gps(
+    cameras: Cameras, photos: Sequence[Photo | None], up: Evidence
+) -> tuple[_Gps | None, list[str]]:
+    """The GPS positions if they determine the scale, and doubts as text for users."""
+    rows = [i for i, photo in enumerate(photos) if photo is not None and photo.location is not None]
+    located = [photo for photo in photos if photo is not None and photo.location is not None]
+    if len(located) < _FEWEST:
+        return None, []
+    locations = np.array([photo.location for photo in located])
+    origin = middle_of(locations)
+    places, errors = east_north_up(locations, origin), position_errors(located)
+    alignment = align(cameras.centres[rows], places, errors, up)
+    if alignment is None:
+        return None, ["GPS gives no scale: the photos have fewer than three different positions"]
+    spread = float(np.sqrt(np.square(places[:, :2] - places[:, :2].mean(axis=0)).sum(1).mean()))
+    if alignment.scale_error > _SCALE_ERROR or not alignment.agrees:
+        if spread < _FAR_APART * float(np.median(errors)):
+            why = "the positions differ too little for their error"
+        else:
+            why = "the positions do not agree with the camera poses"
+        return None, [f"GPS gives no scale: {why}"]
+    doubts = []
+    if alignment.up_away > _CONTRADICTION:
+        doubts.append(f"GPS positions and {' and '.join(up.names)} disagree about the level")
+    name = f"GPS positions of {len(located)} photos"
+    return _Gps(alignment, name, origin), doubts
+
+
+def _north_of_gps(gps: _Gps | None) -> _North | None:
+    if gps is None or gps.alignment.north_error > _NORTH_ERROR:
+        return None
+    return _North(gps.alignment.rotation[1], gps.name, gps.alignment.north_error)
+
+
+def _north_of_sensors(
+    cameras: Cameras, photos: Sequence[Photo | None], up: np.ndarray
+) -> _North | None:
+    """North from the yaw of gimbals or else from compasses, if most of them agree."""
+    for gimbal, name, usual in (
+        (True, "gimbal angles", _GIMBAL_YAW),
+        (False, "compasses", _COMPASS),
+    ):
+        rows = [
+            _horizontal(rotation.T @ np.array(photo.attitude.north), up)
+            for rotation, photo in zip(cameras.rotations, photos, strict=True)
+            if photo is not None
+            and photo.attitude is not None
+            and photo.attitude.north is not None
+            and photo.attitude.gimbal is gimbal
+        ]
+        if len(rows) < _FEWEST:
+            continue
+        norths = np.array(rows)
+        mean, spread = robust_mean(norths)
+        wrong = (norths @ mean < math.cos(_WRONG_NORTH)).mean()
+        if wrong <= _MOST_WRONG:
+            return _North(mean, f"the {name} of {len(rows)} photos", math.hypot(usual, spread))
+    return None
+
+
+def _horizontal(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The unit vector (3,) of the horizontal part of ``direction``."""
+    level = direction - (direction @ up) * up
+    return level / max(float(np.linalg.norm(level)), 1e-12)
+
+
+def _viewing_direction(cameras: Cameras, up: np.ndarray) -> np.ndarray:
+    """(3,) unit vector: the horizontal part of the mean viewing direction.
+
+    If this part is too short, that of the viewing direction of the first camera.
+    """
+    level = np.eye(3) - np.outer(up, up)
+    forward = cameras.forward
+    # If the first camera looks straight down, use the direction of its upper image edge.
+    candidates = (forward.mean(axis=0), forward[0], -cameras.rotations[0, 1])
+    for direction, least in zip(candidates, (0.5, 0.1, 0.0), strict=True):
+        horizontal = level @ direction
+        length = float(np.linalg.norm(horizontal))
+        if length > least:
+            break
+    return horizontal / length

@@ -1,0 +1,168 @@
+"""The up direction, from all that is known about it.
+
+    evidence          what it says                                   usual error
+    gimbal            the attitude of each photo of a drone          0.5°
+    accelerometer     the direction of gravity in each photo         1°
+    cameras           people hold cameras level: no roll             1.5°; along the mean viewing
+                                                                     direction up to 30°
+    ground            the largest plane below the cameras            3°
+
+Each is a direction with a covariance, and they are combined by these. GPS positions are combined
+with the result in `positions`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from snowsplat.scene.orientation import level_of_cameras
+from snowsplat.sfm.ingest.photo import Attitude
+from snowsplat.sfm.orient.cameras import Cameras
+
+# Standard deviations of a single photo, and of the mean of many: sensors are not aligned with the
+# lens exactly.
+_GIMBAL = (math.radians(2.0), math.radians(0.5))
+_ACCELEROMETER = (math.radians(3.0), math.radians(1.0))
+# Fewer photos with a sensor may all be wrong: the accelerometer also measures the hand.
+_FEWEST = 3
+# Sensors whose directions differ by more than this from their median are in contradiction.
+_LARGEST_SPREAD = math.radians(10)
+# Evidence that differs from the more accurate evidence by more standard deviations is not used.
+_CONTRADICTION = 3.0
+# Smaller contradictions are not said: people also tilt a camera, and ground slopes.
+_SAID = math.radians(20)
+# Evidence with a smaller share of the precision in all directions is not named.
+_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """An up direction in the world frame of SfM, and how certain it is.
+
+    Attributes:
+        names: what it was found from, as text for users.
+        up: (3,) unit vector.
+        precision: (3, 3) inverse covariance in 1/rad², of which ``up`` is the null space.
+    """
+
+    names: tuple[str, ...]
+    up: np.ndarray
+    precision: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """The standard deviation in radians, across the direction that is known least."""
+        plane = tangent(self.up)
+        return 1 / math.sqrt(np.linalg.eigvalsh(plane @ self.precision @ plane.T)[0])
+
+
+def of_cameras(cameras: Cameras) -> Evidence:
+    """The direction in which the photos are level; see `level_of_cameras`."""
+    return Evidence(("the way the photos were held",), *level_of_cameras(cameras.rotations))
+
+
+def of_sensors(
+    cameras: Cameras, attitudes: Sequence[Attitude | None]
+) -> tuple[list[Evidence], list[str]]:
+    """The directions of gimbals and of accelerometers, and doubts as text for users.
+
+    ``attitudes``: one per camera.
+    """
+    found, doubts = [], []
+    for gimbal, name in ((True, "gimbal angles"), (False, "accelerometers")):
+        rows = [
+            rotation.T @ np.array(attitude.up)
+            for rotation, attitude in zip(cameras.rotations, attitudes, strict=True)
+            if attitude is not None and attitude.up is not None and attitude.gimbal is gimbal
+        ]
+        if len(rows) < _FEWEST:
+            continue
+        ups = np.array(rows)
+        mean, spread = robust_mean(ups)
+        if spread > _LARGEST_SPREAD:
+            doubts.append(
+                f"the {name} of the photos contradict the camera poses "
+                f"(by {math.degrees(spread):.0f}°), so they are not used"
+            )
+            continue
+        each, all_ = _GIMBAL if gimbal else _ACCELEROMETER
+        error = math.hypot(max(spread, each) / math.sqrt(len(ups)), all_)
+        found.append(Evidence((f"the {name} of {len(ups)} photos",), mean, isotropic(mean, error)))
+    return found, doubts
+
+
+def robust_mean(units: np.ndarray) -> tuple[np.ndarray, float]:
+    """The geometric median (3,) of unit vectors (N, 3), and the median angle from it in radians."""
+    mean = np.median(units, axis=0)
+    for _ in range(50):
+        mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
+        away = np.linalg.norm(units - mean, axis=1)
+        weights = 1 / np.maximum(away, 1e-4)
+        mean = weights @ units
+    mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    angles = 2 * np.arcsin(np.minimum(np.linalg.norm(units - mean, axis=1) / 2, 1))
+    return mean, float(np.median(angles))
+
+
+def combined(evidence: Sequence[Evidence]) -> tuple[Evidence, list[str]]:
+    """The most likely direction, and contradictions as text for users.
+
+    ``evidence`` begins with what is trusted most. What contradicts the direction found from the
+    evidence before is not used.
+    """
+    best, doubts = evidence[0], []
+    for other in evidence[1:]:
+        angle = math.acos(min(1.0, max(-1.0, float(best.up @ other.up))))
+        if _apart(best, other) < _CONTRADICTION:
+            best = _mean(best, other)
+        elif angle > _SAID:
+            doubts.append(
+                f"up differs by {math.degrees(angle):.0f}° between {' and '.join(best.names)} "
+                f"(used) and {' and '.join(other.names)}"
+            )
+    return best, doubts
+
+
+def _apart(one: Evidence, two: Evidence) -> float:
+    """The difference in standard deviations, measured half-way."""
+    middle = one.up + two.up
+    length = float(np.linalg.norm(middle))
+    if length < 1e-6:
+        return math.inf
+    plane = tangent(middle / length)
+    away = plane @ (two.up - one.up)
+    covariance = sum(np.linalg.inv(plane @ part.precision @ plane.T) for part in (one, two))
+    return math.sqrt(away @ np.linalg.solve(covariance, away))
+
+
+def _mean(one: Evidence, two: Evidence) -> Evidence:
+    """The mean, weighted by the precisions."""
+    plane = tangent(one.up)
+    precisions = [plane @ part.precision @ plane.T for part in (one, two)]
+    inverse = np.linalg.inv(precisions[0] + precisions[1])
+    up = one.up + inverse @ precisions[1] @ plane @ (two.up - one.up) @ plane
+    up /= np.linalg.norm(up)
+    # What has nowhere a share that matters is not named.
+    names = tuple(
+        name
+        for part, precision in zip((one, two), precisions, strict=True)
+        if np.linalg.eigvals(inverse @ precision).real.max() > _SHARE
+        for name in part.names
+    )
+    plane = tangent(up)
+    total = plane @ (one.precision + two.precision) @ plane.T
+    return Evidence(names, up, plane.T @ total @ plane)
+
+
+def tangent(unit: np.ndarray) -> np.ndarray:
+    """(2, 3) orthonormal vectors perpendicular to ``unit``."""
+    return np.linalg.svd(unit[None])[2][1:]
+
+
+def isotropic(unit: np.ndarray, error: float) -> np.ndarray:
+    """(3, 3) precision of a direction with the same standard deviation (rad) in all planes."""
+    return (np.eye(3) - np.outer(unit, unit)) / error**2

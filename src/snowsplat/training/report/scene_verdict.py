@@ -1,0 +1,187 @@
+"""The verdict on a trained scene: does it look right from places that it was not trained on?
+
+The held-out photos are the evidence. Their PSNR depends on the contrast of the photos, so the share
+of the variance that the rendering explains decides; see `ViewMetrics.explained`. The comparison
+with training photos tells why: if those look right, the scene lacks photos, not steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from snowsplat.data.dataset import Dataset, View
+from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
+from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.training.starts.point_colors import point_pixels
+
+#: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
+#: of the photo (1 / √10); at 0.75, a half: contours are doubled or missing.
+_GOOD, _USABLE = 0.9, 0.75
+#: A single photo below this share shows something else than the scene.
+_WRONG = 0.5
+#: If the errors of held-out photos are larger than those of training photos by this factor, the
+#: scene lacks photos. It is then made for these photos, and wrong elsewhere.
+_LACKS_PHOTOS = 2.0
+#: Below this SSIM, fine detail is blurred in held-out photos.
+_SHARP = 0.7
+#: If more than this share of the photos is left out, it counts.
+_LEFT_OUT = 0.05
+#: A point is seen by few photos if at most this number of training photos shows it.
+_FEW_PHOTOS = 2
+#: Few photos explain a wrong photo if they see at least this share of its points.
+_SELDOM = 0.4
+#: With fewer held-out photos, these do not outweigh what the capture lacks.
+_EVIDENCE = 3
+#: Number of points whose photos are counted.
+_POINTS = 2000
+#: Standard deviation of the exposures, in EV, from which the camera should be set by hand.
+_SPREAD = 0.3
+
+_MORE = "take more photos, closer together, also from the places of the worst held-out photos"
+_CHECK = "train longer; if that does not help, check the camera poses in the report of the dataset"
+
+
+def scene_verdict(
+    held_out: Evaluation,
+    trained_on: Evaluation,
+    dataset: Dataset,
+    *,
+    left_out: Sequence[str] = (),
+    spread: float = 0.0,
+    poses: str | None = None,
+    capture: Verdict | None = None,
+) -> Verdict:
+    """The verdict.
+
+    Args:
+        held_out: of at least one held-out photo.
+        trained_on: of at least one training photo.
+        dataset: with the present cameras.
+        left_out: names of the training photos that the training has left out.
+        spread: standard deviation of the learnt exposures in EV; 0 if none are learnt.
+        poses: the line about poses that are not exact.
+        capture: the verdict on the photos of the dataset.
+    """
+    typical = _typical(held_out)
+    reasons = [
+        *_new_views(held_out, trained_on),
+        *_worst(held_out, dataset),
+        *_sharpness(held_out),
+        *_left_out(left_out, len(dataset.train)),
+        *([] if poses is None else [Reason("usable", poses)]),
+        *_exposures(spread),
+    ]
+    sure = typical >= _GOOD and len(held_out.views) >= _EVIDENCE
+    for reason in capture.reasons if capture is not None else ():
+        # What the held-out photos do not show is no fault of the scene, but limits it.
+        grade = "usable" if reason.grade == "poor" and sure else reason.grade
+        reasons.append(Reason(grade, reason.text, reason.advice))
+    return Verdict.of(reasons)
+
+
+def _new_views(held_out: Evaluation, trained_on: Evaluation) -> list[Reason]:
+    """Whether held-out photos are explained and, if not, why."""
+    share, own = _typical(held_out), _typical(trained_on)
+    if own < _USABLE:
+        text = (
+            f"the scene reproduces only {_percent(own)} of the contrast of the photos that it was "
+            f"trained on ({_psnr(trained_on):.1f} dB)"
+        )
+        return [Reason("poor", text, _CHECK)]
+    count = len(held_out.views)
+    photos = f"{count} photo" if count == 1 else f"{count} photos"
+    only = "" if share >= _GOOD else "only "
+    text = (
+        f"the scene reproduces {only}{_percent(share)} of the contrast of a typical held-out photo "
+        f"({_psnr(held_out):.1f} dB, colour-aligned, {photos})"
+    )
+    if share >= _GOOD:
+        return [Reason("good", text)]
+    factor = 10.0 ** ((_psnr(trained_on) - _psnr(held_out)) / 20.0)
+    lacks = factor >= _LACKS_PHOTOS
+    if lacks:
+        text += f"; the error is {factor:.1f} times that of the photos that it was trained on"
+    return [Reason("poor" if share < _USABLE or lacks else "usable", text, _MORE if lacks else "")]
+
+
+def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
+    """The held-out photos that show something else than the scene, the worst first."""
+    wrong = sorted(
+        (view for view in held_out.views if _share(view) < _WRONG), key=lambda view: _share(view)
+    )
+    if not wrong:
+        return []
+    names = ", ".join(f"{view.name} ({view.psnr_aligned:.1f} dB)" for view in wrong[:3])
+    text = f"the scene looks wrong in {names}"
+    if len(wrong) > 3:
+        text += f" and {len(wrong) - 3} more"
+    views = {view.name: view for view in dataset.test}
+    seldom = _seen_by_few(views[wrong[0].name], dataset) if wrong[0].name in views else 0.0
+    if seldom >= _SELDOM:
+        it = "it" if len(wrong) == 1 else wrong[0].name
+        text += f"; {_percent(seldom)} of what {it} shows is in at most two training photos"
+    return [Reason("usable", text, _MORE)]
+
+
+def _seen_by_few(view: View, dataset: Dataset) -> float:
+    """The share of the points in a view that at most two training views show. A view is assumed to
+    show what is inside its frame."""
+    if dataset.points is None:
+        return 0.0
+    xyz = dataset.points.xyz[:: -(-len(dataset.points) // _POINTS)]
+    inside = point_pixels(view.camera, xyz)[1]
+    if not inside.any():
+        return 0.0
+    xyz = xyz[inside]
+    counts = sum(point_pixels(other.camera, xyz)[1].long() for other in dataset.train)
+    assert not isinstance(counts, int)
+    return float((counts <= _FEW_PHOTOS).double().mean())
+
+
+def _sharpness(held_out: Evaluation) -> list[Reason]:
+    ssim = float(np.median([view.ssim for view in held_out.views]))
+    if ssim >= _SHARP:
+        return []
+    return [Reason("usable", f"fine detail is blurred in held-out photos (SSIM {ssim:.2f})")]
+
+
+def _left_out(names: Sequence[str], count: int) -> list[Reason]:
+    if not names:
+        return []
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    text = (
+        f"{len(names)} of {count} photos contradict the others and were left out: "
+        f"{', '.join(names[:3])}{more}"
+    )
+    return [Reason("usable" if len(names) > _LEFT_OUT * count else "good", text)]
+
+
+def _exposures(spread: float) -> list[Reason]:
+    if spread < _SPREAD:
+        return []
+    return [
+        Reason(
+            "good",
+            f"the exposures of the photos differ by {spread:.1f} EV, which the training corrects",
+            "fix the exposure and the white balance of the camera",
+        )
+    ]
+
+
+def _typical(evaluation: Evaluation) -> float:
+    return float(np.median([_share(view) for view in evaluation.views]))
+
+
+def _psnr(evaluation: Evaluation) -> float:
+    """The median of the colour-aligned PSNR, in dB; at most 60."""
+    return min(60.0, float(np.median([view.psnr_aligned for view in evaluation.views])))
+
+
+def _percent(share: float) -> str:
+    return f"{100 * max(share, 0.0):.0f}%"
+
+
+def _share(view: ViewMetrics) -> float:
+    return 0.0 if view.explained is None else view.explained

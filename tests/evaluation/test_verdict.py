@@ -1,0 +1,51 @@
+"""The verdict: its grade, the order of its reasons, and its words."""
+
+import json
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from snowsplat.evaluation.verdict import Reason, Verdict
+
+REMARK = Reason("good", "all photos show one side")
+FEW = Reason("usable", "11 photos are few", "take more")
+FAR = Reason("poor", "the photos are far apart <here>", "take more")
+LOST = Reason("usable", "3 photos are lost", "take photos in between")
+
+
+def test_the_worst_reason_is_the_grade_and_comes_first():
+    assert Verdict.of([]).grade == "good"
+    assert Verdict.of([REMARK]).grade == "good"
+    verdict = Verdict.of([REMARK, FEW, LOST, FAR])
+    assert verdict.grade == "poor"
+    assert verdict.reasons == (FAR, FEW, LOST, REMARK)
+    assert verdict.told == (FAR, FEW, LOST)
+    assert verdict.advice == ["take more", "take photos in between"]
+
+
+def test_lines():
+    assert Verdict.of([REMARK, FEW]).lines("the photos") == [
+        "the photos: usable, with limits",
+        "  - 11 photos are few",
+        "  - all photos show one side",
+        "  next time: take more",
+    ]
+
+
+def test_html_is_escaped():
+    box = ET.fromstring(Verdict.of([FAR]).html("the scene"))
+    assert box.attrib["class"] == "verdict poor"
+    words = " ".join("".join(box.itertext()).split())
+    assert words.startswith("The scene: poor; expect blurred or wrong parts")
+    assert "The photos are far apart <here>" in words
+    assert "Next time:Take more" in words
+
+
+def test_json():
+    verdict = Verdict.of([REMARK, FAR])
+    assert Verdict.from_json(json.loads(json.dumps(verdict.as_json()))) == verdict
+
+
+@pytest.mark.parametrize("values", [None, {}, [], {"reasons": 1}, {"reasons": [{"text": "no"}]}])
+def test_other_json_is_no_verdict(values):
+    assert Verdict.from_json(values) is None

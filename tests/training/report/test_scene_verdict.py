@@ -1,0 +1,88 @@
+"""The verdict on a scene, from the metrics of held-out and training photos."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from snowsplat.data import load_dataset
+from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
+from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.report.scene_verdict import scene_verdict
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verdict")
+    write_toy_dataset(folder, n_views=17, width=48, height=36, n_points=300)
+    return load_dataset(folder, hold_out=4)
+
+
+def evaluation(*explained: float, ssim: float = 0.9) -> Evaluation:
+    """The PSNR is that of photos with a variance of 0.1."""
+    names = [f"view_{4 * i:02d}.png" for i in range(len(explained))]
+    values = [-10 * math.log10(max(0.1 * (1 - share), 1e-9)) for share in explained]
+    return Evaluation(
+        [
+            ViewMetrics(name, psnr, ssim, psnr, None, share)
+            for name, psnr, share in zip(names, values, explained, strict=True)
+        ]
+    )
+
+
+SHARP = evaluation(0.98, 0.98, 0.98, 0.98)
+
+
+def told(verdict: Verdict) -> str:
+    return "\n".join(reason.text for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("held_out", "trained_on", "grade", "words"),
+    [
+        (evaluation(0.95, 0.96, 0.97), SHARP, "good", "reproduces 96% of the contrast"),
+        (evaluation(0.85, 0.86, 0.87), evaluation(0.9), "usable", "reproduces only 86%"),
+        (evaluation(0.85, 0.86, 0.87), SHARP, "poor", "the error is 2.6 times"),
+        (evaluation(0.6, 0.6, 0.6), evaluation(0.8), "poor", "reproduces only 60%"),
+        (evaluation(-0.2), evaluation(0.3), "poor", "0.3 of"),
+        (evaluation(0.95, 0.96, 0.97, ssim=0.6), SHARP, "usable", "blurred in held-out photos"),
+        (evaluation(1.0), evaluation(1.0), "good", "reproduces 100%"),
+    ],
+)
+def test_grades(dataset, held_out, trained_on, grade, words):
+    verdict = scene_verdict(held_out, trained_on, dataset)
+    assert verdict.grade == grade
+    assert words.replace("0.3 of", "only 30% of the contrast of the photos") in told(verdict)
+
+
+def test_the_worst_photos_are_named(dataset):
+    verdict = scene_verdict(evaluation(0.95, 0.1, 0.97, 0.96), SHARP, dataset)
+    assert verdict.grade == "usable"
+    assert verdict.reasons[0].text.startswith("the scene looks wrong in view_04.png (10.5 dB)")
+    # Other photos show most of this photo; but with one photo for training, hardly any does.
+    assert "training photos" not in verdict.reasons[0].text
+    alone = load_dataset(dataset.train[0].image.path.parents[1], hold_out=4)
+    alone.train = alone.train[:1]
+    lonely = scene_verdict(evaluation(0.95, 0.1, 0.97, 0.96), SHARP, alone)
+    assert "of what it shows is in at most two training photos" in lonely.reasons[0].text
+
+
+def test_what_the_training_has_found(dataset):
+    good = evaluation(0.95, 0.96, 0.97)
+    verdict = scene_verdict(good, SHARP, dataset, left_out=["a.png"], spread=0.4, poses="off by 3")
+    assert verdict.grade == "usable"
+    assert "off by 3" in told(verdict)
+    assert "1 of 12 photos contradict the others and were left out: a.png" in told(verdict)
+    assert "differ by 0.4 EV" in told(verdict)
+    assert scene_verdict(good, SHARP, dataset, spread=0.1).grade == "good"
+
+
+def test_the_verdict_on_the_photos_counts_but_held_out_photos_outweigh_it(dataset):
+    far = Verdict.of([Reason("poor", "the photos are far apart")])
+    assert scene_verdict(evaluation(0.95), SHARP, dataset, capture=far).grade == "poor"
+    many = evaluation(0.95, 0.96, 0.97)
+    assert scene_verdict(many, SHARP, dataset, capture=far).grade == "usable"
+    nice = Verdict.of([Reason("good", "50 photos")])
+    assert scene_verdict(evaluation(0.5), SHARP, dataset, capture=nice).grade == "poor"
