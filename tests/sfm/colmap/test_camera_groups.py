@@ -125,5 +125,5 @@ def test_photos_with_exif_keep_their_camera():
 def test_more_cameras_alone_are_not_better(tmp_path):
     (tmp_path / "one").mkdir()
     one, each = mapped(tmp_path / "one", WALK), mapped(tmp_path, WALK, separate)
-    assert not better(each, [one])
-    assert better(one, [each])
+    assert not better(each, [one], several=False)
+    assert better(one, [each], several=True)

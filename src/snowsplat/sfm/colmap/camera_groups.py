@@ -123,20 +123,23 @@ def by_camera(photos: Sequence[Photo], focals: Mapping[int, float]) -> dict[int,
     return {camera: float(np.median(known)) for camera, known in values.items()}
 
 
-def better(model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> bool:
+def better(
+    model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction], several: bool
+) -> bool:
     """Whether ``model`` is better than the first of ``others``, which has other cameras.
 
     It has at least as many photos. With more cameras, it also agrees better with the matches; with
-    fewer cameras, it does not agree worse.
+    fewer cameras, it does not agree worse. ``several``: the other model has several focal lengths,
+    too, so only the groups are in question.
     """
     if not others:
         return True
     other = others[0]
     if model.num_reg_images() < other.num_reg_images():
         return False
-    if _cameras(model) > _cameras(other):
-        return misfit(model) < (1 - _MIN_GAIN) * misfit(other)
-    return misfit(other) >= (1 - _MIN_GAIN) * misfit(model)
+    if _cameras(model) <= _cameras(other):
+        return misfit(other) >= (1 - _MIN_GAIN) * misfit(model)
+    return misfit(model) < (1.0 if several else 1 - _MIN_GAIN) * misfit(other)
 
 
 def describe(model: pycolmap.Reconstruction) -> str:

@@ -305,7 +305,10 @@ class PoseEstimation:
             begin = dataclasses.replace(lens, focals=camera_groups.by_camera(several, focals))
             self._try("with several focal lengths", matched, mapper, begin)
             made, best = self.attempts.pop(), self._best()
-            if not made.models or not camera_groups.better(made.models[0], best.models):
+            made_better = bool(made.models) and camera_groups.better(
+                made.models[0], best.models, several=before is not one
+            )
+            if not made_better:
                 self.photos = before
                 break
             self.attempts, lens = [made], begin  # the other models are bent
