@@ -24,7 +24,7 @@ from torch.nn.functional import max_pool2d
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.orientation import scene_up
 from snowsplat.training.parts.direction_cells import (
     ANGLE,
     COUNT,
@@ -197,7 +197,7 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
 def _up(cameras: Sequence[Camera]) -> Tensor:
     """(3,) float32, a unit vector: away from the ground."""
     rotations = torch.stack([camera.cam_from_world[:, :3].cpu() for camera in cameras])
-    return torch.from_numpy(up_direction(rotations.to(torch.float64).numpy())).to(torch.float32)
+    return torch.from_numpy(scene_up(rotations.to(torch.float64).numpy())).to(torch.float32)
 
 
 def _offsets(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
