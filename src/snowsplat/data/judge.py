@@ -30,6 +30,7 @@ from snowsplat.data.rig import Rig
 
 # Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
 _COLOURS_AGREE = 0.6
+_COLOURS_CONTRADICT = 0.35
 # A correlation above this is none of chance. Photos that look alike may agree no less with others.
 _COLOURS_FIT = 0.4
 # Matches: pairs that are needed, and the share of matches that agree. 0 to 0.4 for wrong poses
@@ -155,7 +156,8 @@ def _by_both(
     evidence = f"{_of_matches(fit)}, and {_of_colours(agreement)}"
     if repairs := _explaining(rig, matches, fit):
         return [_mistake(_coloured(repairs, colours, agreement) or repairs[0], evidence)]
-    return [_disorder(evidence, impossible=True)]
+    proven = len(matches.pairs) >= _PAIRS_FOR_PROOF and agreement.agreeing < _COLOURS_CONTRADICT
+    return [_disorder(evidence, impossible=proven)]
 
 
 def _focal(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:

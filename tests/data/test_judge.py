@@ -1,0 +1,203 @@
+"""`judge`: right cameras pass in every frame and unit; the usual mistakes are found and named."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from snowsplat.data import Dataset, ImageSource, Points, View, load_dataset
+from snowsplat.data.judge import judge
+from snowsplat.data.rig import Rig
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import look_at, quat_from_rotation, rotation_from_quat
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def coloured(tmp_path_factory) -> Dataset:
+    """Smooth balls with coloured points: no features to match, so only colours can tell."""
+    folder = tmp_path_factory.mktemp("toy") / "toy"
+    return load_dataset(write_toy_dataset(folder, "colmap-bin", 12, 96, 72, n_points=3000))
+
+
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory) -> Dataset:
+    """A textured corner of a room without points: only matches can tell."""
+    folder = tmp_path_factory.mktemp("corner")
+    random = np.random.default_rng(0)
+    textures = [
+        cv2.GaussianBlur(random.integers(0, 256, (400, 400), np.uint8), (0, 0), 2) * 3
+        for _ in range(3)
+    ]
+    views = []
+    for i in range(10):
+        angle = 0.25 + 0.11 * i
+        position = torch.tensor([4 * np.cos(angle), 4 * np.sin(angle), 1.6 + 0.6 * np.sin(2.0 * i)])
+        pose = look_at(
+            position, torch.tensor([0.6, 0.6, 0.6]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
+        )
+        camera = Camera(320, 240, 300.0, 300.0, 160.0, 120.0, pose[:3].double())
+        path = folder / f"{i:02d}.png"
+        Image.fromarray(corner(camera, textures)).save(path)
+        views.append(View(path.name, camera, ImageSource(path, 320, 240)))
+    return Dataset(views, [], None, 4.0, "corner")
+
+
+def corner(camera: Camera, textures: list[np.ndarray]) -> np.ndarray:
+    """(240, 320) uint8: three squares with a side of 2, in the planes x = 0, y = 0 and z = 0."""
+    picture = np.zeros((camera.height, camera.width), np.uint8)
+    pose = camera.intrinsics.numpy() @ camera.cam_from_world.numpy()
+    for plane, texture in enumerate(textures):
+        first, second = (axis for axis in range(3) if axis != plane)
+        scale = np.diag([2 / 400, 2 / 400, 1.0])  # from pixels of the texture
+        homography = pose[:, [first, second, 3]] @ scale
+        size = camera.width, camera.height
+        inside = cv2.warpPerspective(np.full_like(texture, 255), homography, size)
+        warped = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_AREA)
+        picture = np.where(inside > 0, warped, picture)
+    return picture
+
+
+def rig_of(dataset: Dataset) -> Rig:
+    return Rig.of([view.camera for view in dataset.train + dataset.test])
+
+
+def with_rig(dataset: Dataset, rig: Rig, points: Points | None = None) -> Dataset:
+    """The photos of a dataset with other cameras; and with other points, if there are any."""
+    views = []
+    for i, view in enumerate(dataset.train + dataset.test):
+        pose = np.concatenate([rig.rotation[i], rig.translation[i][:, None]], axis=1)
+        camera = dataclasses.replace(
+            view.camera,
+            fx=float(rig.focal[i, 0] * view.camera.width),
+            fy=float(rig.focal[i, 1] * view.camera.height),
+            cam_from_world=torch.from_numpy(pose),
+        )
+        views.append(dataclasses.replace(view, camera=camera))
+    return Dataset(views, [], points or dataset.points, dataset.extent, "corrupted")
+
+
+def inverted(rig: Rig) -> Rig:
+    return rig.moved(rig.rotation.transpose(0, 2, 1), rig.translation)
+
+
+def quaternions_xyzw(rig: Rig) -> Rig:
+    quats = quat_from_rotation(torch.from_numpy(rig.rotation))[:, (1, 2, 3, 0)]
+    return dataclasses.replace(rig, rotation=rotation_from_quat(quats).numpy())
+
+
+CORRUPTIONS = {
+    "opengl axes": (lambda rig: rig.moved(OPENGL @ rig.rotation, rig.positions), "axes"),
+    "inverted": (inverted, "direction"),
+    "transposed": (
+        lambda rig: dataclasses.replace(rig, rotation=rig.rotation.transpose(0, 2, 1)),
+        "direction",
+    ),
+    "position as translation": (
+        lambda rig: dataclasses.replace(rig, translation=rig.positions),
+        "positions",
+    ),
+    "quaternions": (quaternions_xyzw, "quaternions"),
+    "mirrored": (
+        lambda rig: rig.moved(
+            np.diag([-1.0, 1, 1]) @ rig.rotation @ np.diag([1.0, 1, -1]),
+            rig.positions * [1, 1, -1],
+        ),
+        "axes",
+    ),
+    "long focal length": (lambda rig: rig.zoomed(5.0), "focal length"),
+}
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_right_cameras(coloured: Dataset, matched: Dataset, scale: float) -> None:
+    turn = rotation_from_quat(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64)).numpy()
+    for dataset in (coloured, matched):
+        rig, points = rig_of(dataset), dataset.points
+        moved = rig.moved(rig.rotation @ turn.T, scale * rig.positions @ turn.T)
+        if points is not None:
+            xyz = scale * points.xyz.double() @ torch.from_numpy(turn.T)
+            points = Points(xyz.float(), points.rgb)
+        assert judge(with_rig(dataset, moved, points)) == []
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_matches_find(matched: Dataset, name: str) -> None:
+    corrupt, about = CORRUPTIONS[name]
+    findings = judge(with_rig(matched, corrupt(rig_of(matched))))
+    assert about in [finding.about for finding in findings]
+
+
+# A camera at another place sees nearly the same colours of the large sphere around the balls.
+@pytest.mark.parametrize("name", [n for n in CORRUPTIONS if n != "position as translation"])
+def test_colours_find(coloured: Dataset, name: str) -> None:
+    corrupt, _ = CORRUPTIONS[name]
+    assert judge(with_rig(coloured, corrupt(rig_of(coloured))))
+
+
+def test_shuffled_names(coloured: Dataset, matched: Dataset) -> None:
+    for dataset in (coloured, matched):
+        rig = rig_of(dataset)
+        order = np.random.default_rng(1).permutation(len(rig))
+        assert judge(with_rig(dataset, rig.select(order)))
+
+
+def test_units_of_the_points(coloured: Dataset) -> None:
+    rig = rig_of(coloured)
+    findings = judge(with_rig(coloured, rig.moved(rig.rotation, 100 * rig.positions)))
+    assert [(f.about, f.impossible) for f in findings] == [("units", True)]
+    assert "the unit of the poses is 93 times" in findings[0].text  # in steps of 12%
+
+
+def test_random_points_say_nothing(coloured: Dataset, matched: Dataset) -> None:
+    """Some exporters write points at random, as a start for the training."""
+    generator = torch.Generator().manual_seed(0)
+    xyz = torch.rand(3000, 3, generator=generator) * 4 - 2
+    rgb = torch.randint(0, 256, (3000, 3), generator=generator, dtype=torch.uint8)
+    for dataset in (coloured, matched):
+        assert judge(with_rig(dataset, rig_of(dataset), Points(xyz, rgb))) == []
+    grey = Points(xyz, torch.full_like(rgb, 128))
+    assert judge(with_rig(matched, rig_of(matched), grey)) == []
+
+
+def test_a_damaged_photo_is_left_out(coloured: Dataset, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"not a photo")
+    first, *rest = coloured.train
+    view = dataclasses.replace(first, image=dataclasses.replace(first.image, path=broken))
+    assert judge(dataclasses.replace(coloured, train=[view, *rest])) == []
+
+
+def test_far_from_the_origin(matched: Dataset) -> None:
+    rig = rig_of(matched)
+    moved = rig.moved(rig.rotation, rig.positions + np.array([500_000, 4_500_000, 120]))
+    (finding,) = judge(with_rig(matched, moved))
+    assert (finding.about, finding.impossible) == ("origin", True)
+    assert "subtract (50000" in finding.text
+    moved = rig.moved(rig.rotation, rig.positions + np.array([10_000, 0, 0]))
+    assert [(f.about, f.impossible) for f in judge(with_rig(matched, moved))] == [("origin", False)]
+
+
+def test_one_place(coloured: Dataset) -> None:
+    rig = rig_of(coloured)
+    still = dataclasses.replace(rig, translation=np.zeros_like(rig.translation))
+    assert judge(with_rig(coloured, still))
+
+
+def test_impossible_lens(matched: Dataset) -> None:
+    rig = rig_of(matched)
+    (finding,) = judge(with_rig(matched, rig.zoomed(0.02)))
+    assert (finding.about, finding.impossible) == ("field of view", True)
+    few = dataclasses.replace(
+        rig, focal=rig.focal * np.where(np.arange(len(rig)) < 3, 0.02, 1)[:, None]
+    )
+    (finding,) = judge(with_rig(matched, few))
+    assert finding.text.startswith("3 photos: ")
