@@ -117,6 +117,7 @@ CORRUPTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_right_cameras(coloured: Dataset, matched: Dataset, scale: float) -> None:
     turn = rotation_from_quat(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64)).numpy()
@@ -129,6 +130,7 @@ def test_right_cameras(coloured: Dataset, matched: Dataset, scale: float) -> Non
         assert judge(with_rig(dataset, moved, points)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CORRUPTIONS)
 def test_matches_find(matched: Dataset, name: str) -> None:
     corrupt, about = CORRUPTIONS[name]
@@ -143,6 +145,7 @@ def test_colours_find(coloured: Dataset, name: str) -> None:
     assert judge(with_rig(coloured, corrupt(rig_of(coloured))))
 
 
+@pytest.mark.slow
 def test_shuffled_names(coloured: Dataset, matched: Dataset) -> None:
     for dataset in (coloured, matched):
         rig = rig_of(dataset)
@@ -157,6 +160,7 @@ def test_units_of_the_points(coloured: Dataset) -> None:
     assert "the unit of the poses is 93 times" in findings[0].text  # in steps of 12%
 
 
+@pytest.mark.slow
 def test_random_points_say_nothing(coloured: Dataset, matched: Dataset) -> None:
     """Some exporters write points at random, as a start for the training."""
     generator = torch.Generator().manual_seed(0)
@@ -176,6 +180,7 @@ def test_a_damaged_photo_is_left_out(coloured: Dataset, tmp_path: Path) -> None:
     assert judge(dataclasses.replace(coloured, train=[view, *rest])) == []
 
 
+@pytest.mark.slow
 def test_far_from_the_origin(matched: Dataset) -> None:
     rig = rig_of(matched)
     moved = rig.moved(rig.rotation, rig.positions + np.array([500_000, 4_500_000, 120]))
