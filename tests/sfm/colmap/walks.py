@@ -45,8 +45,10 @@ def forward(count: int = 12, step: float = 1.5) -> Walk:
     """Along a street between two rows of houses; the camera looks ahead."""
     random = np.random.default_rng(0)
     length = count * step + 40
-    side = random.choice([-1, 1], 5000) * random.uniform(5, 7, 5000)
-    xyz = np.stack([side, random.uniform(-4, 1.6, 5000), random.uniform(0, length, 5000)], 1)
+    total = 3000
+    side = random.choice([-1, 1], total) * random.uniform(5, 7, total)
+    height, along = random.uniform((-4, 0), (1.6, length), (total, 2)).T
+    xyz = np.stack([side, height, along], 1)
     sway = 0.02 * random.normal(size=(count, 3))
     centres = np.stack([0 * np.arange(count), 0 * np.arange(count), step * np.arange(count)], 1)
     return _walk(xyz, centres + 2 * sway, 0.5 * sway, random, reach=25.0)
