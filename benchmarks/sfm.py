@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import signal
 import subprocess
@@ -43,6 +42,7 @@ from torch import Tensor
 
 from snowsplat.data.colmap import read_model
 from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.sfm.gps import east_north_up, middle_of
 from snowsplat.sfm.ingest.exif import read_exif
 from snowsplat.util.errors import UserError
 
@@ -239,10 +239,8 @@ def compared_with_gps(found: Mapping[str, Tensor], photos: Path) -> dict[str, An
             places[name] = location
     if len({place[:2] for place in places.values()}) < 3:
         return {}
-    table = np.array(list(places.values()))
-    middle = table.mean(0)
-    east = (table[:, 1] - middle[1]) * math.cos(math.radians(middle[0]))
-    gps = np.stack([east, table[:, 0] - middle[0]], 1) * 111_320.0
+    locations = np.array(list(places.values()))
+    gps = east_north_up(locations, middle_of(locations))[:, :2]
     poses = torch.stack([found[name] for name in places])
     centres = -(poses[:, :, :3].transpose(1, 2) @ poses[:, :, 3:])[..., 0].numpy()
     weights = np.ones(len(gps))

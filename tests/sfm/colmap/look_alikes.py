@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.database import closing_database, open_database
+from snowsplat.sfm.colmap.database import open_database
 from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
+
+from .walks import write_features
 
 COUNT, FAR = 16, range(9, 16)
 STEP, SHIFT = 1.5, np.array([18.0, 0.0, 0.0])
@@ -81,14 +83,8 @@ def photos() -> list[Photo]:
 
 def write_database(path: Path, scene: Walk) -> Path:
     open_database(path, photos(), Lens("SIMPLE_PINHOLE"), "none")
-    with closing_database(path) as database:
-        for i, pixels in enumerate(scene.pixels):
-            database.write_keypoints(i + 1, pixels.astype(np.float32))
-        for (i, j), rows in scene.matches.items():
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
-            geometry.inlier_matches = rows
-            database.write_two_view_geometry(i + 1, j + 1, geometry)
+    config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    write_features(path, scene.pixels, scene.matches, config)
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,15 +31,29 @@ class Walk:
 
     def write(self, path: Path, exif: float | None, lens: Lens) -> Path:
         open_database(path, self.photos(exif), lens, "none")
-        with closing_database(path) as database:
-            for i, pixels in enumerate(self.pixels):
-                database.write_keypoints(i + 1, pixels.astype(np.float32))
-            for (i, j), rows in self.matches.items():
-                geometry = pycolmap.TwoViewGeometry()
-                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-                geometry.inlier_matches = rows
-                database.write_two_view_geometry(i + 1, j + 1, geometry)
+        config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        write_features(path, self.pixels, self.matches, config)
         return path
+
+
+def write_features(
+    path: Path,
+    pixels: Sequence[np.ndarray],
+    matches: Mapping[tuple[int, int], np.ndarray],
+    config: pycolmap.TwoViewGeometryConfiguration,
+) -> None:
+    """Write the features and the verified matches of photos into their database.
+
+    ``pixels`` and ``matches`` as in `Walk`; ``config``: of all pairs.
+    """
+    with closing_database(path) as database:
+        for i, positions in enumerate(pixels):
+            database.write_keypoints(i + 1, positions.astype(np.float32))
+        for (i, j), rows in matches.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = config
+            geometry.inlier_matches = rows
+            database.write_two_view_geometry(i + 1, j + 1, geometry)
 
 
 def forward(count: int = 12, step: float = 1.5) -> Walk:

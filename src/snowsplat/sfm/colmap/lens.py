@@ -213,8 +213,8 @@ def settled(
         model: from the mapper; it is not changed.
         lens: that of the attempt which made ``model``.
     """
-    known = exif_focals(photos) if lens.exif else {}
-    if not (lens.held or _doubts(model, exif_focals(photos))):
+    known = exif_focals(photos)
+    if not (lens.held or _doubts(model, known)):
         return Settled(model, False, [])
 
     def refined(held: bool) -> pycolmap.Reconstruction:
@@ -222,17 +222,17 @@ def settled(
         for name in lens.detailed:
             cameras = cameras_of(photos, replace(lens, model=name, held=False))
             made = refine(copy.deepcopy(model), cameras, held)
-            if not _impossible(made, known):
+            if not _impossible(made):
                 break
         return made
 
     free, held = refined(False), refined(True)
     ratio = misfit(held) / misfit(free)
-    if not _impossible(held, known) and ratio <= 1 + _EQUAL_ERROR:
+    if not _impossible(held) and ratio <= 1 + _EQUAL_ERROR:
         return Settled(held, True, [])
-    if not _impossible(free, known):
-        return Settled(free, False, _doubts(free, exif_focals(photos)))
-    if not _impossible(held, known) and ratio <= _MAX_WORSE:
+    if not _impossible(free):
+        return Settled(free, False, _doubts(free, known))
+    if not _impossible(held) and ratio <= _MAX_WORSE:
         return Settled(held, True, [])
     return Settled(None, False, _doubts(free, known))
 
@@ -252,11 +252,11 @@ def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[
     return list(dict.fromkeys(found))
 
 
-def _impossible(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> bool:
+def _impossible(model: pycolmap.Reconstruction) -> bool:
     return any(
         finding.impossible
         for number in _used(model)
-        for finding in findings_of(model.cameras[number], known.get(number))
+        for finding in findings_of(model.cameras[number], None)
     )
 
 
