@@ -22,8 +22,8 @@ import numpy as np
 import torch
 
 from snowsplat.data import Dataset, Points, View, load_dataset
-from snowsplat.data.judge import judge
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.rig import Rig
+from snowsplat.data.judge.verdict import judge
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 
 _Random = np.random.Generator

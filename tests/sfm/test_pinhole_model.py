@@ -5,8 +5,8 @@ import pycolmap
 import pytest
 import torch
 
+from snowsplat.data.lens.pinhole import pinhole_of
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
-from snowsplat.sfm.pinhole import pinhole_of
 from snowsplat.sfm.pinhole_model import write_model
 
 F64 = torch.float64

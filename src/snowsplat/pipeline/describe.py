@@ -162,7 +162,7 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
 
 def _dataset(path: Path) -> dict[str, Any]:
     from snowsplat.data import load_dataset  # torch; the other kinds do not need it
-    from snowsplat.data.judge import judge
+    from snowsplat.data.judge.verdict import judge
 
     dataset = load_dataset(path)
     views = [*dataset.train, *dataset.test]

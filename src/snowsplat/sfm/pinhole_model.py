@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.scene.geometry import Similarity
-from snowsplat.sfm.pinhole import Pinhole
 
 if TYPE_CHECKING:
     import pycolmap

@@ -27,9 +27,9 @@ from PIL import Image
 from snowsplat.data.decode import resize_area
 from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
-from snowsplat.sfm.pinhole import Pinhole, pinhole_of
+from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
+from snowsplat.data.lens.resample import undistort_image, undistort_mask
 from snowsplat.sfm.pinhole_model import write_model
-from snowsplat.sfm.resample import undistort_image, undistort_mask
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 
 from snowsplat.data import Dataset
-from snowsplat.data.judge import judge
+from snowsplat.data.judge.verdict import judge
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
 
 
 def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tuple[str, ...]:
-    """Judge the cameras of a dataset; see `snowsplat.data.judge.judge`.
+    """Judge the cameras of a dataset; see `snowsplat.data.judge.verdict.judge`.
 
     Logs a warning for each doubt.
 

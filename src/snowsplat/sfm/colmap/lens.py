@@ -21,8 +21,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snowsplat.data.finding import Finding
-from snowsplat.data.lens_check import lens_findings
+from snowsplat.data.judge.finding import Finding
+from snowsplat.data.judge.lens_check import lens_findings
 from snowsplat.sfm.ingest.photo import Photo
 
 # With fewer photos, the eight parameters of the camera model OPENCV are not well determined.

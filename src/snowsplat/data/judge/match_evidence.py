@@ -8,8 +8,8 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from snowsplat.data.photo_sample import PhotoSample
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.photo_sample import PhotoSample
+from snowsplat.data.judge.rig import Rig
 
 _FEATURES = 500  # of each photo
 _RATIO = 0.8  # of the distances to the best and the second best feature, as in Lowe's paper

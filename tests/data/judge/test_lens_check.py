@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from snowsplat.data.lens_check import field_of_view, lens_findings
+from snowsplat.data.judge.lens_check import field_of_view, lens_findings
 
 
 def found(*intrinsics: float, known: float | None = None) -> list[tuple[str, bool]]:

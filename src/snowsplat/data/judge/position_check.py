@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from snowsplat.data.finding import Finding
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.finding import Finding
+from snowsplat.data.judge.rig import Rig
 
 # Distance of the scene from the origin, relative to the extent of the cameras. Kernels compute in
 # float32, with a relative error of 6e-8. At a distance of 2000 extents this is a tenth of a pixel

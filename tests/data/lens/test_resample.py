@@ -5,8 +5,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.pinhole import Pinhole, pinhole_of
-from snowsplat.sfm.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
+from snowsplat.data.lens.resample import undistort_image, undistort_mask
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
@@ -102,5 +102,5 @@ def test_the_strip_size_does_not_change_the_result(strip, monkeypatch):
     camera = lens(*LENSES["tangential"])
     image, pinhole = to_image(photograph(camera, 110)), pinhole_of(camera)
     whole = np.asarray(undistort_image(image, pinhole), np.int64)
-    monkeypatch.setattr("snowsplat.sfm.resample._STRIP_PIXELS", strip)
+    monkeypatch.setattr("snowsplat.data.lens.resample._STRIP_PIXELS", strip)
     assert np.abs(np.asarray(undistort_image(image, pinhole), np.int64) - whole).max() <= 1

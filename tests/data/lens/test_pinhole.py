@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.pinhole import pinhole_of
+from snowsplat.data.lens.pinhole import pinhole_of
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),

@@ -11,7 +11,7 @@ import numpy as np
 
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import load_thumbnail
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.rig import Rig
 from snowsplat.util.errors import UserError
 
 # Pixels of the longer side: enough for matches, and for the colours of points.

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.sfm.pinhole import Pinhole
+from snowsplat.data.lens.pinhole import Pinhole
 
 _STRIP_PIXELS = 1 << 16  # processed at a time: limits the memory and fits the caches
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from snowsplat.data.finding import Finding
+from snowsplat.data.judge.finding import Finding
 
 # Degrees, of the longer side of a photo. A pinhole image of more than 150° has less than a
 # seventh of its pixels within the central 60°: no lens is corrected to that. Below 5° (more than

@@ -14,7 +14,7 @@ from itertools import permutations, product
 import numpy as np
 import torch
 
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.rig import Rig
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 
 _OPENGL = np.diag([1.0, -1.0, -1.0])

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 from snowsplat.data import Dataset, ImageSource, Points, View, load_dataset
-from snowsplat.data.judge import judge
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.rig import Rig
+from snowsplat.data.judge.verdict import judge
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation, rotation_from_quat
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

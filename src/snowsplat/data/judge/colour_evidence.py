@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snowsplat.data.photo_sample import PhotoSample
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.photo_sample import PhotoSample
+from snowsplat.data.judge.rig import Rig
 
 # Points that are projected, and those among which neighbours are sought.
 _MOST_POINTS = 50_000

@@ -18,15 +18,15 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from snowsplat.data.colour_evidence import Agreement, ColourEvidence
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.finding import Finding
-from snowsplat.data.lens_check import lens_findings
-from snowsplat.data.match_evidence import Fit, MatchEvidence
-from snowsplat.data.photo_sample import PhotoSample
-from snowsplat.data.position_check import position_findings
-from snowsplat.data.repairs import Repair, point_repairs, pose_repairs, zooms
-from snowsplat.data.rig import Rig
+from snowsplat.data.judge.colour_evidence import Agreement, ColourEvidence
+from snowsplat.data.judge.finding import Finding
+from snowsplat.data.judge.lens_check import lens_findings
+from snowsplat.data.judge.match_evidence import Fit, MatchEvidence
+from snowsplat.data.judge.photo_sample import PhotoSample
+from snowsplat.data.judge.position_check import position_findings
+from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs, zooms
+from snowsplat.data.judge.rig import Rig
 
 # Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
 _COLOURS_AGREE = 0.6

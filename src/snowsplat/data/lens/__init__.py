@@ -1,0 +1,1 @@
+"""Lenses: from the pixels of a photo to those of a camera without distortion."""
