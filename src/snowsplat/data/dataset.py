@@ -15,6 +15,7 @@ from torch import Tensor
 
 from snowsplat.data.bounds import EXTENT_FACTOR, scene_bounds
 from snowsplat.data.decode import ImageSource
+from snowsplat.data.lens.model import LensModel
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 
@@ -128,6 +129,7 @@ class PosedImage:
     split: Literal["train", "test"] | None = None  # from the dataset's own files
     divided: int = 1  # 2, 4 or 8 if ``folder`` is images_2, images_4 or images_8
     depth: Path | None = None  # as `View.depth`
+    lens: LensModel | None = None  # of a distorted photo; ``camera`` then has its pose and size
 
     @property
     def path(self) -> Path:
