@@ -16,11 +16,12 @@ from snowsplat.util.safe_json import printable
 
 @dataclass
 class Info:
-    """Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.
+    """Describe photos, a video, a dataset, a scene, a checkpoint or an output folder.
 
     Examples:
       snowsplat info out/garden
       snowsplat info walk_scene
+      snowsplat info photos
       snowsplat info garden.spz
       snowsplat info out/garden/point_cloud/iteration_2000/point_cloud.ply
       snowsplat info garden
@@ -29,13 +30,15 @@ class Info:
       For a file, this command prints the format, the size, the number of
       Gaussians or points, the bounds of the scene, and percentiles of opacity and
       scale. For a folder, it also prints the photos, scenes, checkpoints and
-      metrics. For a checkpoint, it also checks that the file is not damaged.
+      metrics. For a checkpoint, it also checks that the file is not damaged. For
+      photos and videos, it prints what sfm and make would use of them, and how long
+      the camera poses take.
     """
 
     # The type is not `Path | None`: to check it, tyro would import another package, which takes a
     # tenth of a second.
     path: Annotated[Optional[Path], tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None  # noqa: UP045
-    """A scene file of any format, a checkpoint, an output folder of train or make, or a dataset."""
+    """A scene file of any format, a checkpoint, an output folder, a dataset, photos or a video."""
     json: Annotated[bool, switch()] = False
     """Print JSON, which other programs can read."""
 

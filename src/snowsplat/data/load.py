@@ -26,6 +26,10 @@ _SMALLEST_SIDE = 16
 _LARGEST_FACTOR = 16
 
 
+class NoPosesError(UserError):
+    """A folder has no camera poses, so it is not a dataset; it may have photos."""
+
+
 def load_dataset(
     path: Path | str,
     *,
@@ -159,7 +163,7 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         return read_transforms(transforms, images)
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
-    raise UserError(
+    raise NoPosesError(
         f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
         "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"
     )

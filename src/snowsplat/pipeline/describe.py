@@ -34,11 +34,12 @@ def describe(path: Path | str) -> dict[str, Any]:
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
       ``path`` is the output folder of `train` or of `make`.
+    - "photos" or "video": what `sfm` and `make` would use of it; see `describe_photos`.
     - "dataset": number and sizes of the photos, focal lengths, number of points, extent, and
       what is impossible or doubtful about the cameras.
 
     Bounds and lengths are in world units, in the frame of the file. torch is imported only for
-    datasets.
+    datasets, photos and videos.
 
     Raises:
         UserError: ``path`` is missing, damaged, or of an unknown kind.
@@ -55,7 +56,8 @@ def describe(path: Path | str) -> dict[str, Any]:
             format = format_for_reading(path)
         except UserError as error:
             if path.suffix != ".json":  # it may be a dataset
-                raise UserError(f"{error}, checkpoints and datasets") from None
+                unknown = UserError(f"{error}, checkpoints, datasets, photos and videos")
+                return _photos(path, unknown)
         else:
             return _scene(path, format)
     folder = training_folder(path)
@@ -160,11 +162,27 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
     return facts
 
 
+def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
+    """What `describe_photos` says. Raises ``otherwise`` if there are no photos and no videos."""
+    from snowsplat.pipeline.describe_photos import describe_photos  # pycolmap and torch
+    from snowsplat.sfm.ingest.sources import find_sources
+
+    try:
+        sources = find_sources([path])
+    except UserError:
+        raise otherwise from None
+    return describe_photos(sources)
+
+
 def _dataset(path: Path) -> dict[str, Any]:
     from snowsplat.data import load_dataset  # torch; the other kinds do not need it
     from snowsplat.data.judge.verdict import judge
+    from snowsplat.data.load import NoPosesError
 
-    dataset = load_dataset(path)
+    try:
+        dataset = load_dataset(path)
+    except NoPosesError as no_poses:
+        return _photos(path, no_poses)
     views = [*dataset.train, *dataset.test]
     findings = judge(dataset)
     sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in views)

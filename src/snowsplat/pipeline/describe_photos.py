@@ -1,0 +1,102 @@
+"""`describe_photos`: what `sfm` and `make` would use of photos and videos, and what not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from snowsplat.pipeline.quality import PRESETS
+from snowsplat.sfm.colmap.options import thread_count
+from snowsplat.sfm.cost import measure_speed, steps_of
+from snowsplat.sfm.ingest.clip import max_frame_count, read_clip
+from snowsplat.sfm.ingest.photo_files import Header, Unusable, read_header
+from snowsplat.sfm.ingest.sources import Source, Sources
+from snowsplat.sfm.survey import survey
+from snowsplat.util.duration import duration
+from snowsplat.util.files import shown
+
+# So many files that are not used are named; the others are counted.
+_NAMED = 5
+
+
+def describe_photos(sources: Sources) -> dict[str, Any]:
+    """The properties of the photos and videos in a file or folder, as a JSON object.
+
+    Reads headers only: the frames of videos and the pixels of photos are not decoded.
+
+    Raises:
+        UserError: a video is not readable.
+    """
+    path = sources.inputs[0]
+    headers, left_out = _headers(sources.photos), list(sources.left_out)
+    unusable = {name: header for name, header in headers.items() if isinstance(header, str)}
+    usable = [header for header in headers.values() if isinstance(header, Header)]
+    left_out += unusable.items()
+    photos = survey(sources)
+    speed = measure_speed(thread_count(None))
+    steps = steps_of(photos, PRESETS["normal"].photos, "normal").values()
+    time = duration(sum(step.seconds(speed) for step in steps))
+    return {
+        "kind": "photos" if usable else "video",
+        "path": str(path),
+        **(_of_photos(usable, sources.photos) if sources.photos else {}),
+        **({"videos": _of_videos(sources.videos)} if sources.videos else {}),
+        **_first(left_out, "not_used"),
+        **_first([(shown(p), "has no photo") for p in sources.unused_masks], "unused_masks"),
+        "camera_poses": f"none; to estimate them takes about {time}",
+        "next": f"snowsplat make {path}",
+    }
+
+
+def _headers(photos: Sequence[Source]) -> dict[str, Header | str]:
+    """By file: its header, or the reason why the photo is unusable."""
+    found: dict[str, Header | str] = {}
+    for source in photos:
+        try:
+            found[shown(source.path)] = read_header(source.path)
+        except Unusable as error:
+            found[shown(source.path)] = str(error)
+    return found
+
+
+def _of_photos(headers: Sequence[Header], sources: Sequence[Source]) -> dict[str, Any]:
+    sizes = Counter("x".join(map(str, header.size(None))) for header in headers)
+    exif = [header.exif for header in headers]
+    return {
+        "photos": len(headers),
+        "formats": _counts(header.format for header in headers),
+        "sizes": dict(sizes.most_common(_NAMED)),
+        "cameras": _counts(info.camera or "unknown" for info in exif),
+        "with_focal_length": sum(info.focal is not None for info in exif),
+        "with_gps": sum(info.location is not None for info in exif),
+        "with_attitude": sum(info.attitude is not None for info in exif),
+        "with_transparency": sum(header.transparent for header in headers),
+        "masks": sum(source.mask is not None for source in sources),
+    }
+
+
+def _counts(names: Any) -> dict[str, int]:
+    return dict(Counter(names).most_common(_NAMED))
+
+
+def _of_videos(sources: Sequence[Source]) -> dict[str, str]:
+    described = {}
+    for source in sources:
+        clip = read_clip(source.path)
+        used = max_frame_count(clip, None, None)
+        described[shown(source.path)] = (
+            f"{clip.width}x{clip.height}, {duration(clip.seconds)}, "
+            f"{used} of {clip.packets} frames will be used"
+        )
+    return described
+
+
+def _first(reasons: Sequence[tuple[str, str]], key: str) -> dict[str, Any]:
+    """An entry for the first files and the number of all; none if there are no files."""
+    if not reasons:
+        return {}
+    named: dict[str, Any] = dict(reasons[:_NAMED])
+    if len(reasons) > _NAMED:
+        named["and"] = f"{len(reasons) - _NAMED} more"
+    return {key: named}
