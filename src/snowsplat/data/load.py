@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.near import near_of
 from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
@@ -73,7 +74,7 @@ def load_dataset(
     ).dataset(resolution)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class DatasetFiles:
     """The files of a dataset, read and checked: they become a `Dataset` at any resolution.
 
@@ -98,6 +99,9 @@ class DatasetFiles:
         views = sorted(
             (_view(*image, resolution) for image in self.images), key=lambda view: view.name
         )
+        points = None if self.points is None else self.points.xyz
+        near = near_of([view.camera for view in views], points)
+        views = [replace(view, camera=replace(view.camera, near=near)) for view in views]
         train = [view for view in views if view.name not in self.test_names]
         if not train:
             raise UserError(
@@ -180,7 +184,7 @@ def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
         stems = (str(Path(image.file).with_suffix("")), image.file)
         names = (folder / (stem + suffix) for stem in stems for suffix in DEPTH_SUFFIXES)
         depth = image.depth or next((name for name in names if is_file(name)), None)
-        found.append(dataclasses.replace(image, depth=depth))
+        found.append(replace(image, depth=depth))
     return found
 
 
@@ -209,7 +213,7 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
                     "is missing" if found is None else f"is not 1/{resolution} of the large image",
                 )
             return posed
-        smaller.append(dataclasses.replace(image, folder=folder, file=found, divided=resolution))
+        smaller.append(replace(image, folder=folder, file=found, divided=resolution))
     return smaller
 
 
