@@ -13,7 +13,9 @@ from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_exte
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.near import near_of
+from snowsplat.data.place import moved_to_origin
 from snowsplat.data.transforms_json import find_transforms, read_transforms
+from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
 
@@ -81,6 +83,7 @@ class DatasetFiles:
     Attributes:
         images: each image, the header of its file, and the result of `_file_sizes`.
         test_names: names of the views to hold out.
+        origin: see `Dataset.origin`.
     """
 
     root: Path
@@ -88,6 +91,7 @@ class DatasetFiles:
     points: Points | None
     description: str
     test_names: set[str]
+    origin: Origin
 
     def dataset(self, resolution: int | None) -> Dataset:
         """The dataset at a resolution, see `load_dataset`; reads no file.
@@ -114,6 +118,7 @@ class DatasetFiles:
             points=self.points,
             extent=scene_extent([view.camera for view in train]),
             description=self.description,
+            origin=self.origin,
         )
 
 
@@ -135,6 +140,7 @@ def read_files(
     """
     root = Path(path)
     posed, points, description = _read(root, images)
+    posed, points, origin = moved_to_origin(posed, points)
     posed = _with_depth_maps((root.parent if root.is_file() else root) / "depths", posed)
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
@@ -152,6 +158,7 @@ def read_files(
         points,
         description,
         _test_names(posed, hold_out, first_held_out, test_list),
+        origin,
     )
 
 
