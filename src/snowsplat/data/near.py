@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.bounds import scene_bounds
+from snowsplat.data.dataset import scene_extent
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.near_plane import near_plane
 
@@ -26,7 +27,8 @@ def near_of(cameras: Sequence[Camera], points: Tensor | None) -> float:
     """The near plane for all cameras of a scene, in world units; see `near_plane`.
 
     It depends on the depths of the points that the cameras see. Without points, it depends on the
-    distance between the cameras and the middle of `scene_bounds`.
+    distance between the cameras and the middle of `scene_bounds`. That is a guess if the cameras
+    look in the same direction, so no more than the extent of the cameras is used.
 
     Args:
         cameras: at least one.
@@ -39,7 +41,7 @@ def near_of(cameras: Sequence[Camera], points: Tensor | None) -> float:
         return near_plane(float(np.median(medians)), float(np.quantile(nearest, _NEAREST_CAMERAS)))
     middle = scene_bounds(used).double().mean(0)
     away = [float((camera.position.detach() - middle).norm()) for camera in used]
-    return near_plane(float(np.median(away)))
+    return near_plane(min(float(np.median(away)), scene_extent(used)))
 
 
 def _depths(cameras: Sequence[Camera], points: Tensor) -> list[tuple[float, float]]:
