@@ -26,7 +26,7 @@ def plane(scale=1.0, depth=0.0):
 
 def test_usual_scenes_have_the_near_plane_of_the_paper():
     assert near_of(cameras(), plane()) == NEAR
-    assert near_of(cameras()[:6], None) == NEAR  # from 3 units of extent
+    assert near_of(cameras()[:7], None) == NEAR
 
 
 @pytest.mark.parametrize("power", [-13, -1, 4, 13])
