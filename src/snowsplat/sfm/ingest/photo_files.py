@@ -13,11 +13,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-import numpy as np
 from PIL import Image, ImageOps
 
 from snowsplat.data import image_file
+from snowsplat.data.colour_profile import is_transparent
 from snowsplat.data.image_file import reason_of
+from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import panorama_in_xmp
 
@@ -30,7 +31,6 @@ _SUFFIXES = {
     "TIFF": (".tif", ".tiff"),
 }
 _LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")
-_TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
 _SMALLEST_SIDE = 32  # pixels; smaller images are icons
 
 
@@ -96,7 +96,7 @@ def read_header(path: Path) -> Header:
             # order to find EXIF data after them.
             has_exif = "exif" in image.info or image.format == "TIFF"
             exif = image.getexif() if has_exif else Image.Exif()
-            transparent = image.mode in _TRANSPARENT or "transparency" in image.info
+            transparent = is_transparent(image)
             plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
             xmp = _xmp(image)
@@ -162,7 +162,7 @@ def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
     """
     try:
         with open_image(path) as opened:
-            image = _eight_bits(ImageOps.exif_transpose(opened))
+            image = ImageOps.exif_transpose(plain_pixels(opened, path))
     except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:
@@ -179,22 +179,9 @@ def decode_small(path: Path, side: int) -> Image.Image:
     try:
         with open_image(path) as opened:
             opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
-            return _eight_bits(opened)
+            return plain_pixels(opened, path)
     except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
-
-
-def _eight_bits(image: Image.Image) -> Image.Image:
-    """Decode and convert to mode L, RGB or RGBA; raises ValueError for floating-point pixels."""
-    if image.mode.startswith("I"):  # 16-bit grey: convert() would clip it, not scale it
-        values = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255)
-        return Image.fromarray(values.astype(np.uint8))
-    if image.mode == "F":
-        raise ValueError("floating-point pixels")
-    if image.mode in _TRANSPARENT or "transparency" in image.info:
-        return image.convert("RGBA")
-    image.load()
-    return image if image.mode == "L" else image.convert("RGB")
 
 
 def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
@@ -208,20 +195,17 @@ def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
 def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
     """Write as JPEG (nearly lossless) or PNG, as the extension of ``path`` says.
 
-    EXIF data and the colour profile are copied from the file ``source``, if it is given.
+    EXIF data are copied from the file ``source``, if it is given. The colours are those of sRGB.
 
     Raises:
         OSError: the disk is full.
     """
-    extra: dict[str, bytes] = {}
+    extra: dict[str, bytes | None] = {"icc_profile": None}  # not the one in ``image.info``
     if source is not None:
         with open_image(source, header_only=True) as original:
             exif = exif_for_copy(original.getexif(), *image.size)
-            profile = original.info.get("icc_profile")
-            profile_is_valid = original.mode not in ("CMYK", "LAB", "I;16")
-        extra = {"exif": exif} if exif else {}
-        if profile and profile_is_valid:  # a CMYK profile is not valid for RGB pixels
-            extra["icc_profile"] = profile
+        if exif:
+            extra["exif"] = exif
     if path.suffix.lower() == ".png":
         image.save(path, "PNG", compress_level=3, **extra)
     else:
