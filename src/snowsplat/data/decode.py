@@ -17,17 +17,17 @@ from torch import Tensor
 
 from snowsplat.data.bit_depth import eight_bits
 from snowsplat.data.colour_profile import is_transparent, to_srgb
-from snowsplat.data.image_file import open_image, reason_of
+from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
 # Formats of photos (Pillow opens the MPO files of phones as JPEG). Other formats are excluded,
 # because Pillow starts external programs for some of them.
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Pixels are converted in bands of this size, to limit the memory for temporary arrays.
 _BAND_PIXELS = 1 << 20
 #: Suffixes that are tried if a dataset names its images without a suffix.
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".avif")
 _EXIF_ORIENTATION = 0x0112
 
 

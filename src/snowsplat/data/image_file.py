@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from PIL import Image
+from PIL import Image, features
 
+#: Formats that depend on how Pillow was built.
+OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
 #: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
 #: million. The size is known before the image is decoded.
 MOST_PIXELS = 178_956_970

@@ -88,6 +88,10 @@ def _check_boxes(path: Path) -> None:
             start = end
 
 
+#: Why a recording of sound, perhaps with a cover picture, is no video.
+ONLY_SOUND = "has only sound, no video"
+
+
 class NoVideoError(ValueError):
     """A file has sound or pictures, but no video; the message says so."""
 
@@ -108,6 +112,18 @@ def why_no_video(path: Path) -> str | None:
     except (av.FFmpegError, OSError, ValueError):
         return "is not a readable video, it may be truncated or damaged"
     return None
+
+
+def film_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of the stored frames, as the header says; None if it is not a video."""
+    import av
+
+    try:
+        with open_video(path) as container:
+            codec = video_stream(container).codec_context
+            return codec.width, codec.height
+    except (av.FFmpegError, OSError, ValueError):
+        return None
 
 
 def read_clip(path: Path) -> Clip:
@@ -223,7 +239,7 @@ def video_stream(container: InputContainer) -> VideoStream:
     pictures = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
     films = [stream for stream in container.streams.video if not stream.disposition & pictures]
     if not films:
-        raise NoVideoError("has only sound" if container.streams.audio else "has no video")
+        raise NoVideoError(ONLY_SOUND if container.streams.audio else "has no video")
 
     def rank(stream: VideoStream) -> tuple[bool, bool, int]:
         codec = stream.codec_context

@@ -17,12 +17,12 @@ from PIL import Image, ImageOps
 
 from snowsplat.data import image_file
 from snowsplat.data.colour_profile import is_transparent
-from snowsplat.data.image_file import reason_of
+from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of
 from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import panorama_in_xmp
 
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Formats that COLMAP reads, by file extension.
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"),
@@ -30,7 +30,7 @@ _SUFFIXES = {
     "PNG": (".png",),
     "TIFF": (".tif", ".tiff"),
 }
-_LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")
+_LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 _SMALLEST_SIDE = 32  # pixels; smaller images are icons
 
 
