@@ -82,7 +82,7 @@ def _values(image: Image.Image, path: Path) -> NDArray[np.uint16]:
     raw = _raw_mode(image)
     swapped = raw[:-1] + _OTHER_ORDER[raw[-1]]
     upper = np.asarray(image, np.uint16)
-    with open_image(path, tuple(_FORMATS.values())) as again:
+    with open_image(path, tuple(_FORMATS.values()), page=image.tell()) as again:
         again.tile = [_with_raw_mode(tile, swapped) for tile in again.tile]
         return upper << 8 | np.asarray(again)
 

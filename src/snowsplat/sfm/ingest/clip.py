@@ -21,6 +21,9 @@ _FORMATS = (
 )
 _MAX_PIXELS = 1 << 26  # maximum number of pixels of a frame: 8192×8192
 
+# Codecs of cover pictures and previews, if there are other streams.
+_PICTURE_CODECS = ("mjpeg", "png", "bmp", "webp", "gif")
+
 # An mp4 file consists of nested boxes. A box is a header (its length and its kind) and content.
 _BOX_HEADER = 8  # bytes
 _KIND = re.compile(rb"[ -~\xa9]{4}")
@@ -227,9 +230,10 @@ def open_video(path: Path) -> InputContainer:
 
 
 def video_stream(container: InputContainer) -> VideoStream:
-    """The film in a file: the stream that is marked as the default one, or else the largest.
+    """The film in a file: of the streams that are not much smaller than the largest, the default.
 
-    Drones and cameras add a cover picture, thumbnails or a small preview as further streams.
+    Drones and cameras add a cover picture, thumbnails or a small preview as further streams. Some
+    programs mark the first stream as the default one, whatever it is.
 
     Raises:
         NoVideoError: there is only sound, or only pictures beside it.
@@ -241,12 +245,20 @@ def video_stream(container: InputContainer) -> VideoStream:
     if not films:
         raise NoVideoError(ONLY_SOUND if container.streams.audio else "has no video")
 
-    def rank(stream: VideoStream) -> tuple[bool, bool, int]:
+    def moves(stream: VideoStream) -> tuple[bool, bool]:
         codec = stream.codec_context
-        pixels = codec.width * codec.height if codec is not None else 0
-        return stream.frames != 1, bool(stream.disposition & Disposition.default), pixels
+        return stream.frames != 1, codec is not None and codec.name not in _PICTURE_CODECS
 
-    return max(films, key=rank)
+    def pixels(stream: VideoStream) -> int:
+        codec = stream.codec_context
+        return codec.width * codec.height if codec is not None else 0
+
+    films = [stream for stream in films if moves(stream) == max(map(moves, films))]
+    enough = max(map(pixels, films)) / 2
+    return max(
+        (stream for stream in films if pixels(stream) >= enough),
+        key=lambda stream: (bool(stream.disposition & Disposition.default), pixels(stream)),
+    )
 
 
 def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:

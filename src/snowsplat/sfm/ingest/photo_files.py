@@ -31,6 +31,8 @@ _SUFFIXES = {
     "TIFF": (".tif", ".tiff"),
 }
 _LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
+_MOST_PAGES = 1000  # of a file; further ones are not looked for
+_ANIMATIONS = ("WEBP", "PNG", "AVIF")
 _SMALLEST_SIDE = 32  # pixels; smaller images are icons
 
 
@@ -48,6 +50,9 @@ class Header:
     plain: bool  # 8 bits per channel; grey, RGB, or RGBA in a PNG
     transparent: bool  # has an alpha channel
     exif: ExifInfo
+    #: The pages of the size of the first one, from 0: a scanner writes several photos to a TIFF.
+    pages: tuple[int, ...] = (0,)
+    animated: int = 1  # number of pictures of an animation, of which only the first is used
     panorama: str | None = None  # `PANORAMA` or `STITCHED`, if the metadata say so
 
     @property
@@ -63,7 +68,8 @@ class Header:
     def is_ready(self, longest: int | None) -> bool:
         """Whether COLMAP can read the file unchanged, and its pixels are upright."""
         as_stored = self.size(longest) == (self.width, self.height)
-        return self.format in _SUFFIXES and self.plain and self.exif.orientation == 1 and as_stored
+        upright = self.exif.orientation == 1 and as_stored
+        return self.format in _SUFFIXES and self.plain and upright and len(self.pages) == 1
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
@@ -110,12 +116,27 @@ def read_header(path: Path) -> Header:
                 transparent=transparent,
                 exif=read_exif(exif, width, height, xmp, image.info.get("original_orientation")),
                 panorama=panorama_in_xmp(xmp),
+                animated=getattr(image, "n_frames", 1) if image.format in _ANIMATIONS else 1,
+                pages=_pages(image),  # the last, because it reads another page
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
     return header
+
+
+def _pages(image: Image.Image) -> tuple[int, ...]:
+    """The pages of the size of the first one. Smaller ones are previews of it."""
+    if image.format != "TIFF":
+        return (0,)
+    pages, size = [0], image.size
+    with suppress(Exception):  # EOFError after the last page; other errors if one is damaged
+        for page in range(1, _MOST_PAGES):
+            image.seek(page)
+            if image.size == size:
+                pages.append(page)
+    return tuple(pages)
 
 
 def _xmp(image: Image.Image) -> bytes:
@@ -146,22 +167,22 @@ def _bits(path: Path, image: Image.Image) -> int:
     return 8
 
 
-def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
+def open_image(path: Path, *, header_only: bool = False, page: int = 0) -> Image.Image:
     """Open a photo; its pixels are decoded later. Raises the errors of `image_file.open_image`."""
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
-    return image_file.open_image(path, _FORMATS, header_only=header_only)
+    return image_file.open_image(path, _FORMATS, header_only=header_only, page=page)
 
 
-def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
+def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Image.Image:
     """The photo, upright and resized: mode L, RGB or, with transparent pixels, RGBA.
 
     Raises:
         Unusable: the photo is damaged.
     """
     try:
-        with open_image(path) as opened:
+        with open_image(path, page=page) as opened:
             image = ImageOps.exif_transpose(plain_pixels(opened, path))
     except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
