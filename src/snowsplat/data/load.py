@@ -172,6 +172,11 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         return read_colmap(root, models, images)
     if transforms:
         return read_transforms(transforms, images)
+    if root.suffix.lower() == ".zip" and root.is_file():
+        raise UserError(
+            f"{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
+            f"it, run: snowsplat make {root} -o OUT"
+        )
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
     raise NoPosesError(
