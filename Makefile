@@ -18,9 +18,11 @@ NO_PYTHON := snowsplat: $(BOOTSTRAP) is missing or older than 3.10; choose anoth
 NO_VENV := snowsplat: $(BOOTSTRAP) cannot create environments; install venv (Debian/Ubuntu: apt install python3-venv)
 
 ifdef PYTHON
+TOOLS :=
 ENVIRONMENT :=
 else
 PYTHON := .venv/bin/python
+TOOLS := .venv/.tools
 ENVIRONMENT := .venv/.installed
 endif
 # Tools (cmake, ninja, ruff, …) come from the environment, the package from this checkout.
@@ -37,7 +39,7 @@ CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp'
 .PHONY: demo quick test nightly dev docs format native wheel compiler lint types layers clean
 .PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
 
-demo: native
+demo: native $(ENVIRONMENT)
 	$(PYTHON) -m snowsplat demo -o out/demo
 
 quick: lint
@@ -46,16 +48,26 @@ quick: lint
 test: lint
 	@$(MAKE) --no-print-directory -j2 types layers pytest
 
-dev: native
+# What compiles is a small part of the environment, so the rest is installed at the same time.
+dev:
+	@$(MAKE) --no-print-directory -j2 native $(ENVIRONMENT)
 
-# The environment. The editable installation builds nothing: `make native` installs the libraries into src/.
-.venv/.installed: pyproject.toml | compiler
+# The part of the environment that compiles: the pinned tools among the packages for development.
+COMPILING := cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
+.venv/.tools: pyproject.toml | compiler
 	@$(BOOTSTRAP) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || \
 	    { echo "$(NO_PYTHON)" >&2; exit 1; }
 	@$(BOOTSTRAP) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(NO_VENV)" >&2; exit 1; }
 	$(BOOTSTRAP) -m venv .venv
 	.venv/bin/python -m pip install --quiet --upgrade pip
-	.venv/bin/python -m pip install --editable '.[dev,docs]' \
+	sed -nE '/^dev = /,/^]/ s/^ *"(($(COMPILING))==.*)",$$/\1/p' pyproject.toml >.venv/tools.txt
+	.venv/bin/python -m pip install --quiet --no-compile --requirement .venv/tools.txt
+	@touch $@
+
+# The editable installation builds nothing: `make native` installs the libraries into src/. Python
+# compiles the modules that it imports; most of those of torch are never imported.
+.venv/.installed: .venv/.tools
+	.venv/bin/python -m pip install --no-compile --no-build-isolation --editable '.[dev,docs]' \
 	    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
 	@touch $@
 
@@ -65,7 +77,7 @@ compiler:
 
 # One library per instruction set and the kernels for each GPU architecture, into src/snowsplat/_lib; the page
 # of the viewer, into src/snowsplat/_viewer. Only changed files are compiled.
-native: $(ENVIRONMENT) | compiler
+native: $(TOOLS) | compiler
 	@mkdir -p $(BUILD)
 	@$(LOCK) env -u MAKEFLAGS sh -ec ' \
 	    cmake -G Ninja -S . -B $(BUILD) --log-level=NOTICE \
@@ -110,20 +122,20 @@ ISA := isa and not (emulated or gpu or nightly)
 SANITIZED := emulated-float32 or sanitizers_find
 REPEATED := build/pytest-repeated.log
 
-pytest-quick: native
+pytest-quick: native $(ENVIRONMENT)
 	$(PYTEST) -m '$(QUICK)'
 
 # All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
 # time, with half as many processes and a lower priority: on each other instruction set and in an emulator
 # of Arm, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
 # repeated without them.
-pytest: native
+pytest: native $(ENVIRONMENT)
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
 pytest-best:
 	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
-nightly: native
+nightly: native $(ENVIRONMENT)
 	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
@@ -135,7 +147,7 @@ NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_
     --deselect tests/ops/test_determinism.py::test_training_steps
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
-neon: native
+neon: native $(ENVIRONMENT)
 	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)' $(NEON_TESTS)"; \
 	    SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
 	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
@@ -159,7 +171,7 @@ pytest-isas:
 # Python that was built without them. Reports need no call stack of each allocation, which costs time.
 SANITIZERS = $(strip $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1))))
 
-sanitized: native
+sanitized: native $(ENVIRONMENT)
 	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k '$(SANITIZED)'"; \
 	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0:malloc_context_size=1 CXX=g++ \
 	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \
