@@ -118,6 +118,11 @@ PROCESSES = $(if $(filter 1,$(JOBS)),,-n $(JOBS) --dist worksteal)
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow or nightly)
 ISA := isa and not (emulated or gpu or nightly)
+# The tests of kernels that other instruction sets do not repeat: threads and the loops over long images
+# are the same for each of them; and on each, results and gradients are compared with those of the reference,
+# so finite differences would only test the reference again.
+SAME := test_determinism or number_of_threads or long_images or \
+    (finite_differences and (test_photometric or test_project or test_rasterize))
 # Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
 SANITIZED := emulated-float32 or sanitizers_find
 REPEATED := build/pytest-repeated.log
@@ -139,16 +144,13 @@ nightly: native $(ENVIRONMENT)
 	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
-# used for them. The two longest tests of threads take minutes there, and threads do not depend on the
-# instruction set.
+# used for them.
 NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py \
-    --ignore tests/ops/test_native.py \
-    --deselect tests/ops/test_determinism.py::test_rasterize_in_bands \
-    --deselect tests/ops/test_determinism.py::test_training_steps
+    --ignore tests/ops/test_native.py -k 'not ($(SAME))'
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
 neon: native $(ENVIRONMENT)
-	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)' $(NEON_TESTS)"; \
+	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)'" $(NEON_TESTS); \
 	    SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
 	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
 
@@ -158,11 +160,13 @@ pytest-repeated:
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
+ISA_TESTS := tests/ops tests/sfm/colmap/test_matching.py \
+    tests/training/test_pose_refinement.py tests/training/test_step_runner.py -k 'not ($(SAME))'
 pytest-isas:
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
-	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training tests/sfm/colmap/test_matching.py"; \
-	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training tests/sfm/colmap/test_matching.py || exit 1; \
+	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)'" $(ISA_TESTS); \
+	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' $(ISA_TESTS) || exit 1; \
 	    done
 
 # The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a
