@@ -21,6 +21,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from concurrent.futures import thread as pools
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -195,6 +196,7 @@ class _This:
             return _exit_code_of(request["ended"])
         pid = os.fork()
         if pid == 0:
+            pools._threads_queues.clear()  # a fork has no threads of pools, so none to wait for
             _take(streams or [])
             _run_and_exit(request)
         return pid
