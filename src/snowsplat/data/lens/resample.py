@@ -15,6 +15,7 @@ from PIL import Image
 
 from snowsplat.data.lens.pinhole import Pinhole
 
+_NO_MAP: np.ndarray = np.empty(0, np.float32)
 _MARGIN = 3  # pixels beside a pixel that its spline may need
 
 
@@ -65,7 +66,7 @@ def resampled(
     if margin:
         planes = np.pad(planes, ((0, 0), (0, 0), (margin, margin)), mode="wrap")
     for rows, position in view.strips(width, height):
-        position = np.nan_to_num(position * np.float32(scale), copy=False, nan=-1.0)
+        position = np.nan_to_num(position * np.array(scale, np.float32), copy=False, nan=-1.0)
         position[..., 0] += margin
         _sample(planes, position, made[:, rows])
     return made
@@ -84,14 +85,14 @@ def _sample(planes: np.ndarray, position: np.ndarray, out: np.ndarray) -> None:
     top, bottom = _needed(position[..., 1], height)
     left, right = _needed(position[..., 0], width)
     part = np.ascontiguousarray(planes[:, top:bottom, left:right].transpose(1, 2, 0))
-    position = position - np.float32([left + 0.5, top + 0.5])
+    position = position - np.array([left + 0.5, top + 0.5], np.float32)
     border = cv2.BORDER_REPLICATE
-    cubic = cv2.remap(part, position, None, cv2.INTER_CUBIC, borderMode=border)
+    cubic = cv2.remap(part, position, _NO_MAP, cv2.INTER_CUBIC, borderMode=border)
     whole = np.floor(position)
     position -= whole
     position *= position * (3 - 2 * position)
     position += whole
-    bent = cv2.remap(part, position, None, cv2.INTER_LINEAR, borderMode=border)
+    bent = cv2.remap(part, position, _NO_MAP, cv2.INTER_LINEAR, borderMode=border)
     made = cv2.addWeighted(cubic, 2 / 3, bent, 1 / 3, 0).reshape(*position.shape[:2], -1)
     out[...] = made.transpose(2, 0, 1)
 

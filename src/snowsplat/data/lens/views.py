@@ -146,6 +146,16 @@ def rotated_view(
     return dataclasses.replace(view, partial=not view.covered(_positions(view, x, y)).all())
 
 
+def is_wide(lens: LensModel) -> bool:
+    """Whether a lens may have an image circle within the photo: it is a fisheye.
+
+    Also a lens of another model whose field of view is more than 120°.
+    """
+    if lens.model == "EQUIRECTANGULAR" or not all(map(math.isfinite, lens.params)):
+        return False
+    return "FISHEYE" in lens.model or 2 * float(_field(lens, None).reach.max()) > _WIDEST
+
+
 @lru_cache(256)
 def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, ...]:
     """The pinhole views that show what a lens shows: one, or several of a wide lens.
@@ -195,7 +205,7 @@ class _Field:
 
 
 def _directions(angle: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """(D, N, 3) unit directions at ``angle`` (D, N) to the axis, in the directions ``turn`` (D,)."""
+    """(D, N, 3) unit directions at ``angle`` (D, N) to the axis, on the sides ``turn`` (D,)."""
     sine = np.sin(angle)
     return np.stack(
         [sine * np.cos(turn)[:, None], sine * np.sin(turn)[:, None], np.cos(angle)], axis=-1
