@@ -241,8 +241,7 @@ def _covered(view: LensView | None, width: int, height: int) -> np.ndarray:
     fine: np.ndarray = np.empty((_SAMPLES * height, _SAMPLES * width), bool)
     for rows, position in view.strips(_SAMPLES * width, _SAMPLES * height):
         fine[rows] = view.covered(position)
-    shown: np.ndarray = fine.reshape(height, _SAMPLES, width, _SAMPLES).all(axis=(1, 3))
-    return shown
+    return np.logical_and.reduce(fine.reshape(height, _SAMPLES, width, _SAMPLES), axis=(1, 3))
 
 
 def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:

@@ -15,7 +15,6 @@ from PIL import Image
 
 from snowsplat.data.lens.pinhole import Pinhole
 
-_NO_MAP: np.ndarray = np.empty(0, np.float32)
 _MARGIN = 3  # pixels beside a pixel that its spline may need
 
 
@@ -86,15 +85,21 @@ def _sample(planes: np.ndarray, position: np.ndarray, out: np.ndarray) -> None:
     left, right = _needed(position[..., 0], width)
     part = np.ascontiguousarray(planes[:, top:bottom, left:right].transpose(1, 2, 0))
     position = position - np.array([left + 0.5, top + 0.5], np.float32)
-    border = cv2.BORDER_REPLICATE
-    cubic = cv2.remap(part, position, _NO_MAP, cv2.INTER_CUBIC, borderMode=border)
+    cubic = _remap(part, position, cv2.INTER_CUBIC)
     whole = np.floor(position)
     position -= whole
     position *= position * (3 - 2 * position)
     position += whole
-    bent = cv2.remap(part, position, _NO_MAP, cv2.INTER_LINEAR, borderMode=border)
+    bent = _remap(part, position, cv2.INTER_LINEAR)
     made = cv2.addWeighted(cubic, 2 / 3, bent, 1 / 3, 0).reshape(*position.shape[:2], -1)
     out[...] = made.transpose(2, 0, 1)
+
+
+def _remap(part: np.ndarray, position: np.ndarray, how: int) -> np.ndarray:
+    made: np.ndarray = cv2.remap(  # type: ignore[call-overload]
+        part, position, None, how, borderMode=cv2.BORDER_REPLICATE
+    )
+    return made
 
 
 def _needed(position: np.ndarray, size: int) -> tuple[int, int]:

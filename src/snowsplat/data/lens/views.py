@@ -226,9 +226,10 @@ def _field(lens: LensModel, circle: float | None) -> _Field:
     # has folded may return into the photo.
     ends = np.where(growing.all(1), _ANGLES, growing.argmin(1))
     limit = int(ends.min())
-    inside = ((pixel >= 0) & (pixel <= [lens.width, lens.height])).all(-1)
+    x, y = pixel[..., 0], pixel[..., 1]
+    inside = (x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height)
     if circle is not None:
-        inside &= np.hypot(pixel[..., 0] - cx, pixel[..., 1] - cy) <= circle
+        inside &= np.hypot(x - cx, y - cy) <= circle
     last = np.where(inside.all(1), _ANGLES, inside.argmin(1) - 1)
     return _Field(float(angle[limit]), angle[np.clip(last, 0, limit)])
 
