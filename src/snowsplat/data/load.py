@@ -146,9 +146,9 @@ def read_files(
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
     sizes = _file_sizes(posed, headers)
-    for image, header in zip(posed, headers, strict=True):
+    for image, size in zip(posed, sizes, strict=True):
         if image.mask is not None:
-            _check_mask(image, header, read_header(image.mask))
+            _check_mask(image.mask, size)
     count = Counter(image.name for image in posed)
     if len(count) < len(posed):
         repeated = next(name for name, n in sorted(count.items()) if n > 1)
@@ -213,7 +213,7 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
         stem = str(Path(image.file).with_suffix(""))
         names = (image.file, *(stem + s for s in IMAGE_SUFFIXES), stem + ".JPG", stem + ".PNG")
         found = next((name for name in names if is_file(folder / name)), None)
-        if found is None or not _is_divided(image.path, folder / found, resolution):
+        if found is None or not _is_copy(image.path, folder / found, resolution):
             if folder.is_dir():
                 logger.warning(
                     "%s: not used, because %s %s; the large images are scaled instead",
@@ -226,52 +226,53 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
     return smaller
 
 
-def _is_divided(large: Path, small: Path, factor: int) -> bool:
-    a, b = read_header(large), read_header(small)
-    return _is_close(a.width, b.width, factor) and _is_close(a.height, b.height, factor)
+def _is_copy(large: Path, small: Path, factor: int) -> bool:
+    header = read_header(small)
+    return _is_divided(read_header(large), (header.width, header.height), factor)
 
 
-def _is_close(large: int, small: int, factor: int) -> bool:
+def _is_divided(large: Header | Camera, size: tuple[int, int], factor: float) -> bool:
+    """Whether ``size`` is the size of ``large``, divided by ``factor``."""
     # Sizes that are not divisible are rounded up by some tools and down by others.
-    return abs(small - large / factor) < 1
+    return abs(size[0] - large.width / factor) < 1 and abs(size[1] - large.height / factor) < 1
 
 
 def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[int, int, bool]]:
     """Width and height of each file, and whether to apply its EXIF orientation.
 
-    The sizes are checked against the cameras. The images of a folder may be smaller than the images
-    that the poses were estimated from (for example ``images_4``, or a dataset that is distributed
-    without the large images). The ratio of the sizes must be an integer and the same for all images
-    of a folder. `_view` scales the intrinsics.
+    The sizes are checked against the cameras. The images of a folder may be smaller or larger than
+    the images that the poses were estimated from (for example ``images_4``, or a dataset that is
+    distributed without the large images). The ratio of the sizes must be the same for all images of
+    a folder. `_views` scales the intrinsics.
     """
     found = [_shrink_factor(image, header) for image, header in zip(posed, headers, strict=True)]
-    usual: dict[Path, int] = {}  # the most frequent factor in each folder
+    usual: dict[Path, float] = {}  # the most frequent factor in each folder
     for folder in {image.folder for image in posed}:
         factors = [f for i, (f, _) in zip(posed, found, strict=True) if i.folder == folder and f]
         if factors:
             usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]
     sizes = []
     for image, header, (factor, sideways) in zip(posed, headers, found, strict=True):
-        if factor is None or factor != usual[image.folder]:
-            camera = image.camera
+        size = (header.height, header.width) if sideways else (header.width, header.height)
+        camera = image.camera
+        if factor is None or not _is_divided(camera, size, usual[image.folder]):
             raise UserError(
                 f"{image.path}: is {header.width}x{header.height}, but its camera is "
                 f"{camera.width}x{camera.height}; use the images that the poses were estimated "
-                "from, or all of them scaled by 1/2, 1/4 or 1/8"
+                "from, or scale all of them by one factor"
             )
-        size = (header.height, header.width) if sideways else (header.width, header.height)
         sizes.append((*size, sideways))
     for folder, factor in usual.items():
-        if factor > 1 and not folder.name.endswith(f"_{factor}"):
+        if factor != 1 and not folder.name.endswith(f"_{factor:g}"):
             logger.warning(
-                "%s: the images are 1/%d of the size of their cameras; the cameras are scaled",
+                "%s: the images are %s of the size of their cameras; the cameras are scaled",
                 folder,
-                factor,
+                f"1/{factor:g}" if factor == round(factor) else f"{1 / factor:.4g}",
             )
     return sizes
 
 
-def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]:
+def _shrink_factor(image: PosedImage, header: Header) -> tuple[float | None, bool]:
     """The image size of the camera divided by that of the file; whether to apply EXIF orientation.
 
     The factor is None if the size of the file does not match the camera. Like COLMAP, this ignores
@@ -280,11 +281,14 @@ def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]
     camera = image.camera
     for sideways in (False, True) if header.sideways else (False,):
         width, height = (header.height, header.width) if sideways else (header.width, header.height)
-        factor = max(1, round(camera.width / width))
-        exact = factor == 1 and (width, height) == (camera.width, camera.height)
-        close = _is_close(camera.width, width, factor) and _is_close(camera.height, height, factor)
-        if exact or (1 < factor <= _LARGEST_FACTOR and close):
-            return factor, sideways
+        if (width, height) == (camera.width, camera.height):
+            return 1.0, sideways
+        ratio = max(camera.width, camera.height) / max(width, height)
+        if not 1 < max(ratio, 1 / ratio) <= _LARGEST_FACTOR:
+            continue
+        for factor in (max(2, round(ratio)), ratio):
+            if _is_divided(camera, (width, height), factor):
+                return float(factor), sideways
     return None, False
 
 
@@ -390,12 +394,18 @@ def _final_size(
     return new_width, new_height
 
 
-def _check_mask(image: PosedImage, header: Header, mask: Header) -> None:
-    fits = (header.width, header.height), (image.camera.width, image.camera.height)
-    if (mask.width, mask.height) not in fits:
+def _check_mask(path: Path, size: tuple[int, int, bool]) -> None:
+    """Raise `UserError` if a mask has another aspect ratio than its image; it may be smaller."""
+    width, height, sideways = size
+    mask = read_header(path)
+    own = (mask.width, mask.height)
+    if sideways and mask.sideways:
+        own = (mask.height, mask.width)
+    # Sides are rounded to whole pixels of the mask, or of an image that is smaller.
+    if abs(own[0] * height - own[1] * width) > max(width, height, *own):
         raise UserError(
-            f"{image.mask}: the mask is {mask.width}x{mask.height}, but its image is "
-            f"{header.width}x{header.height}; resize the mask"
+            f"{path}: the mask is {own[0]}x{own[1]}, but its image is {width}x{height}; use a mask "
+            "of the whole image"
         )
 
 

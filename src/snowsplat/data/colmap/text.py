@@ -20,6 +20,7 @@ from snowsplat.data.colmap.types import (
     damaged,
     unreadable,
 )
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
@@ -85,7 +86,10 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         except (ValueError, IndexError):
             raise damaged(path, f"not a camera: line {shown(line[:60])!r}") from None
         if model not in counts:
-            raise damaged(path, f"unknown camera model {shown(model[:40])!r}")
+            raise UserError(
+                f"{path}: unknown camera model {shown(model[:40])!r}; undistort the images with "
+                "the program that made it"
+            )
         if len(params) != counts[model]:
             raise damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
         cameras[camera_id] = checked_camera(path, model, width, height, params)
