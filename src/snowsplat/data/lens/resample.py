@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.lens.pinhole import Pinhole
+from snowsplat.data.lens.views import LensView
 
 _MARGIN = 3  # pixels beside a pixel that its spline may need
 
@@ -68,6 +69,21 @@ def resampled(
         position = np.nan_to_num(position * np.array(scale, np.float32), copy=False, nan=-1.0)
         position[..., 0] += margin
         _sample(planes, position, made[:, rows])
+    return made
+
+
+def nearest(values: np.ndarray, view: LensView, width: int, height: int) -> np.ndarray:
+    """(height, width) float32: a map (H, W) of a photo, such as its depth, seen by a view.
+
+    Nearest values, because a mean of two surfaces is on neither. NaN where the photo shows nothing.
+    """
+    scale = np.array([values.shape[1] / view.lens.width, values.shape[0] / view.lens.height])
+    made = np.full((height, width), np.nan, np.float32)
+    for rows, position in view.strips(width, height):
+        shown = view.covered(position) & np.isfinite(position).all(-1)
+        column, row = np.floor(position[shown] * scale).astype(np.int64).T
+        column, row = column.clip(0, values.shape[1] - 1), row.clip(0, values.shape[0] - 1)
+        made[rows][shown] = values[row, column]
     return made
 
 

@@ -90,6 +90,11 @@ class LensView:
         rays = np.stack([across, down, np.ones_like(across)], -1)
         return rays if self.rotation is None else rays @ np.array(self.rotation, rays.dtype)
 
+    def photo_z(self, width: int, height: int) -> np.ndarray:
+        """(height, width): z in the frame of the photo of the points at z = 1 of the view."""
+        x, y = (np.arange(size) + 0.5 for size in (width, height))
+        return self.rays(x * (self.width / width), y * (self.height / height))[..., 2]
+
     def covered(self, position: np.ndarray) -> np.ndarray:
         """(H, W) bool: whether positions from `strips` are in the photo and in its circle."""
         if not self.partial:
