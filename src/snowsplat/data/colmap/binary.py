@@ -27,7 +27,7 @@ from snowsplat.util.errors import UserError
 _COUNT = struct.Struct("<Q")
 # Id, index into CAMERA_MODELS, width, height. The parameters (doubles) follow.
 _CAMERA_HEAD = struct.Struct("<IiQQ")
-_SMALLEST_CAMERA = _CAMERA_HEAD.size + 3 * 8
+_SMALLEST_CAMERA = _CAMERA_HEAD.size + 2 * 8
 # Id, quaternion (w, x, y, z), translation, camera id. The name, ended by a zero byte, and the
 # observations follow.
 _IMAGE_HEAD = struct.Struct("<I4d3dI")
@@ -104,8 +104,8 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         camera_id, number, width, height = cursor.take(_CAMERA_HEAD)
         if not 0 <= number < len(CAMERA_MODELS):
             raise UserError(
-                f"{path}: unknown camera model {number}; undistort the images first "
-                "(colmap image_undistorter), or copy the file again if it is damaged"
+                f"{path}: unknown camera model {number}; undistort the images with the program "
+                "that made it, or copy the file again if it is damaged"
             )
         model, count = CAMERA_MODELS[number]
         params = cursor.take(struct.Struct(f"<{count}d"))
