@@ -12,6 +12,7 @@ from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.imports import find_export, read_export
 from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
@@ -154,13 +155,17 @@ def read_files(
 def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str]:
     if not root.exists():
         raise UserError(f"{root}: no such folder")
-    transforms = find_transforms(root)
+    export = find_export(root) if root.is_file() else None
+    transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse") or ([] if transforms else find_models(root))
     models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
     if models:
         return read_colmap(root, models, images)
     if transforms:
         return read_transforms(transforms, images)
+    export = export or find_export(root)
+    if export and export.cameras:
+        return read_export(root, export, images)
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
     raise NoPosesError(
@@ -284,7 +289,8 @@ def _view(
     if image.mask is not None:
         mask = ImageSource(image.mask, width, height, sideways)
     source = ImageSource(image.path, width, height, sideways, header.width * header.height)
-    return View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
+    camera = image.camera.scaled(width, height)
+    return View(image.name, camera, source, mask, image.depth, image.depth_unit)
 
 
 def _final_size(

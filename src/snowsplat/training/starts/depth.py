@@ -39,7 +39,8 @@ def depth_points(
     The maps may have any unit. Each of them is aligned to the points of the dataset that its photo
     shows: as z and as distance up to a factor, and as disparity up to a factor and a shift (Ranftl
     et al. 2022). The kind with the smallest error is used. If the dataset has no points, the values
-    must be z in world units. Pixels are used whose depth the map of another view confirms.
+    must be z in units of ``View.depth_unit``. Pixels are used whose depth the map of another view
+    confirms.
 
     Args:
         generator: a random generator on the CPU.
@@ -83,7 +84,7 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     width, height = map_size(camera.width, camera.height)
     camera = camera.scaled(width, height)
     small = interpolate(torch.from_numpy(values)[None, None], (height, width), mode="nearest-exact")
-    z = _world_z(small[0, 0].numpy(), camera, points)
+    z = _world_z(small[0, 0].numpy() * view.depth_unit, camera, points)
     if z is None:
         return None
     known = z.isfinite()
