@@ -90,7 +90,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         rgb = np.stack([numbers(path, p.get("color", [128] * 3), 3) for p in points])
         found.points = usable_points(path, xyz, np.clip(rgb, 0, 255))
     elif found.shots:
-        points_beside(path.parent, found)
+        points_beside(path.parent, photos, found)
     return found
 
 

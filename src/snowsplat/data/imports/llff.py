@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.data.image_file import reason_of
 from snowsplat.data.imports.lenses import centred, perspective
 from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.reconstruction import Reconstruction, Shot
@@ -38,9 +39,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
         if stored.ndim != 2 or stored.shape[1] != _COLUMNS or len(stored) > _MOST_ROWS:
             raise ValueError(f"it has the shape {stored.shape}")
-        rows = numbers(path, stored, len(stored), _COLUMNS)
-    except (OSError, ValueError, EOFError, TypeError, SyntaxError, MemoryError) as error:
-        raise damaged(path, f"not a table of poses ({str(error)[:80]})") from None
+    except Exception as error:  # numpy raises many kinds
+        raise damaged(path, f"not a table of poses ({reason_of(error)})") from None
+    rows = numbers(path, stored, len(stored), _COLUMNS)
     files = photos.sorted_files()
     if len(files) != len(rows):
         raise UserError(

@@ -125,7 +125,7 @@ def _read_chunk(
         )
         found.shots.append(Shot(photo, lens, inverse(world_from_cam)))
     similar = np.column_stack([scale * world[:, :3], world[:, 3]])
-    points_beside(path.parent, found, {"world": np.eye(4)[:3], "chunk": similar})
+    points_beside(path.parent, photos, found, (np.eye(4)[:3], similar))
     return found
 
 

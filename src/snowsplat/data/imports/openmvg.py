@@ -86,7 +86,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         for point in objects(f"{path}: structure", scene.get("structure") or [])
     ]
     if found.shots:  # the points of the file have no colours
-        points_beside(path.parent, found)
+        points_beside(path.parent, photos, found)
     if xyz and found.points is None:
         found.points = usable_points(path, np.stack(xyz), np.full((len(xyz), 3), 128))
     return found

@@ -86,7 +86,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         pose = np.column_stack([_rotation(*angles), position])
         found.shots.append(Shot(photo, lens, from_opengl(where, pose)))
     _warn(path, found, division)
-    points_beside(path.parent, found)
+    points_beside(path.parent, photos, found)
     return found
 
 

@@ -1,0 +1,283 @@
+"""Exports of other programs: what is read must project points as the other program does."""
+
+import json
+import logging
+import shutil
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from snowsplat.data.imports import find_export, read_export
+from snowsplat.data.load import load_dataset
+from snowsplat.util.errors import UserError
+
+from . import exports
+from .exports import COLORS, HEIGHT, NAMES, POINTS, WIDTH
+
+
+def read(path, images="images"):
+    export = find_export(path)
+    assert export is not None
+    assert export.cameras is not None
+    return read_export(path, export, images)
+
+
+def pixels(image):
+    """(P, 2): where a posed image shows `POINTS`, by the equations of COLMAP."""
+    camera = image.camera
+    pose = camera.cam_from_world.numpy()
+    cam = POINTS @ pose[:, :3].T + pose[:, 3]
+    if image.lens is None:
+        model, params = "PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy)
+    else:
+        model, params = image.lens.model, image.lens.params
+        assert (image.lens.width, image.lens.height) == (camera.width, camera.height)
+        assert params[:4] == (camera.fx, camera.fy, camera.cx, camera.cy)
+    lens = pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
+    return np.asarray(lens.img_from_cam(cam))
+
+
+CASES = {
+    "metashape": (exports.metashape, {}),
+    "metashape chunk": (exports.metashape, {"world": False}),
+    "metashape fisheye": (exports.metashape, {"kind": "fisheye", "k": (0.1, -0.02, 0.01, 0.004)}),
+    "realityscan": (exports.realityscan, {}),
+    "realityscan 2": (exports.realityscan, {"newer": True}),
+    "bundler": (exports.bundler, {}),
+    "polycam": (exports.polycam, {}),
+    "polycam arkit": (exports.polycam, {"corrected": False}),
+    "record3d": (exports.record3d, {}),
+    "record3d rows": (exports.record3d, {"rows": True}),
+    "openmvg": (exports.openmvg, {}),
+    "openmvg fisheye": (exports.openmvg, {"kind": "fisheye"}),
+    "opensfm": (exports.opensfm, {}),
+    "opensfm perspective": (exports.opensfm, {"kind": "perspective"}),
+    "opensfm fisheye": (exports.opensfm, {"kind": "fisheye"}),
+    "alicevision": (exports.alicevision, {}),
+    "alicevision 1.2.0": (exports.alicevision, {"newer": False}),
+    "llff": (exports.llff, {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_points_are_projected_as_by_the_program(case, tmp_path):
+    write, options = CASES[case]
+    expected = write(tmp_path, **options)
+    posed, points, description = read(tmp_path)
+    assert len(posed) == len(NAMES)
+    for image in posed:
+        assert image.path.is_file()
+        assert np.abs(pixels(image) - expected[image.path.name]).max() < 1e-6
+    if points is not None:
+        assert torch.allclose(points.xyz, torch.from_numpy(POINTS).float(), atol=1e-5)
+    assert f"{len(NAMES)} of" in description
+
+
+def test_the_description_tells_what_was_read(tmp_path):
+    exports.metashape(tmp_path)
+    _, points, description = read(tmp_path)
+    assert description == ("Metashape cameras.xml, 4 of 5 photos aligned, points from points.ply")
+    assert points is not None
+    assert points.rgb.tolist() == COLORS.tolist()
+
+
+def test_points_in_the_frame_of_the_chunk_are_moved_to_the_world(tmp_path):
+    exports.metashape(tmp_path)
+    turn, shift, scale = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]), 2.5
+    exports.points(tmp_path, (POINTS - shift) @ turn / scale)
+    exports.painted_photos(tmp_path / "images")
+    _, points, _ = read(tmp_path)
+    assert points is not None
+    assert torch.allclose(points.xyz, torch.from_numpy(POINTS).float(), atol=1e-5)
+
+
+def test_points_in_another_frame_are_not_used(tmp_path, caplog):
+    exports.realityscan(tmp_path)
+    exports.points(tmp_path, POINTS + 100)
+    _, points, description = read(tmp_path)
+    assert points is None
+    assert "points" not in description
+    assert "are not where the cameras look" in caplog.text
+
+
+@pytest.mark.parametrize("k4", [0.02, -0.05])
+def test_a_term_r8_is_fitted(k4, tmp_path, caplog):
+    k = (0.1, -0.05, 0.03, k4)
+    expected = exports.metashape(tmp_path, k=k)
+    posed, _, _ = read(tmp_path)
+    for image in posed:
+        inside = ((expected[image.path.name] > 0) & (expected[image.path.name] < (64, 48))).all(1)
+        assert inside.sum() > 20
+        error = np.abs(pixels(image) - expected[image.path.name])[inside]
+        assert error.max() < 0.01
+    assert "r^8" not in caplog.text
+
+
+def test_cameras_on_the_earth_get_a_local_frame(tmp_path):
+    expected = exports.metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    file.write_text(file.read_text().replace("1.0 2.0 3.0", "4200000.0 500000.0 4750000.0"))
+    posed, _, _ = read(tmp_path)
+    centres = torch.stack([image.camera.position for image in posed])
+    assert centres.mean(0).abs().max() < 1e-6
+    a, b = centres[0] - centres[1], centres[0] - centres[2]
+    truth = [-r.T @ t for r, t in exports.rig().values()]
+    assert float(a.norm()) == pytest.approx(np.linalg.norm(truth[0] - truth[1]), rel=1e-9)
+    assert float(b.norm()) == pytest.approx(np.linalg.norm(truth[0] - truth[2]), rel=1e-9)
+    assert set(expected) == {image.path.name for image in posed}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_damaged_files_are_one_line(case, tmp_path, count_rejected):
+    write, options = CASES[case]
+    write(tmp_path, **options)
+    export = find_export(tmp_path)
+    path = export.cameras if export.cameras.is_file() else min(export.cameras.glob("*.json"))
+
+    def again():
+        found = find_export(tmp_path)
+        if found is not None and found.cameras is not None:
+            return read_export(tmp_path, found, "images")
+        return None
+
+    assert count_rejected(path, again) > 0
+
+
+def test_a_document_type_is_refused(tmp_path):
+    exports.metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    start, end = file.read_text().split("<document", 1)
+    bomb = '<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+    file.write_text(f"{start}{bomb}<document{end}")
+    with pytest.raises(UserError, match="has a document type"):
+        read(tmp_path)
+
+
+def test_depth_maps_have_a_unit(tmp_path):
+    exports.polycam(tmp_path)
+    dataset = load_dataset(tmp_path, hold_out=None)
+    assert [view.depth_unit for view in dataset.train] == [1e-3] * len(NAMES)
+    assert all(view.depth is not None for view in dataset.train)
+    assert dataset.description == "Polycam corrected_cameras, 4 of 4 photos aligned"
+
+
+def test_keyframes_without_poses_are_photos(tmp_path):
+    exports.polycam(tmp_path, corrected=False)
+    for file in (tmp_path / "keyframes" / "cameras").iterdir():
+        file.write_text(json.dumps({"fx": 500, "t_00": 1}))
+    export = find_export(tmp_path)
+    assert export is not None
+    assert export.cameras is None
+    assert export.photos == tmp_path / "keyframes" / "images"
+
+
+def test_the_file_of_the_cameras_can_be_given(tmp_path):
+    exports.bundler(tmp_path)
+    assert len(read(tmp_path / "bundle.out")[0]) == len(NAMES)
+
+
+def test_photos_elsewhere_are_one_line(tmp_path):
+    exports.realityscan(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    with pytest.raises(
+        UserError, match=r"none of its 4 photos .*'a\.png'.*; copy them to .*images"
+    ):
+        read(tmp_path)
+
+
+def test_missing_photos_are_skipped(tmp_path, caplog):
+    exports.openmvg(tmp_path)
+    (tmp_path / "images" / "b.png").unlink()
+    posed, _, description = read(tmp_path)
+    assert [image.path.name for image in posed] == ["a.png", "c.png", "d.png"]
+    assert "1 of 4 photos are missing (the first is '/b.png')" in caplog.text
+    assert "4 of 5 photos aligned" in description
+
+
+def test_photos_are_found_in_other_folders_and_with_other_suffixes(tmp_path):
+    exports.alicevision(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "Photos of Monday")
+    (tmp_path / "Photos of Monday" / "a.png").rename(tmp_path / "Photos of Monday" / "A.PNG")
+    exports.photos(tmp_path / "images_2", size=(WIDTH // 2, HEIGHT // 2))
+    names = {image.path.name for image in read(tmp_path)[0]}
+    assert names == {"A.PNG", "b.png", "c.png", "d.png"}
+
+
+def test_equal_names_are_told_apart_by_their_folder(tmp_path):
+    exports.alicevision(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "photos")
+    exports.photos(tmp_path / "retouched")
+    posed, _, _ = read(tmp_path)  # the file has /home/me/photos/
+    assert {image.folder.name for image in posed} == {"photos"}
+    (tmp_path / "photos").rename(tmp_path / "other")
+    with pytest.raises(UserError, match=r"several photos named 'a\.png'"):
+        read(tmp_path)
+
+
+def test_no_photo_outside_of_the_folder_is_used(tmp_path):
+    folder = tmp_path / "dataset"
+    folder.mkdir()
+    exports.opensfm(folder)
+    shutil.move(folder / "images", tmp_path / "images")
+    file = folder / "reconstruction.json"
+    file.write_text(file.read_text().replace('"a.png"', '"../images/a.png"'))
+    with pytest.raises(UserError, match="none of its 4 photos"):
+        read(folder)
+
+
+def test_positions_in_degrees_are_refused(tmp_path):
+    exports.realityscan(tmp_path)
+    file = tmp_path / "cameras.csv"
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    for line in lines[1:]:
+        line[1:3] = str(8.5 + float(line[1]) / 1e5), str(47.3 + float(line[2]) / 1e5)
+    file.write_text("\n".join(map(",".join, lines)))
+    with pytest.raises(UserError, match="longitude and latitude; export"):
+        read(tmp_path)
+
+
+def test_a_table_of_positions_alone_is_explained(tmp_path):
+    exports.photos(tmp_path)
+    (tmp_path / "cameras.csv").write_text("#name,x,y,alt\na.png,1,2,3\n")
+    with pytest.raises(UserError, match="export the alignment as Internal/External"):
+        read(tmp_path)
+
+
+def test_lenses_with_k1_alone_are_in_doubt(tmp_path, caplog):
+    exports.realityscan(tmp_path)
+    file = tmp_path / "cameras.csv"
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    for line in lines[1:]:
+        line[11:] = ["0"] * 5
+    file.write_text("\n".join(map(",".join, lines)))
+    read(tmp_path)
+    assert "division model" in caplog.text
+
+
+def test_compressed_depth_maps_are_named(tmp_path, caplog):
+    exports.record3d(tmp_path)
+    (tmp_path / "rgb").rename(tmp_path / "rgbd")
+    (tmp_path / "rgbd" / "0.depth").write_bytes(b"bvx2")
+    read(tmp_path)
+    assert "LZFSE" in caplog.text
+
+
+def test_other_files_are_no_exports(tmp_path):
+    exports.photos(tmp_path)
+    (tmp_path / "notes.xml").write_text("<notes><chunk/></notes>")
+    (tmp_path / "prices.csv").write_text("name,price\na,1\n")
+    (tmp_path / "metadata.json").write_text("{}")
+    (tmp_path / "a.out").write_bytes(b"\x7fELF")
+    assert find_export(tmp_path) is None
+
+
+def test_a_dataset_is_loaded(tmp_path, caplog):
+    caplog.set_level(logging.WARNING)
+    exports.llff(tmp_path)
+    dataset = load_dataset(tmp_path, hold_out=2)
+    assert [view.name for view in dataset.test] == ["images/a.png", "images/c.png"]
+    assert {(view.camera.width, view.camera.height) for view in dataset.train} == {(WIDTH, HEIGHT)}
+    assert dataset.train[0].camera.fx == 55
+    assert dataset.description == "LLFF poses_bounds.npy, 4 of 4 photos aligned"
