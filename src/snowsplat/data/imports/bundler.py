@@ -25,9 +25,10 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def find(folder: Path) -> Iterator[Path]:
-    """The files of cameras in a folder."""
-    places = (folder, folder / "bundle")
-    return (path for place in places for path in sorted(place.glob("*.out")) if is_bundler(path))
+    """The files of cameras in a folder; others than bundle.out may be of an earlier step."""
+    for place in (folder, folder / "bundle"):
+        paths = sorted(place.glob("*.out"), key=lambda p: (p.name != "bundle.out", p.name))
+        yield from (path for path in paths if is_bundler(path))
 
 
 def is_bundler(path: Path) -> bool:
@@ -68,7 +69,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
 
 def _names(path: Path, root: Path, count: int) -> list[str]:
     """The photos in the order of the cameras, from a list in a text file beside ``path``."""
-    folders = dict.fromkeys((path.parent, root))
+    folders = dict.fromkeys((path.parent, root, root / "prepare"))
     lists = [f for folder in folders for p in ("*.lst", "*.txt") for f in sorted(folder.glob(p))]
     for file in lists:
         names = [line.strip() for line in load_text(file).splitlines() if line.strip()]

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 _KINDS = {"frame": perspective, "fisheye": fisheye, "equidistant_fisheye": fisheye}
 # A world whose origin is further away, in extents of the cameras, is the Earth.
 _FAR = 1000.0
-# Pixels: skew is reported above this error.
+# Pixels: the skew of a sensor (b₂), which no lens model has, is reported above this error.
 _SKEW_ERROR = 0.5
 
 
@@ -117,6 +117,7 @@ def _read_chunk(
             "%s: has %d components, which are not aligned with each other; using the largest",
             *(path, len(groups)),
         )
+    _warn_of_skew(path, [sensors[key] for key in lenses])
     given = worlds.get(component)
     scale, world = _world(given if given is not None else whole, groups[component])
     for photo, lens, pose in groups[component]:
@@ -168,16 +169,36 @@ def _world(
     return scale, np.column_stack([local @ world[:, :3], local @ (world[:, 3] - middle)])
 
 
-def _lens(where: str, sensor: Element) -> LensModel:
+def _calibration(sensor: Element) -> Element | None:
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class", "adjusted") == "adjusted"]
+    return next(iter(adjusted or calibrations), None)
+
+
+def _warn_of_skew(path: Path, sensors: list[Element]) -> None:
+    errors = []
+    for sensor in sensors:
+        calibration, size = _calibration(sensor), sensor.find("resolution")
+        if calibration is not None and size is not None:
+            values = {key: calibration.findtext(key) or 0.0 for key in ("b2", "f")}
+            ratio = number(path, values, "b2") / (number(path, values, "f") or 1.0)
+            errors.append(abs(ratio) * _size(str(path), size)[1] / 2)
+    if max(errors, default=0.0) > _SKEW_ERROR:
+        logger.warning(
+            "%s: %d of %d calibrations have a skew (b2), which is not supported: an error of up to "
+            "%.1f pixels at the borders; optimise the alignment without b2 if that matters",
+            *(path, sum(error > _SKEW_ERROR for error in errors), len(errors), max(errors)),
+        )
+
+
+def _lens(where: str, sensor: Element) -> LensModel:
     kind = sensor.get("type", "frame")
     size = sensor.find("resolution")
     if kind == "spherical" and size is not None:
         return equirectangular(where, *_size(where, size))
-    if not calibrations:
+    calibration = _calibration(sensor)
+    if calibration is None:
         raise damaged(where, "has no calibration")
-    calibration = (adjusted or calibrations)[0]
     kind = calibration.get("type", kind)
     own = calibration.find("resolution")
     size = size if own is None else own
@@ -193,13 +214,6 @@ def _lens(where: str, sensor: Element) -> LensModel:
         return number(where, values, name, 0.0)
 
     focal, cx, cy = number(where, values, "f"), value("cx"), value("cy")
-    skew = value("b2")
-    if abs(skew) * height > 4 * _SKEW_ERROR * focal:  # the rest of it is a rotation of the image
-        logger.warning(
-            "%s: the calibration has a skew (b2 = %.3g), which is not supported: an error of %.2g "
-            "pixels at the borders; align the photos again without b1, b2 if that matters",
-            *(where, skew, abs(skew) * height / (2 * focal)),
-        )
     intrinsics = (focal + value("b1"), focal, width / 2 + cx, height / 2 + cy)
     radial = [value(name) for name in ("k1", "k2", "k3", "k4")]
     # Metashape: x += p₁ (r² + 2 x²) + 2 p₂ x y.

@@ -48,8 +48,8 @@ class PhotoFolder:
         if not name:
             return None
         for folder in (f"{self._preferred}/", *(() if self._only else ("",))):
-            for suffix in ("", *IMAGE_SUFFIXES) if not _is_photo(name) else ("",):
-                if is_file(self.root / (folder + name + suffix)) and _is_photo(name + suffix):
+            for suffix in ("", *IMAGE_SUFFIXES) if not is_photo(name) else ("",):
+                if is_file(self.root / (folder + name + suffix)) and is_photo(name + suffix):
                     return folder + name + suffix
         parts = PurePosixPath(name.lower())
         index = self._index()
@@ -68,7 +68,7 @@ class PhotoFolder:
         folder = self.root / self._preferred
         prefix = f"{self._preferred}/" if folder.is_dir() else ""
         names = (path.name for path in (folder if prefix else self.root).iterdir())
-        return [prefix + name for name in sorted(names) if _is_photo(name)]
+        return [prefix + name for name in sorted(names) if is_photo(name)]
 
     def _nearest(self, name: str, found: list[str]) -> str | None:
         """The one of several files that has most folders in common with ``name``."""
@@ -103,17 +103,18 @@ class PhotoFolder:
                 if count > _MOST_FILES:
                     raise UserError(f"{self.root}: has more than {_MOST_FILES:,} files; use fewer")
                 for file in sorted(files):
-                    if _is_photo(file) and not file.startswith("."):
+                    if is_photo(file) and not file.startswith("."):
                         path = (Path(folder) / file).relative_to(self.root).as_posix()
                         for key in {file.lower(), _stem(file.lower())}:
                             self._by_name.setdefault(key, []).append(path)
         return self._by_name
 
 
-def _is_photo(name: str) -> bool:
+def is_photo(name: str) -> bool:
+    """Whether a file name has the suffix of a photo."""
     return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
 
 
 def _stem(name: str) -> str:
     """The name without the suffix of a photo; "IMG.0001" has none."""
-    return name.rpartition(".")[0] if _is_photo(name) else name
+    return name.rpartition(".")[0] if is_photo(name) else name

@@ -46,6 +46,8 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     keyframes = path.parent
     images = dict(_PAIRS)[path.name]
     prefix = keyframes.relative_to(photos.root).as_posix()
+    # Some versions correct the depth maps too.
+    depths = [keyframes / path.name.replace("cameras", "depth"), keyframes / "depth"]
     found = Reconstruction()
     for file in sorted(path.glob("*.json")):
         found.total += 1
@@ -61,8 +63,8 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             number(file, values, f"t_{row}{column}") for row in range(3) for column in range(4)
         ]
         pose = from_opengl(file, np.reshape(entries, (3, 4)))
-        depth = keyframes / "depth" / f"{file.stem}.png"
-        found.shots.append(Shot(photo, lens, pose, depth if is_file(depth) else None, _MILLIMETRE))
+        depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
+        found.shots.append(Shot(photo, lens, pose, depth, _MILLIMETRE))
     return found
 
 

@@ -8,6 +8,7 @@ are metres.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import torch
 
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.imports.lenses import Intrinsics, perspective
-from snowsplat.data.imports.photos import PhotoFolder
+from snowsplat.data.imports.photos import PhotoFolder, is_photo
 from snowsplat.data.imports.reconstruction import Reconstruction, Shot
 from snowsplat.data.imports.values import (
     damaged,
@@ -29,10 +30,12 @@ from snowsplat.data.imports.values import (
     table,
 )
 from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
 logger = logging.getLogger(__name__)
 
+_DIGITS = re.compile(r"[0-9]{1,9}")
 _FOLDERS = ("rgb", "rgbd", "images", "EXR_RGBD/rgb")
 
 
@@ -59,7 +62,7 @@ def photos(folder: Path) -> Path | None:
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
-    """Read cameras; frame N has the pose N. Depth maps of .r3d files are not readable."""
+    """Read cameras. Depth maps of .r3d files are not readable."""
     values = table(path, load_json(path))
     poses = values.get("poses")
     if not isinstance(poses, list):
@@ -69,14 +72,14 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     own = frames if isinstance(frames, list) and len(frames) == len(poses) else None
     intrinsics = _intrinsics(path, values)
     images = next((path.parent / n for n in _FOLDERS if (path.parent / n).is_dir()), path.parent)
-    prefix = images.relative_to(photos.root).as_posix()
+    files = _frames(path, images, len(poses))
     found = Reconstruction(total=len(poses))
     compressed = False
     for index, entry in enumerate(poses):
         where = f"{path}: pose {index}"
-        photo = photos.find(f"{prefix}/{index}")
-        if photo is None:
-            found.missing.append(f"{prefix}/{index}.jpg")
+        file = files.get(index)
+        if file is None:
+            found.missing.append(f"{images.name}/{index}.jpg")
             continue
         pose = numbers(where, entry, 7)
         if not 0.5 < np.linalg.norm(pose[:4]) < 2.0:
@@ -87,9 +90,10 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         lens = perspective(where, width, height, intrinsics)
         rotation = rotation_from_quat(torch.from_numpy(pose[[3, 0, 1, 2]])).numpy()
         cam = from_opengl(where, np.column_stack([rotation, pose[4:]]))
-        names = (path.parent / "depth" / f"{index}{suffix}" for suffix in DEPTH_SUFFIXES)
+        names = (path.parent / "depth" / f"{file.stem}{suffix}" for suffix in DEPTH_SUFFIXES)
         depth = next((name for name in names if is_file(name)), None)
-        compressed |= depth is None and is_file(images / f"{index}.depth")
+        compressed |= depth is None and is_file(file.with_suffix(".depth"))
+        photo = file.relative_to(photos.root).as_posix()
         found.shots.append(Shot(photo, lens, cam, depth))
     if compressed:
         logger.warning(
@@ -98,6 +102,24 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             path.parent,
         )
     return found
+
+
+def _frames(path: Path, images: Path, count: int) -> dict[int, Path]:
+    """The photo of each pose: 0.jpg, 1.jpg …; with other names, the photos in their order.
+
+    Raises:
+        UserError: the photos have other names, and there are not as many as poses.
+    """
+    files = [file for file in sorted(images.iterdir()) if is_photo(file.name) and is_file(file)]
+    numbered = {int(file.stem): file for file in files if _DIGITS.fullmatch(file.stem)}
+    if len(numbered) == len(files) and max(numbered, default=0) < count:
+        return numbered
+    if len(files) != count:
+        raise UserError(
+            f"{path}: has {count} poses, but there are {len(files)} photos in {images}, which are "
+            "not named 0.jpg, 1.jpg …; use the photos as Record3D has named them"
+        )
+    return dict(enumerate(files))
 
 
 def _intrinsics(path: Path, values: dict[str, Any]) -> Intrinsics:
