@@ -281,3 +281,18 @@ def test_a_dataset_is_loaded(tmp_path, caplog):
     assert {(view.camera.width, view.camera.height) for view in dataset.train} == {(WIDTH, HEIGHT)}
     assert dataset.train[0].camera.fx == 55
     assert dataset.description == "LLFF poses_bounds.npy, 4 of 4 photos aligned"
+
+
+def test_nerfcapture_has_depth_maps_with_a_unit(tmp_path):
+    matrix = np.eye(4).tolist()
+    frames = [{"file_path": f"images/{i}", "depth_path": f"images/{i}.depth.png"} for i in range(2)]
+    for i, frame in enumerate(frames):
+        matrix[0][3] = float(i)
+        frame["transform_matrix"] = [row[:] for row in matrix]
+    exports.photos(tmp_path / "images", ["0.png", "1.png", "0.depth.png", "1.depth.png"])
+    scene = {"fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0, "w": WIDTH, "h": HEIGHT}
+    scene |= {"integer_depth_scale": 10 / 65535, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(scene))
+    views = load_dataset(tmp_path, hold_out=None).train
+    assert [view.depth.name for view in views] == ["0.depth.png", "1.depth.png"]
+    assert [view.depth_unit for view in views] == [10 / 65535] * 2

@@ -73,7 +73,7 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     """The map of a view in world units; None without a map, or if it contradicts the points."""
     if view.depth is None:
         return None
-    values = read_depth_file(view.depth)
+    values = view.depth_unit * read_depth_file(view.depth)
     height, width = values.shape
     camera = view.camera
     if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
@@ -84,7 +84,7 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     width, height = map_size(camera.width, camera.height)
     camera = camera.scaled(width, height)
     small = interpolate(torch.from_numpy(values)[None, None], (height, width), mode="nearest-exact")
-    z = _world_z(small[0, 0].numpy() * view.depth_unit, camera, points)
+    z = _world_z(small[0, 0].numpy(), camera, points)
     if z is None:
         return None
     known = z.isfinite()
