@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 import torch
 
+from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import pinhole_of
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.pinhole_model import write_model
@@ -33,7 +34,12 @@ def found(model_of) -> pycolmap.Reconstruction:
 
 
 def written(model: pycolmap.Reconstruction, folder) -> pycolmap.Reconstruction:
-    pinholes = {number: pinhole_of(camera) for number, camera in model.cameras.items()}
+    pinholes = {
+        number: pinhole_of(
+            LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+        )
+        for number, camera in model.cameras.items()
+    }
     write_model(model, pinholes, SCENE, folder / "sparse")
     return pycolmap.Reconstruction(folder / "sparse" / "0")
 

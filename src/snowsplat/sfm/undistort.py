@@ -27,6 +27,7 @@ from PIL import Image
 from snowsplat.data.decode import resize_area
 from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
+from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
 from snowsplat.sfm.pinhole_model import write_model
@@ -136,9 +137,10 @@ def undistort(
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
     try:
-        pinhole = pinhole_of(camera)
+        pinhole = pinhole_of(lens)
     except ValueError as error:
         raise UserError(
             f"lens distortion: implausible estimate ({found}): {error}; take more photos from "

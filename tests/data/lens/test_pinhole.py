@@ -4,7 +4,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.data.lens.pinhole import pinhole_of
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.pinhole import Pinhole
+from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
@@ -12,6 +14,11 @@ LENSES = {
     "tangential": ("OPENCV", [262.0, 258.0, 165.0, 117.0, -0.12, 0.05, 0.003, -0.004]),
     "fisheye": ("OPENCV_FISHEYE", [150.0, 150.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]),
 }
+
+
+def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
+    size = camera.width, camera.height
+    return pinhole_of_lens(LensModel(camera.model_name, *size, tuple(camera.params)))
 
 
 def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
@@ -62,16 +69,20 @@ def test_a_fisheye_without_coefficients_is_no_pinhole():
 
 
 @pytest.mark.parametrize(
-    ("model", "params"),
+    ("model", "params", "cropped"),
     [
-        # Polynomials that turn back inside the image.
-        ("SIMPLE_RADIAL", [250.0, 160.0, 120.0, -0.6]),
-        ("FULL_OPENCV", [250.0, 250.0, 160.0, 120.0, 0.1, 0.1, 0.0, 0.0, 0.1, -2.0, 0.0, 0.0]),
+        # Polynomials that turn back inside the image, and one that has a pole outside.
+        ("SIMPLE_RADIAL", [250.0, 160.0, 120.0, -0.6], True),
+        (
+            "FULL_OPENCV",
+            [250.0, 250.0, 160.0, 120.0, 0.1, 0.1, 0.0, 0.0, 0.1, -2.0, 0.0, 0.0],
+            False,
+        ),
     ],
 )
-def test_a_folded_image_is_cropped(model, params):
+def test_a_folded_image_is_cropped(model, params, cropped):
     pinhole = pinhole_of(lens(model, params))
-    assert pinhole.cropped
+    assert pinhole.cropped == cropped
     assert pinhole.width >= 64
     # The map is monotonic in both directions.
     assert (np.diff(pinhole.nodes[..., 0], axis=1) > 0).all()

@@ -5,7 +5,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.pinhole import Pinhole
+from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
 
 LENSES = {
@@ -14,6 +16,11 @@ LENSES = {
     "tangential": ("OPENCV", [262.0, 258.0, 165.0, 117.0, -0.12, 0.05, 0.003, -0.004]),
     "fisheye": ("OPENCV_FISHEYE", [150.0, 150.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]),
 }
+
+
+def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
+    size = camera.width, camera.height
+    return pinhole_of_lens(LensModel(camera.model_name, *size, tuple(camera.params)))
 
 
 def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
@@ -102,5 +109,5 @@ def test_the_strip_size_does_not_change_the_result(strip, monkeypatch):
     camera = lens(*LENSES["tangential"])
     image, pinhole = to_image(photograph(camera, 110)), pinhole_of(camera)
     whole = np.asarray(undistort_image(image, pinhole), np.int64)
-    monkeypatch.setattr("snowsplat.data.lens.resample._STRIP_PIXELS", strip)
+    monkeypatch.setattr("snowsplat.data.lens.pinhole._STRIP_PIXELS", strip)
     assert np.abs(np.asarray(undistort_image(image, pinhole), np.int64) - whole).max() <= 1

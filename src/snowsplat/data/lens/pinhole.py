@@ -6,16 +6,33 @@ calibration that SfM may return.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 import numpy as np
 
-if TYPE_CHECKING:
-    import pycolmap
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import intrinsics, project, unproject
 
 _MAP_ERROR = 0.02  # pixels: largest error of the bilinear interpolation between nodes
 _CELLS = (64, 32, 16, 8, 4)  # pixels: approximate cell sizes, tried in this order
+_CROPPED = 0.95  # of width and height; without blank borders, an image shows more of the photo
+_BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle
+_STRIP_PIXELS = 1 << 18  # processed at a time: limits the memory and fits the caches
+# Models that are pinhole cameras if their coefficients are 0.
+_PINHOLES = frozenset(
+    {
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "FULL_OPENCV",
+        "SIMPLE_DIVISION",
+        "DIVISION",
+    }
+)
 _MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the calibration is wrong
 
 
@@ -31,85 +48,111 @@ class Pinhole:
     width: int  # pixels
     height: int
     params: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
-    nodes: np.ndarray | None = None
-    cropped: bool = False  # whether the outer part is cut off, because the calibration is invalid
+    nodes: np.ndarray | None = None  # float32
+    cropped: bool = False  # the outer part is cut off, because the calibration is invalid there
+    wraps: ClassVar[bool] = False  # see `LensView.wraps`
+
+    def strips(self, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
+        """Rows of this image at the size ``width`` × ``height``, and the positions of their pixels
+        in the photo: (H, W, 2) float32 x, y in pixels.
+        """
+        assert self.nodes is not None
+        return interpolated(self.nodes, width, height)
 
 
-def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
+def is_pinhole(lens: LensModel) -> bool:
+    """Whether a lens has no distortion. A fisheye without coefficients has: it is no pinhole."""
+    return lens.model in _PINHOLES and not any(intrinsics(lens)[4])
+
+
+def pinhole_of(lens: LensModel) -> Pinhole:
     """The pinhole camera for a distorted one: the same focal lengths, no blank borders.
 
     Raises:
         ValueError: the calibration is valid only for a small part of the photo.
     """
-    import pycolmap
-
-    # COLMAP regards a fisheye lens with zero coefficients as undistorted, but it is not a pinhole
-    # camera.
-    if camera.is_perspective_pinhole() and camera.is_undistorted():
-        params = (
-            camera.focal_length_x,
-            camera.focal_length_y,
-            camera.principal_point_x,
-            camera.principal_point_y,
-        )
-        return Pinhole(camera.width, camera.height, params)
-    # COLMAP chooses an image without blank borders, of 0.2 to 2 times the size of the photo.
-    whole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    made, cropped = whole, False
-    if not _is_valid(camera, whole):
+    fx, fy, cx, cy, _ = intrinsics(lens)
+    if is_pinhole(lens):
+        return Pinhole(lens.width, lens.height, (fx, fy, cx, cy))
+    made = _without_blank_borders(lens)
+    if not _is_valid(lens, made):
         # Beyond some radius the distortion polynomial may decrease, so that the image is folded
-        # there. If COLMAP limits the size of the image, it may have blank borders. Search for the
+        # there. If the size of the image is limited, it may have blank borders. Search for the
         # largest part around the principal point without folds and blank borders.
-        cropped = True
+        whole = Pinhole(2 * lens.width, 2 * lens.height, (fx, fy, 2 * cx, 2 * cy))
         low, high = 0.0, 1.0
         while high - low > 1e-3:
             middle = (low + high) / 2
             part = _shrunk(whole, middle)
-            if part is not None and _is_valid(camera, part):
+            if part is not None and _is_valid(lens, part):
                 low, made = middle, part
             else:
                 high = middle
-        min_width, min_height = _MIN_FRACTION * camera.width, _MIN_FRACTION * camera.height
+        min_width, min_height = _MIN_FRACTION * lens.width, _MIN_FRACTION * lens.height
         if low == 0 or made.width < min_width or made.height < min_height:
             raise ValueError("less than a fifth of the width or height can be undistorted")
-    fx, fy, cx, cy = (float(value) for value in made.params)
-    return Pinhole(made.width, made.height, (fx, fy, cx, cy), _nodes(camera, made), cropped)
+    nodes = node_grid(made.width, made.height, lambda x, y: _to_photo(lens, made, x, y))
+    used = np.ptp(nodes, axis=(0, 1)) / (lens.width, lens.height)
+    return Pinhole(made.width, made.height, made.params, nodes, bool(used.min() < _CROPPED))
 
 
-def _to_photo(
-    camera: pycolmap.Camera, pinhole: pycolmap.Camera, x: np.ndarray, y: np.ndarray
-) -> np.ndarray:
+def _without_blank_borders(lens: LensModel) -> Pinhole:
+    """The image of 0.2 to 2 times the size of the photo that has no blank borders, as in COLMAP.
+
+    The border of the photo is mapped to the pinhole camera of the same parameters. On each side,
+    the innermost position is the border of the new image, which keeps the shares of the principal
+    point.
+    """
+    fx, fy, cx, cy, _ = intrinsics(lens)
+    sides = []
+    for size, other, centre, focal, axis in (
+        (lens.width, lens.height, cx, fx, 0),
+        (lens.height, lens.width, cy, fy, 1),
+    ):
+        along = np.linspace(0.5, other - 0.5, min(other, _BORDER_SAMPLES))
+        near, far = (
+            unproject(lens, np.stack([across, along] if axis == 0 else [along, across], -1))
+            for across in (np.full_like(along, 0.5), np.full_like(along, size - 0.5))
+        )
+        inner = -focal * near[:, axis].max(), focal * far[:, axis].min()
+        outer = centre, size - 0.5 - centre
+        with np.errstate(all="ignore"):
+            scale = float(np.divide(inner, outer).min())
+        sides.append(max(1, int(size * np.clip(scale, 0.2, 2.0))) if scale > 0 else 2 * size)
+    width, height = sides
+    params = (fx, fy, cx * width / lens.width, cy * height / lens.height)
+    return Pinhole(width, height, params)
+
+
+def _to_photo(lens: LensModel, pinhole: Pinhole, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels.
 
     NaN where the lens model is undefined.
     """
     fx, fy, cx, cy = pinhole.params
     across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
-    rays = np.stack([across, down, np.ones_like(across)], -1).reshape(-1, 3)
-    return np.asarray(camera.img_from_cam(rays)).reshape(len(y), len(x), 2)
+    return project(lens, np.stack([across, down, np.ones_like(across)], -1))
 
 
-def _shrunk(camera: pycolmap.Camera, factor: float) -> pycolmap.Camera | None:
+def _shrunk(pinhole: Pinhole, factor: float) -> Pinhole | None:
     """The part around the principal point whose size is ``factor`` times the size of the image."""
-    import pycolmap
-
-    width, height = int(factor * camera.width), int(factor * camera.height)
+    width, height = int(factor * pinhole.width), int(factor * pinhole.height)
     if width < 1 or height < 1:
         return None
-    fx, fy, cx, cy = camera.params
-    params = [fx, fy, cx * width / camera.width, cy * height / camera.height]
-    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+    fx, fy, cx, cy = pinhole.params
+    params = (fx, fy, cx * width / pinhole.width, cy * height / pinhole.height)
+    return Pinhole(width, height, params)
 
 
-def _is_valid(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
+def _is_valid(lens: LensModel, pinhole: Pinhole) -> bool:
     """Whether every pixel of the undistorted image is in the photo, without folds or gaps."""
     x, y = (np.linspace(0, size, 65) for size in (pinhole.width, pinhole.height))
-    source = _to_photo(camera, pinhole, x, y)
+    source = _to_photo(lens, pinhole, x, y)
     if not np.isfinite(source).all():
         return False
     # Because sizes are rounded, positions up to one pixel outside of the photo are allowed. There,
     # the border pixels of the photo are repeated.
-    if (source < -1).any() or (source > [camera.width + 1, camera.height + 1]).any():
+    if (source < -1).any() or (source > [lens.width + 1, lens.height + 1]).any():
         return False
     right, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
     area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
@@ -118,15 +161,44 @@ def _is_valid(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
     return bool(area.min() > 0.01 * area[32, 32] > 0)
 
 
-def _nodes(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> np.ndarray:
-    """`Pinhole.nodes`, with the largest cells for which the error is below `_MAP_ERROR`."""
+def node_grid(
+    width: int, height: int, positions: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """`Pinhole.nodes`, with the largest cells for which the error is below `_MAP_ERROR`.
+
+    Args:
+        width, height: of the image in pixels.
+        positions: of columns x and rows y, in pixels, to positions (len(y), len(x), 2) in the
+            photo; NaN where there are none.
+    """
     for cell in _CELLS:
-        x, y = (
-            np.linspace(0, size, -(-size // cell) + 1) for size in (pinhole.width, pinhole.height)
-        )
-        nodes = _to_photo(camera, pinhole, x, y)
-        middles = _to_photo(camera, pinhole, (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
+        x, y = (np.linspace(0, size, -(-size // cell) + 1) for size in (width, height))
+        nodes = positions(x, y)
+        middles = positions((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
         means = (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4
-        if np.abs(means - middles).max() < _MAP_ERROR:
+        error = np.abs(means - middles)
+        if not (error > _MAP_ERROR).any():
             break
-    return nodes
+    return nodes.astype(np.float32)
+
+
+def interpolated(nodes: np.ndarray, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
+    """Rows of an image, and the positions (H, W, 2) float32 of their pixels between the nodes."""
+    column, across = _cells(width, nodes.shape[1] - 1)
+    row, down = _cells(height, nodes.shape[0] - 1)
+    across, down = across[:, None], down[:, None, None]
+    lines = nodes[:, column]
+    lines += (nodes[:, column + 1] - lines) * across
+    step = max(1, _STRIP_PIXELS // width)
+    for first in range(0, height, step):
+        rows = slice(first, min(first + step, height))
+        position = lines[row[rows]]
+        position += (lines[row[rows] + 1] - position) * down[rows]
+        yield rows, position
+
+
+def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The cell (of ``count``) of each of ``size`` pixels, and the position in the cell, 0..1."""
+    position = (np.arange(size) + 0.5) * (count / size)
+    cell = np.minimum(position.astype(np.int64), count - 1)
+    return cell, (position - cell).astype(np.float32)
