@@ -13,17 +13,15 @@ import torch
 
 from snowsplat.data.dataset import Points, PosedImage, safe_name
 from snowsplat.data.imports.kinds import KINDS, Kind
-from snowsplat.data.imports.lenses import intrinsics_of
 from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.lens.pinhole import is_pinhole
+from snowsplat.data.lens.project import intrinsics
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
 logger = logging.getLogger(__name__)
-
-# Lenses without distortion; the other models are in `PosedImage.lens`.
-_PINHOLE = "PINHOLE"
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ def _posed(root: Path, shot: Shot) -> PosedImage:
     camera = Camera(
         lens.width,
         lens.height,
-        *intrinsics_of(lens),
+        *intrinsics(lens)[:4],
         torch.from_numpy(shot.cam_from_world.copy()),
     )
     first, slash, _ = shot.photo.partition("/")
@@ -131,5 +129,5 @@ def _posed(root: Path, shot: Shot) -> PosedImage:
         (root / shot.photo).relative_to(folder).as_posix(),
         depth=shot.depth,
         depth_unit=shot.depth_unit,
-        lens=None if lens.model == _PINHOLE else lens,
+        lens=None if is_pinhole(lens) else lens,
     )

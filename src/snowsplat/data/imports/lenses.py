@@ -83,15 +83,6 @@ def equirectangular(where: object, width: float, height: float) -> LensModel:
     return LensModel("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])))
 
 
-def intrinsics_of(lens: LensModel) -> Intrinsics:
-    """fx, fy, cx, cy of a lens that a function of this module has made."""
-    if lens.model == "EQUIRECTANGULAR":
-        width, height = lens.width, lens.height
-        return width / (2 * math.pi), height / math.pi, width / 2, height / 2
-    fx, fy, cx, cy = lens.params[:4]
-    return fx, fy, cx, cy
-
-
 def centred(width: float, height: float, focal: float) -> Intrinsics:
     """One focal length, and the principal point in the middle."""
     return focal, focal, width / 2, height / 2

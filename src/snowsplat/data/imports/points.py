@@ -10,9 +10,9 @@ import numpy as np
 
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.decode import ImageSource, load_thumbnail, read_header
-from snowsplat.data.imports.lenses import intrinsics_of
 from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.lens.project import project
 from snowsplat.data.points_ply import read_points
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
@@ -82,16 +82,10 @@ def _share_seen(xyz: np.ndarray, shots: Sequence[Shot]) -> float:
 
 
 def _positions(xyz: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
-    """The indices (N,) of the points that a photo shows, and where (N, 2), relative to its size.
-
-    Distortion is ignored.
-    """
-    fx, fy, cx, cy = intrinsics_of(shot.lens)
-    with np.errstate(all="ignore"):
-        cam = xyz @ shot.cam_from_world[:, :3].T + shot.cam_from_world[:, 3]
-        pixels = cam[:, :2] / cam[:, 2:] * (fx, fy) + (cx, cy)
-        where = pixels / (shot.lens.width, shot.lens.height)
-        seen = ((where >= 0) & (where < 1)).all(1) & (cam[:, 2] > 0)
+    """The indices (N,) of the points that a photo shows, and where (N, 2), relative to its size."""
+    cam = xyz @ shot.cam_from_world[:, :3].T + shot.cam_from_world[:, 3]
+    where = project(shot.lens, cam) / (shot.lens.width, shot.lens.height)
+    seen = ((where >= 0) & (where < 1)).all(1)
     return np.flatnonzero(seen), where[seen]
 
 
