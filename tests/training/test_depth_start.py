@@ -114,6 +114,13 @@ def test_without_points_the_maps_are_z_in_world_units(tmp_path: Path) -> None:
     assert float(error.max()) < 0.03
 
 
+def test_without_points_maps_may_have_a_unit(tmp_path: Path) -> None:
+    data = dataset(tmp_path)
+    views = [replace(view, depth_unit=1e-3) for view in data.train]
+    error = (found(replace(data, train=views, points=None)).xyz.norm(dim=1) - 1.0).abs()
+    assert float(error.max()) < 0.03
+
+
 def test_the_first_gaussians_are_at_the_points(tmp_path: Path) -> None:
     data = dataset(tmp_path)
     config = replace(TrainConfig(), init="depth", initial_points=COUNT)

@@ -52,8 +52,9 @@ def load_dataset(
 
     Args:
         path: a folder with a COLMAP model (``sparse/0`` …, binary or text) and images; a folder
-            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file. The folder
-            may contain depth maps of the images, ``depths/IMG.png`` (or TIFF, NPY, EXR).
+            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file; or the
+            export of another program, see `snowsplat.data.imports`. The folder may contain depth
+            maps of the images, ``depths/IMG.png`` (or TIFF, NPY, EXR).
         images: name of the folder of images.
         resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
             they are complete. Any other number is a width in pixels to which wider images are

@@ -129,22 +129,6 @@ def test_cameras_on_the_earth_get_a_local_frame(tmp_path):
     assert set(expected) == {image.path.name for image in posed}
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_damaged_files_are_one_line(case, tmp_path, count_rejected):
-    write, options = CASES[case]
-    write(tmp_path, **options)
-    export = find_export(tmp_path)
-    path = export.cameras if export.cameras.is_file() else min(export.cameras.glob("*.json"))
-
-    def again():
-        found = find_export(tmp_path)
-        if found is not None and found.cameras is not None:
-            return read_export(tmp_path, found, "images")
-        return None
-
-    assert count_rejected(path, again) > 0
-
-
 def test_a_document_type_is_refused(tmp_path):
     exports.metashape(tmp_path)
     file = tmp_path / "cameras.xml"
