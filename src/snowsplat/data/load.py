@@ -178,7 +178,7 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     if transforms:
         return read_transforms(transforms, images)
     export = export or find_export(root)
-    if export and export.cameras:
+    if export and export.cameras and not models:
         return read_export(root, export, images)
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")

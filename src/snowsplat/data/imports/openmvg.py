@@ -57,9 +57,8 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras and points."""
     scene = table(path, load_json(path))
     lenses = _lenses(path, scene)
-    poses = {
-        pose.get("key"): pose for pose in objects(f"{path}: extrinsics", scene.get("extrinsics"))
-    }
+    where = f"{path}: extrinsics"
+    poses = {number(where, pose, "key"): pose for pose in objects(where, scene.get("extrinsics"))}
     found = Reconstruction()
     for view in objects(f"{path}: views", scene.get("views")):
         data = _data(f"{path}: view", view)
