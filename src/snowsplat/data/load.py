@@ -15,6 +15,7 @@ from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_exte
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.imports import find_export, read_export
+from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
@@ -182,6 +183,8 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         return read_export(root, export, images)
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
+    if (known := advice(root)) is not None:
+        raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
     raise NoPosesError(
         f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
         "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"

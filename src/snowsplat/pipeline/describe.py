@@ -55,7 +55,7 @@ def describe(path: Path | str) -> dict[str, Any]:
         try:
             format = format_for_reading(path)
         except UserError as error:
-            if path.suffix != ".json":  # it may be a dataset
+            if path.suffix != ".json" and not _is_export(path):  # it may be a dataset
                 unknown = UserError(f"{error}, checkpoints, datasets, photos and videos")
                 return _photos(path, unknown)
         else:
@@ -172,6 +172,12 @@ def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
     except UserError:
         raise otherwise from None
     return describe_photos(sources)
+
+
+def _is_export(path: Path) -> bool:
+    from snowsplat.data.imports import find_export  # torch
+
+    return find_export(path) is not None
 
 
 def _dataset(path: Path) -> dict[str, Any]:

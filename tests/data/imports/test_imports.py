@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from snowsplat.data.imports import find_export, read_export
-from snowsplat.data.load import load_dataset
+from snowsplat.data.load import NoPosesError, load_dataset
+from snowsplat.pipeline.describe import describe
 from snowsplat.util.errors import UserError
 
 from . import exports
@@ -246,6 +247,37 @@ def test_compressed_depth_maps_are_named(tmp_path, caplog):
     (tmp_path / "rgbd" / "0.depth").write_bytes(b"bvx2")
     read(tmp_path)
     assert "LZFSE" in caplog.text
+
+
+def test_packed_recordings_are_to_be_unpacked(tmp_path):
+    (tmp_path / "scan.r3d").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"scan\.r3d: is packed; unpack it"):
+        load_dataset(tmp_path / "scan.r3d")
+
+
+def test_info_describes_the_file_of_the_cameras(tmp_path):
+    exports.metashape(tmp_path)
+    facts = describe(tmp_path / "cameras.xml")
+    assert facts["description"].startswith("Metashape cameras.xml, 4 of 5 photos aligned")
+    assert facts["points"] == len(POINTS)
+
+
+def test_the_folder_of_an_unpacked_archive_may_be_inside(tmp_path):
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "__MACOSX").mkdir()
+    exports.polycam(tmp_path / "scan")
+    posed, _, _ = read(tmp_path)
+    assert len(posed) == len(NAMES)
+    export = find_export(tmp_path)
+    assert export.photos == tmp_path / "scan" / "keyframes" / "corrected_images"
+
+
+@pytest.mark.parametrize("name", ["garden.psx", "Garden.rcproj", "sfm_data.bin", "scan.r3d"])
+def test_projects_that_are_not_readable_are_explained(name, tmp_path):
+    exports.photos(tmp_path / "images")
+    (tmp_path / name).touch()
+    with pytest.raises(NoPosesError, match=rf"{name} is .*; (export|convert|unpack)"):
+        load_dataset(tmp_path)
 
 
 def test_other_files_are_no_exports(tmp_path):

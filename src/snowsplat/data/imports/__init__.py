@@ -40,17 +40,31 @@ class Export:
 
 
 def find_export(path: Path) -> Export | None:
-    """The program whose files are in a folder, or that wrote the file ``path``; None if unknown."""
+    """The program whose files are in a folder, or that wrote the file ``path``; None if unknown.
+
+    If there is only one folder in a folder, as unpacked archives have it, it is searched too.
+    """
+    if path.is_file():
+        return next((Export(kind, path, None) for kind in KINDS if kind.reads_file(path)), None)
+    return _in_folder(path) or next(map(_in_folder, _only_folder(path)), None)
+
+
+def _in_folder(folder: Path) -> Export | None:
     for kind in KINDS:
-        if path.is_file():
-            if kind.reads_file(path):
-                return Export(kind, path, None)
-            continue
-        cameras = next(kind.find(path), None)
-        photos = kind.photos(path)
+        cameras = next(kind.find(folder), None)
+        photos = kind.photos(folder)
         if cameras is not None or photos is not None:
             return Export(kind, cameras, photos)
     return None
+
+
+def _only_folder(folder: Path) -> list[Path]:
+    """The subfolder, if a folder has one and no files; hidden ones do not count."""
+    try:
+        inside = [path for path in folder.iterdir() if not path.name.startswith((".", "__"))]
+    except OSError:
+        return []
+    return inside if len(inside) == 1 and inside[0].is_dir() else []
 
 
 def read_export(
@@ -104,10 +118,11 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
             quoted(found.missing[0]),
         )
     if found.points is None:
+        with_depth = any(shot.depth is not None for shot in found.shots)
         logger.warning(
-            "%s: no points; training starts from random ones; export the points as PLY into %s "
-            "for a better scene",
+            "%s: no points%s; a PLY file of them in %s is a better start",
             cameras,
+            ", but depth maps, which --init depth uses" if with_depth else "",
             folder.root,
         )
 

@@ -35,6 +35,7 @@ from snowsplat.util.safe_json import is_file
 
 logger = logging.getLogger(__name__)
 
+_PACKED = ".r3d"
 _DIGITS = re.compile(r"[0-9]{1,9}")
 _FOLDERS = ("rgb", "rgbd", "images", "EXR_RGBD/rgb")
 
@@ -46,7 +47,9 @@ def find(folder: Path) -> Iterator[Path]:
 
 
 def is_record3d(path: Path) -> bool:
-    """Whether a file is the metadata of a recording with poses."""
+    """Whether a file is the metadata of a recording with poses, or a packed recording."""
+    if path.suffix.lower() == _PACKED and is_file(path):
+        return True
     if path.name not in ("metadata.json", "metadata") or not is_file(path):
         return False
     head = head_of(path, 1 << 24)
@@ -63,6 +66,11 @@ def photos(folder: Path) -> Path | None:
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras. Depth maps of .r3d files are not readable."""
+    if path.suffix.lower() == _PACKED:
+        raise UserError(
+            f"{path}: is packed; unpack it as a zip archive, or export EXR + RGB from Record3D, "
+            "and use the folder"
+        )
     values = table(path, load_json(path))
     poses = values.get("poses")
     if not isinstance(poses, list):

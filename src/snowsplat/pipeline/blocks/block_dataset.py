@@ -52,7 +52,8 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         _link(image.path, folder / "images" / name)
         if image.mask is not None:
             _link(image.mask, folder / "masks" / f"{name}.png")
-        if image.depth is not None:
+        # A COLMAP dataset cannot state a unit; without points, the maps would be misunderstood.
+        if image.depth is not None and (image.depth_unit == 1.0 or points is not None):
             _link(image.depth, folder / "depths" / f"{name}{image.depth.suffix}")
     nothing = np.zeros((0, 3))
     write_model(
