@@ -12,7 +12,7 @@ import torch
 from snowsplat.data.imports import find_export, read_export
 from snowsplat.data.load import NoPosesError, load_dataset
 from snowsplat.pipeline.describe import describe
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 
 from . import exports
 from .exports import COLORS, HEIGHT, NAMES, POINTS, WIDTH
@@ -188,6 +188,16 @@ def test_photos_are_found_in_other_folders_and_with_other_suffixes(tmp_path):
     exports.photos(tmp_path / "images_2", size=(WIDTH // 2, HEIGHT // 2))
     names = {image.path.name for image in read(tmp_path)[0]}
     assert names == {"A.PNG", "b.png", "c.png", "d.png"}
+
+
+def test_another_folder_of_images_can_be_chosen(tmp_path):
+    exports.llff(tmp_path)
+    exports.photos(tmp_path / "images_2", size=(WIDTH // 2, HEIGHT // 2))
+    dataset = load_dataset(tmp_path, images="images_2", hold_out=None)
+    assert dataset.train[0].name == "images_2/a.png"
+    assert dataset.train[0].camera.fx == pytest.approx(55 / 2)
+    with pytest.raises(SettingError, match="no such folder"):
+        load_dataset(tmp_path, images="images_8")
 
 
 def test_equal_names_are_told_apart_by_their_folder(tmp_path):

@@ -125,8 +125,9 @@ def _read_chunk(
             path, world[:, :3] @ pose[:, :3], scale * world[:, :3] @ pose[:, 3] + world[:, 3]
         )
         found.shots.append(Shot(photo, lens, inverse(world_from_cam)))
+    # The points may be in the frame of the chunk, or in that of the chunk in world units.
     similar = np.column_stack([scale * world[:, :3], world[:, 3]])
-    points_beside(path.parent, photos, found, (np.eye(4)[:3], similar))
+    points_beside(path.parent, photos, found, (np.eye(4)[:3], similar, world))
     return found
 
 
