@@ -64,7 +64,7 @@ def points(folder: Path, xyz=POINTS, name="points.ply") -> None:
     write_points(folder / name, xyz, COLORS)
 
 
-def metashape(folder: Path, kind="frame", k=(0.03, -0.02, 0.01, 0.0), b1=0.7, world=True):
+def metashape(folder: Path, kind="frame", k=(0.03, -0.02, 0.01, 0.0), b1=0.7, b2=0.0, world=True):
     """cameras.xml, with a chunk of another scale and rotation than the world, and a photo that is
     not aligned."""
     f, cx, cy, p1, p2 = 55.0, 1.5, -0.8, 0.002, -0.003
@@ -91,7 +91,9 @@ def metashape(folder: Path, kind="frame", k=(0.03, -0.02, 0.01, 0.0), b1=0.7, wo
         radial = 1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6 + k[3] * r**8
         u = x * radial + p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y
         v = y * radial + p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y
-        expected[name] = np.column_stack([WIDTH / 2 + cx + u * f + u * b1, HEIGHT / 2 + cy + v * f])
+        expected[name] = np.column_stack(
+            [WIDTH / 2 + cx + u * f + u * b1 + v * b2, HEIGHT / 2 + cy + v * f]
+        )
     lines.append('<camera id="9" sensor_id="0" label="not_aligned"/>')
     similar = " ".join(map(str, turn.ravel())), " ".join(map(str, shift)), scale
     transform = "<transform><rotation>{}</rotation><translation>{}</translation><scale>{}</scale>"
@@ -102,7 +104,7 @@ def metashape(folder: Path, kind="frame", k=(0.03, -0.02, 0.01, 0.0), b1=0.7, wo
         f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
         f'<calibration type="{kind}" class="initial"><f>1</f></calibration>'
         f'<calibration type="{kind}" class="adjusted"><resolution width="{WIDTH}" '
-        f'height="{HEIGHT}"/><f>{f}</f><cx>{cx}</cx><cy>{cy}</cy><b1>{b1}</b1>{coefficients}'
+        f'height="{HEIGHT}"/><f>{f}</f><cx>{cx}</cx><cy>{cy}</cy><b1>{b1}</b1><b2>{b2}</b2>{coefficients}'
         f"<p1>{p1}</p1><p2>{p2}</p2></calibration></sensor></sensors>"
         + (
             f"<components><component id='0'>{transform.format(*similar)}</transform></component>"

@@ -34,11 +34,11 @@ from snowsplat.util.safe_json import quoted
 
 logger = logging.getLogger(__name__)
 
-_KINDS = {"frame": perspective, "fisheye": fisheye, "equidistant_fisheye": fisheye}
+_KINDS = ("frame", "fisheye", "equidistant_fisheye")
+# Pixels: the skew of a fisheye lens, which no lens model has, is reported above this error.
+_SKEW_ERROR = 0.5
 # A world whose origin is further away, in extents of the cameras, is the Earth.
 _FAR = 1000.0
-# Pixels: the skew of a sensor (b₂), which no lens model has, is reported above this error.
-_SKEW_ERROR = 0.5
 
 
 def find(folder: Path) -> Iterator[Path]:
@@ -117,7 +117,6 @@ def _read_chunk(
             "%s: has %d components, which are not aligned with each other; using the largest",
             *(path, len(groups)),
         )
-    _warn_of_skew(path, [sensors[key] for key in lenses])
     given = worlds.get(component)
     scale, world = _world(given if given is not None else whole, groups[component])
     for photo, lens, pose in groups[component]:
@@ -176,22 +175,6 @@ def _calibration(sensor: Element) -> Element | None:
     return next(iter(adjusted or calibrations), None)
 
 
-def _warn_of_skew(path: Path, sensors: list[Element]) -> None:
-    errors = []
-    for sensor in sensors:
-        calibration, size = _calibration(sensor), sensor.find("resolution")
-        if calibration is not None and size is not None:
-            values = {key: calibration.findtext(key) or 0.0 for key in ("b2", "f")}
-            ratio = number(path, values, "b2") / (number(path, values, "f") or 1.0)
-            errors.append(abs(ratio) * _size(str(path), size)[1] / 2)
-    if max(errors, default=0.0) > _SKEW_ERROR:
-        logger.warning(
-            "%s: %d of %d calibrations have a skew (b2), which is not supported: an error of up to "
-            "%.1f pixels at the borders; optimise the alignment without b2 if that matters",
-            *(path, sum(error > _SKEW_ERROR for error in errors), len(errors), max(errors)),
-        )
-
-
 def _lens(where: str, sensor: Element) -> LensModel:
     kind = sensor.get("type", "frame")
     size = sensor.find("resolution")
@@ -217,8 +200,17 @@ def _lens(where: str, sensor: Element) -> LensModel:
     focal, cx, cy = number(where, values, "f"), value("cx"), value("cy")
     intrinsics = (focal + value("b1"), focal, width / 2 + cx, height / 2 + cy)
     radial = [value(name) for name in ("k1", "k2", "k3", "k4")]
-    # Metashape: x += p₁ (r² + 2 x²) + 2 p₂ x y.
-    return _KINDS[kind](where, width, height, intrinsics, radial, (value("p2"), value("p1")))
+    tangential = value("p2"), value("p1")  # x += p₁ (r² + 2 x²) + 2 p₂ x y
+    skew = value("b2")
+    if kind == "frame":
+        return perspective(where, width, height, intrinsics, radial, tangential, skew)
+    if abs(skew) * height > 2 * _SKEW_ERROR * focal:
+        logger.warning(
+            "%s: the skew (b2) of a fisheye lens is not supported: an error of up to %.1f pixels "
+            "at the borders; optimise the alignment without b2 if that matters",
+            *(where, abs(skew) * height / (2 * focal)),
+        )
+    return fisheye(where, width, height, intrinsics, radial, tangential)
 
 
 def _size(where: str, resolution: Element) -> tuple[int, int]:
