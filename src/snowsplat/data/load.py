@@ -342,7 +342,7 @@ def _views(
             mask = ImageSource(image.mask, width, height, sideways)
         source = ImageSource(image.path, width, height, sideways, header.width * header.height)
         camera = image.camera.scaled(width, height)
-        yield View(image.name, camera, source, mask, image.depth, image.depth_unit)
+        yield View(image.name, camera, source, mask, *_depth_of(image))
         return
     try:
         views = lens_views(image.lens, circles.get(image.lens))
@@ -354,6 +354,10 @@ def _views(
         ) from None
     for view in views:
         yield _lens_view(image, view, header, size, resolution)
+
+
+def _depth_of(image: PosedImage) -> tuple[Path | None, float, Path | None]:
+    return image.depth, image.depth_unit, image.depth_confidence
 
 
 def _lens_view(
@@ -380,7 +384,7 @@ def _lens_view(
     elif view.partial:
         mask = dataclasses.replace(source, blank=True)
     name = f"{image.name}/{view.name}" if view.name else image.name
-    return View(name, camera, source, mask, image.depth, image.depth_unit)
+    return View(name, camera, source, mask, *_depth_of(image))
 
 
 def _final_size(

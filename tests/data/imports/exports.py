@@ -179,11 +179,12 @@ def bundler(folder: Path):
 
 
 def polycam(folder: Path, corrected=True):
-    """Keyframes with depth maps in millimetres."""
+    """Keyframes with depth maps in millimetres, and maps of confidence."""
     keyframes = folder / "keyframes"
     prefix = "corrected_" if corrected else ""
     (keyframes / f"{prefix}cameras").mkdir(parents=True)
     (keyframes / "depth").mkdir()
+    (keyframes / "confidence").mkdir()
     fx, fy, cx, cy = 50.0, 51.0, 31.0, 25.0
     expected = {}
     for name, (rotation, translation) in rig().items():
@@ -196,6 +197,8 @@ def polycam(folder: Path, corrected=True):
         expected[name] = np.column_stack([fx * x / z + cx, fy * y / z + cy])
         depth = np.full((HEIGHT // 4, WIDTH // 4), 3000, np.uint16)
         Image.fromarray(depth).save(keyframes / "depth" / f"{stem}.png")
+        confidence = Image.new("L", (WIDTH // 4, HEIGHT // 4), 127)
+        confidence.save(keyframes / "confidence" / f"{stem}.png")
     photos(keyframes / f"{prefix}images")
     return expected
 

@@ -144,5 +144,6 @@ def _posed(root: Path, shot: Shot) -> PosedImage:
         (root / shot.photo).relative_to(folder).as_posix(),
         depth=shot.depth,
         depth_unit=shot.depth_unit,
+        depth_confidence=shot.depth_confidence,
         lens=None if is_pinhole(lens) else lens,
     )

@@ -2,7 +2,8 @@
 
 ``keyframes/`` has one JSON file for each photo. ``corrected_cameras`` and ``corrected_images`` are
 the result of Polycam's own adjustment; without them, the poses are those of ARKit. A camera has y
-up and looks along −z; units are metres. Depth maps have millimetres.
+up and looks along −z; units are metres. Depth maps have millimetres;
+maps of their confidence are 0 where it is low.
 """
 
 from __future__ import annotations
@@ -64,7 +65,10 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         ]
         pose = from_opengl(file, np.reshape(entries, (3, 4)))
         depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
-        found.shots.append(Shot(photo, lens, pose, depth, _MILLIMETRE))
+        confidence = keyframes / "confidence" / f"{file.stem}.png"
+        found.shots.append(
+            Shot(photo, lens, pose, depth, _MILLIMETRE, confidence if is_file(confidence) else None)
+        )
     return found
 
 

@@ -20,6 +20,7 @@ class Shot:
     cam_from_world: np.ndarray  # (3, 4) float64, OpenCV axes
     depth: Path | None = None
     depth_unit: float = 1.0  # as `PosedImage.depth_unit`
+    depth_confidence: Path | None = None  # as `PosedImage.depth_confidence`
 
 
 @dataclass(eq=False)

@@ -75,6 +75,12 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     if view.depth is None:
         return None
     values = view.depth_unit * read_depth_file(view.depth)
+    if view.depth_confidence is not None:
+        confidence = read_depth_file(view.depth_confidence)
+        if confidence.shape == values.shape:
+            values[confidence == 0] = np.nan
+        if not (values > 0).any():  # too dark, or too far away for the sensor
+            return None
     height, width = values.shape
     camera, part = view.camera, view.image.view
     photo = camera if part is None else part.lens
