@@ -28,6 +28,7 @@ from pillow_heif import register_heif_opener
 from snowsplat.data import load_dataset
 from snowsplat.data.decode import ImageSource, load_image, load_mask
 from snowsplat.data.decode import read_header as read_image_header
+from snowsplat.data.imports import find_export, read_export
 from snowsplat.data.points_ply import read_points, write_points
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
@@ -51,6 +52,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 
+from ..data.imports import exports
 from ..formats.test_ksplat import ksplat, section
 from ..sfm.pictures import exif, pan, photo, write_video
 
@@ -111,6 +113,19 @@ class Reader:
 @functools.cache
 def _root() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="snowsplat-fuzz-")
+
+
+# Exports of other programs
+
+
+def _export(file: str, make: Callable[[Path], object], json: bool = False) -> Reader:
+    def read(folder: Path) -> object:
+        found = find_export(folder)
+        if found is None or found.cameras is None:
+            raise UserError("no cameras of another program")
+        return read_export(folder, found, "images")
+
+    return Reader(f"export {file}", file, make, read, json)
 
 
 # Scenes
@@ -501,6 +516,16 @@ READERS: tuple[Reader, ...] = (
     *(_dataset("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),
     *(_dataset("colmap-txt", f"sparse/0/{part}.txt") for part in ("cameras", "images", "points3D")),
     _dataset("blender", "transforms_train.json", json=True),
+    _export("cameras.xml", exports.metashape),
+    _export("cameras.csv", exports.realityscan),
+    _export("bundle.out", exports.bundler),
+    _export("list.txt", exports.bundler),
+    _export("keyframes/corrected_cameras/a.json", exports.polycam, json=True),
+    _export("metadata.json", exports.record3d, json=True),
+    _export("sfm_data.json", exports.openmvg, json=True),
+    _export("reconstruction.json", exports.opensfm, json=True),
+    _export("cameras.sfm", exports.alicevision, json=True),
+    _export("poses_bounds.npy", exports.llff),
     Reader(
         "list of test images",
         "test.txt",

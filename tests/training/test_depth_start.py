@@ -114,6 +114,27 @@ def test_without_points_the_maps_are_z_in_world_units(tmp_path: Path) -> None:
     assert float(error.max()) < 0.03
 
 
+def test_without_points_maps_may_have_a_unit(tmp_path: Path) -> None:
+    data = dataset(tmp_path)
+    views = [replace(view, depth_unit=1e-3) for view in data.train]
+    error = (found(replace(data, train=views, points=None)).xyz.norm(dim=1) - 1.0).abs()
+    assert float(error.max()) < 0.03
+
+
+def test_depths_of_no_confidence_are_not_used(tmp_path: Path) -> None:
+    data = dataset(tmp_path)
+    confidence = np.full((SIZE, SIZE), 255, np.uint8)
+    confidence[: SIZE // 2] = 0
+    Image.fromarray(confidence).save(tmp_path / "confidence.png")
+    file = tmp_path / "confidence.png"
+    points = found(replace(data, train=[replace(v, depth_confidence=file) for v in data.train]))
+    camera = cameras()[2]
+    all_rows, rows = (camera.project(p.xyz)[0][:, 1] for p in (found(data), points))
+    assert int((all_rows < SIZE / 2 - 8).sum()) > 50
+    assert int((rows < SIZE / 2 - 8).sum()) == 0
+    assert len(points) > 100
+
+
 def test_the_first_gaussians_are_at_the_points(tmp_path: Path) -> None:
     data = dataset(tmp_path)
     config = replace(TrainConfig(), init="depth", initial_points=COUNT)

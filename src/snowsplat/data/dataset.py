@@ -71,6 +71,8 @@ class View:
     image: ImageSource
     mask: ImageSource | None = None  # black pixels of the mask are ignored in the image
     depth: Path | None = None  # a depth map of the image, of any size; see `read_depth_file`
+    depth_unit: float = 1.0  # world units per unit of the depth map, if the dataset has no points
+    depth_confidence: Path | None = None  # a map of the same size; 0: the depth is not used
 
 
 @dataclass
@@ -130,6 +132,8 @@ class PosedImage:
     split: Literal["train", "test"] | None = None  # from the dataset's own files
     divided: int = 1  # 2, 4 or 8 if ``folder`` is images_2, images_4 or images_8
     depth: Path | None = None  # as `View.depth`
+    depth_unit: float = 1.0  # as `View.depth_unit`
+    depth_confidence: Path | None = None  # as `View.depth_confidence`
     lens: LensModel | None = None  # of a distorted photo; ``camera`` then has its pose and size
 
     @property

@@ -14,6 +14,8 @@ from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.imports import find_export, read_export
+from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
@@ -54,8 +56,9 @@ def load_dataset(
 
     Args:
         path: a folder with a COLMAP model (``sparse/0`` …, binary or text) and images; a folder
-            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file. The folder
-            may contain depth maps of the images, ``depths/IMG.png`` (or TIFF, NPY, EXR).
+            with ``transforms.json`` or ``transforms_train.json``; or such a JSON file; or the
+            export of another program, see `snowsplat.data.imports`. The folder may contain depth
+            maps of the images, ``depths/IMG.png`` (or TIFF, NPY, EXR).
         images: name of the folder of images.
         resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
             they are complete. Any other number is a width in pixels to which wider images are
@@ -183,13 +186,17 @@ def read_files(
 def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str]:
     if not root.exists():
         raise UserError(f"{root}: no such folder")
-    transforms = find_transforms(root)
+    export = find_export(root) if root.is_file() else None
+    transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse") or ([] if transforms else find_models(root))
     models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
     if models:
         return read_colmap(root, models, images)
     if transforms:
         return read_transforms(transforms, images)
+    export = export or find_export(root)
+    if export and export.cameras and not models:
+        return read_export(root, export, images)
     if root.suffix.lower() == ".zip" and root.is_file():
         raise UserError(
             f"{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
@@ -197,6 +204,8 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         )
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
+    if (known := advice(root)) is not None:
+        raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
     raise NoPosesError(
         f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
         "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"
@@ -353,7 +362,8 @@ def _views(
         if image.mask is not None:
             mask = ImageSource(image.mask, width, height, sideways)
         source = ImageSource(image.path, width, height, sideways, header.width * header.height)
-        yield View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
+        camera = image.camera.scaled(width, height)
+        yield View(image.name, camera, source, mask, *_depth_of(image))
         return
     try:
         views = lens_views(image.lens, circles.get(image.lens))
@@ -365,6 +375,10 @@ def _views(
         ) from None
     for view in views:
         yield _lens_view(image, view, header, size, resolution)
+
+
+def _depth_of(image: PosedImage) -> tuple[Path | None, float, Path | None]:
+    return image.depth, image.depth_unit, image.depth_confidence
 
 
 def _lens_view(
@@ -391,7 +405,7 @@ def _lens_view(
     elif view.partial:
         mask = replace(source, blank=True)
     name = f"{image.name}/{view.name}" if view.name else image.name
-    return View(name, camera, source, mask, image.depth)
+    return View(name, camera, source, mask, *_depth_of(image))
 
 
 def _final_size(

@@ -1,10 +1,12 @@
 """transforms.json and similar files -> posed images and points.
 
-Three variants of the format are supported:
+Four variants of the format are supported:
 
 - Synthetic Blender scenes: ``transforms_train.json``, ``transforms_test.json`` and
   ``transforms_val.json`` with ``camera_angle_x``; image names have no suffix.
 - instant-ngp: ``transforms.json`` with intrinsics in pixels (``fl_x``, ``cx``, ``w`` …).
+- NeRFCapture, and others for instant-ngp with depth: ``depth_path`` and ``integer_depth_scale``,
+  the world units per integer of the depth maps.
 - nerfstudio: as instant-ngp, but each frame may have its own intrinsics, and there may be
   ``ply_file_path``, ``mask_path``, ``depth_file_path`` and ``train_filenames``. Specification:
   https://docs.nerf.studio/quickstart/data_conventions.html
@@ -136,6 +138,7 @@ def _posed_image(
         _mask(where, root, values.maps[0]),  # masks belong to frames, not to files
         split,
         depth=_depth_map(root, values.maps[0]),
+        depth_unit=_number(where, values, "integer_depth_scale") or 1.0,
         lens=None if is_pinhole(lens) else lens,
     )
 
@@ -201,7 +204,7 @@ def _mask(where: str, root: Path, frame: Mapping[str, Any]) -> Path | None:
 
 def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
     """The depth map of a frame; None if it is missing, because most recipes do not need it."""
-    name = frame.get("depth_file_path")
+    name = frame.get("depth_file_path", frame.get("depth_path"))
     path = inside(root, name.replace("\\", "/")) if isinstance(name, str) and name else None
     return path if path is not None and is_file(path) else None
 

@@ -62,7 +62,7 @@ def describe(path: Path | str) -> dict[str, Any]:
         try:
             format = format_for_reading(path)
         except UserError as error:
-            if path.suffix != ".json":  # it may be a dataset
+            if path.suffix != ".json" and not _is_export(path):  # it may be a dataset
                 unknown = UserError(f"{error}, checkpoints, datasets, photos and videos")
                 return _photos(path, unknown)
         else:
@@ -181,6 +181,12 @@ def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
     return describe_photos(sources)
 
 
+def _is_export(path: Path) -> bool:
+    from snowsplat.data.imports import find_export  # torch
+
+    return find_export(path) is not None
+
+
 def _dataset(path: Path) -> dict[str, Any]:
     from snowsplat.data import load_dataset  # torch; the other kinds do not need it
     from snowsplat.data.judge.verdict import judge
@@ -203,6 +209,7 @@ def _dataset(path: Path) -> dict[str, Any]:
         "sizes": dict(sizes),
         "focal_length_pixels": _rounded([focal[0], focal[-1]]),
         "masks": sum(view.mask is not None for view in views),
+        "depth_maps": sum(view.depth is not None for view in views),
         "points": 0 if dataset.points is None else len(dataset.points),
         "extent": float(f"{dataset.extent:.5g}"),
         "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],

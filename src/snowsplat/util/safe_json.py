@@ -27,8 +27,11 @@ _MAX_DEPTH = 100
 _MAX_INTEGER = 1 << 64
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, ratio: int = _RATIO) -> Any:
     """The value in a JSON file.
+
+    Args:
+        ratio: see `parse_json`.
 
     Raises:
         OSError: the file is missing or cannot be read.
@@ -36,20 +39,23 @@ def read_json(path: Path) -> Any:
     """
     if path.exists() and not path.is_file():  # reading a pipe may never end
         raise ValueError("not a file")
-    return parse_json(path.read_bytes())
+    return parse_json(path.read_bytes(), ratio)
 
 
-def parse_json(data: bytes) -> Any:
+def parse_json(data: bytes, ratio: int = _RATIO) -> Any:
     """The value of a JSON text in UTF-8, with or without a byte order mark.
 
     Some texts, such as ``[[],[],[]``, need twenty times their size in memory. A text that would
     need too much is rejected before it is parsed.
 
+    Args:
+        ratio: memory that is allowed per byte of the text, in addition to a fixed amount.
+
     Raises:
         ValueError: not JSON, nested too deeply, or too many values. No other error is raised.
     """
     needed = sum(data.count(sign) * size for sign, size in _BYTES_OF.items())
-    if needed > _ALWAYS_ALLOWED + _RATIO * len(data):
+    if needed > _ALWAYS_ALLOWED + ratio * len(data):
         raise ValueError("too many values")
     try:
         value = json.loads(data.decode("utf-8-sig"))

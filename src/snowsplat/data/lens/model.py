@@ -12,7 +12,7 @@ class LensModel:
     https://colmap.github.io/cameras.html lists the models and the order of their parameters.
     """
 
-    model: str  # the name of a camera model of COLMAP, e.g. "OPENCV_FISHEYE"
+    model: str  # the name of a camera model of COLMAP, e.g. "OPENCV_FISHEYE"; or `project.BROWN`
     width: int  # pixels, of the photos that ``params`` are for
     height: int
     params: tuple[float, ...]  # focal lengths and principal point in pixels, then coefficients

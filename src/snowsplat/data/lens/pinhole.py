@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import intrinsics, project, unproject
+from snowsplat.data.lens.project import BROWN, intrinsics, project, unproject
 
 _MAP_ERROR = 0.02  # pixels: largest error of the bilinear interpolation between nodes
 _CELLS = (64, 32, 16, 8, 4)  # pixels: approximate cell sizes, tried in this order
@@ -29,6 +29,7 @@ _PINHOLES = frozenset(
         "RADIAL",
         "OPENCV",
         "FULL_OPENCV",
+        BROWN,
         "SIMPLE_DIVISION",
         "DIVISION",
     }

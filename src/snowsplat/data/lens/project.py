@@ -24,6 +24,9 @@ _ONE_FOCAL_LENGTH = frozenset(
         "SIMPLE_FISHEYE",
     }
 )
+#: The model of Metashape and RealityScan, which COLMAP does not have: fx, fy, cx, cy, k1, k2, k3,
+#: k4 (of r⁸), p1, p2 as in OPENCV, and the skew divided by fx.
+BROWN = "BROWN"
 _TINY = 1e-12
 _NEWTON_STEPS = 30
 
@@ -132,6 +135,12 @@ def _perspective(
     depth = np.where(z > 0, z, np.nan)
     u, v = x / depth, y / depth
     r2 = u * u + v * v
+    if model == BROWN:
+        k1, k2, k3, k4, p1, p2, skew = k
+        factor = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        du, dv = _tangential(u, v, r2, p1, p2)
+        u, v = u * factor + du, v * factor + dv
+        return u + skew * v, v
     if model == "FOV":
         if abs(omega := k[0]) < 1e-6:
             return u, v

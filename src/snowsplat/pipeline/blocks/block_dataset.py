@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Iterable
@@ -12,8 +13,14 @@ import numpy as np
 
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.data.dataset import Points, PosedImage
+from snowsplat.data.lens.brown import as_colmap
 from snowsplat.data.lens.model import LensModel
 from snowsplat.scene.geometry import quat_from_rotation
+
+logger = logging.getLogger(__name__)
+
+# Pixels: a larger difference between a lens and its model in the files is reported.
+_LENS_ERROR = 0.1
 
 
 def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Points | None) -> None:
@@ -35,6 +42,7 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
     shutil.rmtree(folder, ignore_errors=True)
     cameras: dict[ColmapCamera, int] = {}
     images = []
+    worst = 0.0
     for image in posed:
         name = _file_name(image)
         if image.divided > 1:
@@ -44,6 +52,8 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         if lens is None:
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
             lens = LensModel("PINHOLE", camera.width, camera.height, intrinsics)
+        lens, error = as_colmap(lens)
+        worst = max(worst, error)
         colmap = ColmapCamera(lens.model, lens.width, lens.height, lens.params)
         number = cameras.setdefault(colmap, len(cameras) + 1)
         pose = camera.cam_from_world.double()
@@ -52,8 +62,15 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         _link(image.path, folder / "images" / name)
         if image.mask is not None:
             _link(image.mask, folder / "masks" / f"{name}.png")
-        if image.depth is not None:
+        # A COLMAP dataset cannot state a unit; without points, the maps would be misunderstood.
+        if image.depth is not None and (image.depth_unit == 1.0 or points is not None):
             _link(image.depth, folder / "depths" / f"{name}{image.depth.suffix}")
+    if worst > _LENS_ERROR:
+        logger.warning(
+            "%s: the lens distortion has terms that COLMAP's models do not have: an error of up to "
+            "%.1f pixels; train without blocks if that matters",
+            *(folder, worst),
+        )
     nothing = np.zeros((0, 3))
     write_model(
         folder / "sparse" / "0",

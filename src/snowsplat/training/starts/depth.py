@@ -40,7 +40,8 @@ def depth_points(
     The maps may have any unit. Each of them is aligned to the points of the dataset that its photo
     shows: as z and as distance up to a factor, and as disparity up to a factor and a shift (Ranftl
     et al. 2022). The kind with the smallest error is used. If the dataset has no points, the values
-    must be z in world units. Pixels are used whose depth the map of another view confirms.
+    must be z in units of ``View.depth_unit``. Pixels are used whose depth the map of another view
+    confirms.
 
     Args:
         generator: a random generator on the CPU.
@@ -73,7 +74,13 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     """The map of a view in world units; None without a map, or if it contradicts the points."""
     if view.depth is None:
         return None
-    values = read_depth_file(view.depth)
+    values = view.depth_unit * read_depth_file(view.depth)
+    if view.depth_confidence is not None:
+        confidence = read_depth_file(view.depth_confidence)
+        if confidence.shape == values.shape:
+            values[confidence == 0] = np.nan
+        if not (values > 0).any():  # too dark, or too far away for the sensor
+            return None
     height, width = values.shape
     camera, part = view.camera, view.image.view
     photo = camera if part is None else part.lens
