@@ -14,6 +14,7 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
+from snowsplat.data.files.mask_pixels import mask_levels
 from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
@@ -154,15 +155,18 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
 
 
 def load_mask(source: ImageSource) -> Tensor:
-    """Decode a mask to (H, W) bool: True where its largest channel is 128 or more.
-
-    Transparent pixels count as black.
+    """Decode a mask to (H, W) bool: True where its level is 128 or more, see `mask_levels`.
 
     Raises:
         UserError: see `load_image`.
     """
-    planes = load_image(source, background=(0.0, 0.0, 0.0))
-    return planes.amax(0) >= 128
+    try:
+        with open_image(source.path, _FORMATS) as opened:
+            image = ImageOps.exif_transpose(opened) if source.apply_orientation else opened
+            levels = mask_levels(image)
+    except Exception as error:  # as above
+        raise _unreadable(source.path, error) from None
+    return torch.from_numpy(resize_area(levels[None], source.width, source.height)[0] >= 128)
 
 
 def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:

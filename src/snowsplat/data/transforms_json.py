@@ -18,7 +18,8 @@ from __future__ import annotations
 import logging
 import math
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +29,7 @@ import torch
 from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
+from snowsplat.data.files.photos import find_photos
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
@@ -74,9 +76,49 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
         UserError: a file is damaged or of another kind, a camera is distorted, or no image is
             there.
     """
+    root = files[0].parent
+    shown = " + ".join(path.name for path in files)
+    frames, first_scene = _frames(files)
+    found = _files_of(root / shown, root, [frame.name for frame in frames], images)
+    split = _without_overlap(root, files, frames, found)
     posed: dict[str, PosedImage] = {}
-    missing: list[str] = []
-    frame_count = 0
+    for frame in frames:
+        file = found.get(frame.name)
+        if file is None or (file in posed and split[file] != frame.split):
+            continue
+        if file in posed:
+            raise UserError(
+                f"{frame.where}: the image {file} also belongs to another frame; remove one of them"
+            )
+        image = _posed_image(frame.where, root, file, frame.values, split[file])
+        posed[file] = image
+    missing = [frame.name for frame in frames if frame.name not in found]
+    if not posed:
+        problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"
+        hint = f" (the first is {quoted(missing[0])})" if missing else ""
+        raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
+    if missing:
+        logger.warning(
+            "%s: %d of %d images are missing (the first is %s); skipped",
+            root / shown,
+            len(missing),
+            len(frames),
+            quoted(missing[0]),
+        )
+    return list(posed.values()), _points(root, first_scene), shown
+
+
+@dataclass(frozen=True)
+class _Frame:
+    where: str  # the start of error messages
+    name: str  # its file_path
+    values: ChainMap[str, Any]  # the entries of the frame, then those of the file
+    split: _Split | None
+
+
+def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
+    """The frames of all files, and the first file."""
+    frames: list[_Frame] = []
     first_scene: _Json = {}
     for index, path in enumerate(files):
         scene = _read_json(path)
@@ -90,34 +132,37 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
             where = f"{path}: frame {number}"
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise UserError(f"{where}: no file_path; export the file again")
-            frame_count += 1
-            file = _find_file(where, path.parent, frame["file_path"], images)
-            if file is None:
-                missing.append(frame["file_path"][:80])
-                continue
-            image_split = split or splits.get(safe_name(frame["file_path"]))
-            image = _posed_image(where, path.parent, file, ChainMap(frame, scene), image_split)
-            if image.name in posed:
-                raise UserError(
-                    f"{where}: the image {file} also belongs to another frame; remove one of them"
-                )
-            posed[image.name] = image
-    shown = " + ".join(path.name for path in files)
-    if not posed:
-        problem = (
-            f"all of its {frame_count} images are missing" if frame_count else "it has no frames"
-        )
-        hint = f" (the first is {missing[0]!r})" if missing else ""
-        raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
-    if missing:
-        logger.warning(
-            "%s: %d of %d images are missing (the first is %r); skipped",
-            files[0].parent / shown,
-            len(missing),
-            frame_count,
-            missing[0],
-        )
-    return list(posed.values()), _points(files[0].parent, first_scene), shown
+            name = frame["file_path"]
+            named = split or splits.get(safe_name(name))
+            frames.append(_Frame(where, name, ChainMap(frame, scene), named))
+    return frames, first_scene
+
+
+def _without_overlap(
+    root: Path, files: list[Path], frames: list[_Frame], found: Mapping[str, str]
+) -> dict[str, _Split | None]:
+    """The split of each image file. Logs a line if images are in both splits.
+
+    Such images are held out. But if all images for training are held out, the second file says
+    nothing about a split, for example as a copy of the first one.
+    """
+    splits: dict[str, set[_Split | None]] = {}
+    for frame in frames:
+        if frame.name in found:
+            splits.setdefault(found[frame.name], set()).add(frame.split)
+    both = {file for file, named in splits.items() if len(named) > 1}
+    single = {file: next(iter(named)) for file, named in splits.items() if file not in both}
+    if not both:
+        return single
+    shown = " and ".join(path.name for path in files)
+    if "train" in single.values():
+        logger.warning("%s: %d images are in both %s; they are held out", root, len(both), shown)
+        return single | dict.fromkeys(both, "test")
+    if "test" in single.values():
+        logger.warning("%s: %d images are in both %s; trained on", root, len(both), shown)
+        return single | dict.fromkeys(both, "train")
+    logger.warning("%s: the same images are in %s, so this is no split", root, shown)
+    return dict.fromkeys(both)
 
 
 def _posed_image(
@@ -184,10 +229,20 @@ def _path_inside(where: str, root: Path, name: str) -> Path:
     return path
 
 
-def _find_file(where: str, root: Path, name: str, images: str) -> str | None:
-    """The path of a frame's image relative to ``root``; None if it is missing."""
+def _files_of(where: Path, root: Path, names: Sequence[str], images: str) -> dict[str, str]:
+    """The files that the names of images mean, relative to ``root``; see `find_photos`."""
+    names = list(dict.fromkeys(names))
+    found = {name: file for name in names if (file := _find_file(root, name, images))}
+    if left := [name for name in names if name not in found]:
+        found |= find_photos(where, root, left, set(found.values()))
+    return found
+
+
+def _find_file(root: Path, name: str, images: str) -> str | None:
+    """The path of a frame's image relative to ``root``, if it is where its name says."""
     name = name.replace("\\", "/").removeprefix("./")
-    _path_inside(where, root, name)  # after removeprefix: ".//x" has become the absolute path "/x"
+    if inside(root, name) is None:
+        return None
     if images != "images" and name.startswith("images/"):
         name = f"{images}/{name.removeprefix('images/')}"
     for suffix in ("", *IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
