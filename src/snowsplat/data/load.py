@@ -169,7 +169,7 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
     if not models or (models == [root] and not photos_below(root)):
-        above = next((p for p in root.absolute().parents[:2] if _has_poses(p)), None)
+        above = next((p for p in root.absolute().parents[:2] if poses_in(p)), None)
         if above is not None:
             raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
     if models:
@@ -180,8 +180,11 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     )
 
 
-def _has_poses(folder: Path) -> bool:
-    return bool(find_models(folder / "sparse") or find_transforms(folder))
+def poses_in(root: Path) -> str | None:
+    """What gives the poses of the photos in a folder: "sparse/0" or "transforms.json"; or None."""
+    models = find_models(root / "sparse")
+    files = models[:1] or find_transforms(root)
+    return files[0].relative_to(root).as_posix() if files and root.is_dir() else None
 
 
 def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:

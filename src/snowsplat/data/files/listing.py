@@ -19,7 +19,7 @@ _MAPS = {
     *("confidence", "confidences", "confidence_maps", "normal", "normals", "normal_maps"),
 }
 _THUMBNAILS = {"thumb", "thumbs", "thumbnail", "thumbnails", "@eadir", "__macosx"}
-_DIVIDED = re.compile(r"(.+)_[248]")
+_DIVIDED = re.compile(r"(?P<original>.+)_[248]")
 #: Names of folders that say that there are photos inside, and not which ones.
 PHOTO_FOLDERS = frozenset(
     {
@@ -28,7 +28,7 @@ PHOTO_FOLDERS = frozenset(
     }
 )
 # Names of folders that say that they hold changed copies of the photos in another one.
-_CHANGED = re.compile(r"(corrected|undistorted|resized|downscaled)[_-](.+)")
+_CHANGED = re.compile(r"(corrected|undistorted|resized|downscaled)[_-](?P<original>.+)")
 # More files than this are not listed, to bound memory and time: it may be a whole disk.
 _MOST_FILES = 500_000
 
@@ -39,7 +39,7 @@ def folder_kind(name: str) -> FolderKind:
     """What the name of a folder says about the images inside; "photos" if it says nothing."""
     name = name.casefold().replace("-", "_").replace(" ", "_").lstrip("._")
     divided = _DIVIDED.fullmatch(name)
-    names = {name, divided[1]} if divided else {name}
+    names = {name, divided["original"]} if divided else {name}
     if names & _MASKS:
         return "masks"
     if names & _MAPS:
@@ -47,17 +47,16 @@ def folder_kind(name: str) -> FolderKind:
     return "thumbnails" if names & _THUMBNAILS else "photos"
 
 
-def original_of(name: str, siblings: Iterable[str]) -> str | None:
-    """The folder beside ``name`` whose photos it holds at another size or undistorted, or None.
+def original_of(name: str, siblings: Iterable[str], *, divided: bool = True) -> str | None:
+    """The folder beside ``name`` whose photos it holds undistorted or at another size, or None.
 
-    ``images_2``, ``images_4`` and ``images_8`` hold smaller copies of those in ``images``, and
-    ``corrected_images`` undistorted ones.
+    ``corrected_images`` holds undistorted photos of ``images``; if ``divided``, then ``images_2``,
+    ``images_4`` and ``images_8`` hold smaller ones.
     """
-    folded = {sibling.casefold(): sibling for sibling in siblings}
-    for match, group in ((_DIVIDED.fullmatch(name), 1), (_CHANGED.fullmatch(name.casefold()), 2)):
-        if match is not None and (original := folded.get(match[group].casefold())) is not None:
-            return original
-    return None
+    name = name.casefold()
+    match = _CHANGED.fullmatch(name) or (_DIVIDED.fullmatch(name) if divided else None)
+    among = {sibling.casefold(): sibling for sibling in siblings}
+    return None if match is None else among.get(match["original"])
 
 
 def files_below(root: Path, enter: Callable[[Path, list[str]], Iterable[str]]) -> list[str]:

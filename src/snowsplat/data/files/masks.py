@@ -71,7 +71,8 @@ def find_masks(root: Path, photos: Sequence[str]) -> FoundMasks:
         inside = {p: p[len(folder) :].lstrip("/") for p in left if _is_below(p, folder)}
         for masks in _mask_folders(root / folder):
             listed |= _find_in(masks, inside, found)
-    if folder_kind(root.name) == "photos" and root.name.casefold() in PHOTO_FOLDERS:
+    # In ``input``, a dataset keeps its original photos; masks beside it are those of other images.
+    if root.name.casefold() in PHOTO_FOLDERS - {"input"}:
         for masks in _mask_folders(root.parent):
             listed |= _find_in(masks, {photo: f"{root.name}/{photo}" for photo in left}, found)
     found.unused += sorted(listed - set(found.of.values()))
@@ -90,7 +91,7 @@ def _find_beside(root: Path, names: Sequence[str], found: FoundMasks) -> None:
         meant = [p for base in marked for p in by_base.get(base, []) if p != name]
         # IMG.png beside IMG.jpg may be the same photo.
         alike = [p for p in by_base.get(stem, []) if p != name and look(name) and not look(p)]
-        if (alike or marked) and look(name):
+        if alike or (marked and look(name)):
             found.beside.add(name)
             found.of |= {photo: root / name for photo in [*meant, *alike] if photo not in found.of}
             if not meant and not alike:

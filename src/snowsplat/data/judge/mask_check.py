@@ -32,11 +32,11 @@ def mask_findings(views: Sequence[View], points: Points | None) -> list[Finding]
     if not used:
         return []
     if not any(mask.any() for _, mask in used):
-        text = f"the masks ignore every pixel of every photo ({len(used)} were looked at)"
-        return [Finding("masks", f"{text}; {INVERT}", impossible=len(masked) == len(views))]
+        nothing = f"the masks ignore every pixel of every photo ({len(used)} were looked at)"
+        return [Finding("masks", f"{nothing}; {INVERT}", impossible=len(masked) == len(views))]
     looks = [look_of(mask) for _, mask in used]
-    text = doubt_about_masks(looks, None if points is None else _points_kept(used, points))
-    return [] if text is None else [Finding("masks", text)]
+    doubt = doubt_about_masks(looks, None if points is None else _points_kept(used, points))
+    return [] if doubt is None else [Finding("masks", doubt)]
 
 
 def _small(camera: Camera, mask: ImageSource) -> tuple[Camera, np.ndarray | None]:
