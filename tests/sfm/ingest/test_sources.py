@@ -16,11 +16,11 @@ def names(*inputs):
 
 def test_a_folder_is_searched_recursively(tmp_path):
     root = write_photos(tmp_path / "p")
-    write_photos(root / "näher dran", 2, "PNG")
+    write_photos(root / "näher dran", 2, "PNG", start=5)
     write_photos(root / "masks", 2, "png")
     write_photos(root / ".thumbnails")
     photo().save(root / ".hidden.jpg")
-    photo().save(root / "Ünïcode name (1).JPG")
+    photo(200).save(root / "Ünïcode name (1).JPG")
     (root / "notes.txt").write_text("x")
     for name in ("sfm.json", "capture.json", "cfg_args"):
         write_photos(root / f"made with {name}" / "input")
@@ -30,7 +30,7 @@ def test_a_folder_is_searched_recursively(tmp_path):
 
 
 def test_symbolic_links_and_cycles(tmp_path):
-    root, other = write_photos(tmp_path / "p"), write_photos(tmp_path / "other")
+    root, other = write_photos(tmp_path / "p"), write_photos(tmp_path / "other", start=5)
     (root / "linked").symlink_to(other)
     (root / "circle").symlink_to(root)
     (other / "back").symlink_to(root)
@@ -39,7 +39,7 @@ def test_symbolic_links_and_cycles(tmp_path):
     found = find_sources([root])
     expected = ["0.jpg", "1.jpg", "2.jpg", "linked/0.jpg", "linked/1.jpg", "linked/2.jpg"]
     assert [s.name for s in found.files] == expected
-    assert found.left_out == [(str(root / "one more.jpg"), f"is the same file as {root / '0.jpg'}")]
+    assert found.left_out == [(str(root / "one more.jpg"), "is the same picture as 0.jpg")]
 
 
 def test_names_of_several_inputs_do_not_collide(tmp_path):
@@ -66,7 +66,7 @@ def test_videos_beside_photos_are_skipped_and_named(tmp_path):
 
 def test_masks_are_found_by_both_names_and_in_both_folders(tmp_path):
     root = write_photos(tmp_path / "p", 4)
-    write_photos(root / "sub", 2)
+    write_photos(root / "sub", 2, start=5)
     for mask in ("masks/0.jpg.png", "masks/1.PNG", "masks/2.tif", "masks/9.png"):
         (root / mask).parent.mkdir(exist_ok=True)
         photo().save(root / mask)

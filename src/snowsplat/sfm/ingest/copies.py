@@ -134,8 +134,16 @@ def _equal_files(root: Path, names: Sequence[str]) -> Iterator[tuple[str, str]]:
             digest = _digest(root / name)
             if digest not in first:
                 first[digest] = name
-            elif not looks_like_mask(root / name):
+            elif _is_readable(root / name) and not looks_like_mask(root / name):
                 yield first[digest], name
+
+
+def _is_readable(path: Path) -> bool:
+    try:
+        read_header(path)
+    except Unusable:
+        return False
+    return True
 
 
 def _digest(path: Path) -> bytes:

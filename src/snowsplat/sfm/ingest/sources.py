@@ -30,6 +30,7 @@ _RAW_SUFFIXES = _suffixes("dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef s
 RECORDS = ("sfm.json", "capture.json")
 # Folders that contain one of these files are datasets or output folders. They are skipped.
 _OUTPUT_FILES = (*RECORDS, "cfg_args")
+_LONGEST_NAME = 200  # bytes of a name in input/
 # The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
 _MAP = re.compile(
     r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
@@ -296,7 +297,8 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
 
 
 def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names, made unique: a name that equals an earlier one except for case gets a suffix.
+    """The names, made unique and not too long: a name that equals an earlier one except for case
+    gets a suffix.
 
     "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on.
     """
@@ -305,9 +307,18 @@ def free_names(names: Sequence[str]) -> Iterator[str]:
         yield _free(name, taken)
 
 
+def _shortened(part: str) -> str:
+    """A name of at most 200 bytes, so that ".NAME.png.tmp" fits into the 255 of a file system."""
+    if len(part.encode()) <= _LONGEST_NAME:
+        return part
+    path = PurePosixPath(part)
+    room = max(0, _LONGEST_NAME - len(path.suffix.encode()))
+    return path.stem.encode()[:room].decode(errors="ignore") + path.suffix
+
+
 def _free(name: str, taken: set[str]) -> str:
     """``name``, or a variant of it that is not in ``taken``; the result is added to ``taken``."""
-    name = shown(name)
+    name = "/".join(_shortened(part) for part in shown(name).split("/"))
     path = PurePosixPath(name)
     candidate, n = name, 1
     while candidate.casefold() in taken:
