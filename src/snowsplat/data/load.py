@@ -168,7 +168,7 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         return read_transforms(transforms, images)
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
-    if not models or (models == [root] and not photos_below(root)):
+    if not models or not ((root / images).is_dir() or photos_below(root)):
         above = next((p for p in root.absolute().parents[:2] if poses_in(p)), None)
         if above is not None:
             raise UserError(f"{root}: a part of a dataset; use the whole: {above}")

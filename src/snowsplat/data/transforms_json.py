@@ -82,16 +82,18 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
     found = _files_of(root / shown, root, [frame.name for frame in frames], images)
     split = _without_overlap(root, files, frames, found)
     posed: dict[str, PosedImage] = {}
+    seen: set[tuple[str, _Split | None]] = set()
     for frame in frames:
         file = found.get(frame.name)
-        if file is None or (file in posed and split[file] != frame.split):
+        if file is None:
             continue
-        if file in posed:
+        if (file, frame.split) in seen:
             raise UserError(
                 f"{frame.where}: the image {file} also belongs to another frame; remove one of them"
             )
-        image = _posed_image(frame.where, root, file, frame.values, split[file])
-        posed[file] = image
+        seen.add((file, frame.split))
+        if file not in posed:
+            posed[file] = _posed_image(frame.where, root, file, frame.values, split[file])
     missing = [frame.name for frame in frames if frame.name not in found]
     if not posed:
         problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from snowsplat.data.colmap.model import count_images, model_is_text
+from snowsplat.data.files.listing import is_output
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -30,6 +31,8 @@ def find_models(parent: Path) -> list[Path]:
 def find_models_below(root: Path, images: str) -> list[Path]:
     """The models of one dataset anywhere in a folder, the largest first: ``dense/0/sparse`` …
 
+    Outputs of snowsplat in ``root`` are skipped.
+
     Args:
         images: name of the folders of images, which tell datasets apart.
 
@@ -47,7 +50,10 @@ def find_models_below(root: Path, images: str) -> list[Path]:
                 inner = sorted(p for p in folder.iterdir() if p.is_dir())
             except OSError:
                 continue
-            queue += [(p, depth + 1) for p in inner if not p.name.startswith(".")]
+            queue += [(p, depth + 1) for p in inner if not (p.name[0] == "." or is_output(p))]
+    # The model in sparse/0 beside dense/0 may be one of photos that are not there.
+    complete = [m for m in models if (workspace_of(m, root, images) / images).is_dir()]
+    models = complete or models
     workspaces = list(dict.fromkeys(workspace_of(model, root, images) for model in models))
     # dense/0, dense/1 …: the parts of one reconstruction.
     parts = {path.parent for path in workspaces if path.name.isdecimal()}

@@ -36,7 +36,9 @@ class Matches:
     doubtful: list[str]
 
 
-def match_names(names: Sequence[str], files: Iterable[str]) -> Matches:
+def match_names(
+    names: Sequence[str], files: Iterable[str], *, other_folders: bool = True
+) -> Matches:
     """The file that each name means. No file belongs to two names.
 
     A name may differ from its file in these ways, and the first way that finds a file counts: the
@@ -48,6 +50,7 @@ def match_names(names: Sequence[str], files: Iterable[str]) -> Matches:
     Args:
         names: relative or absolute paths, as a dataset states them, on any system. Different.
         files: relative paths with "/", of images only.
+        other_folders: whether the folders of a name and its file may differ.
     """
     found: dict[str, str] = {}
     left, free = list(names), list(dict.fromkeys(files))
@@ -56,7 +59,7 @@ def match_names(names: Sequence[str], files: Iterable[str]) -> Matches:
         certain, _ = _unique(_same_path(left, free, with_suffix))
         found |= certain
         left, free = _rest(left, free, certain)
-    for with_suffix in (True, False):
+    for with_suffix in (True, False) if other_folders else ():
         for renamed in (False, True):
             certain, unsure = _unique(_same_end(left, free, with_suffix, renamed))
             if unsure:  # other names may be mixed up too, without a sign of it

@@ -53,7 +53,9 @@ def find_photos(
         files = [file for file in photos_below(root) if file not in taken]
     except OSError:
         return {}
-    matches = match_names(names, files)
+    # If some photos are where the dataset says, the others were removed. They may have been put
+    # aside, into a folder "rejected".
+    matches = match_names(names, files, other_folders=not taken)
     if matches.files:
         name, file = next(iter(matches.files.items()))
         logger.warning(

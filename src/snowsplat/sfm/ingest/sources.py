@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from snowsplat.data.files.listing import files_below, folder_kind, original_of
+from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
 from snowsplat.data.load import poses_in
 from snowsplat.sfm.ingest.clip import is_video
@@ -28,9 +28,8 @@ VIDEO_SUFFIXES = _suffixes(
 _RAW_SUFFIXES = _suffixes("dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw")
 #: The record of the stages of a dataset, and its name in version 0.1.0.
 RECORDS = ("sfm.json", "capture.json")
-# Folders that contain one of these files are datasets or output folders. They are skipped.
-_OUTPUT_FILES = (*RECORDS, "cfg_args")
 _LONGEST_NAME = 200  # bytes of a name in input/
+_KEPT_END = 12  # characters at the end of a longer name
 # The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
 _MAP = re.compile(
     r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
@@ -171,7 +170,7 @@ def _search(root: Path) -> _Folder:
     def enter(folder: Path, names: list[str]) -> Iterator[str]:
         for name in names:
             reason = _why_left_out(name, names)
-            if _is_output(folder / name) or folder_kind(name) == "masks":
+            if is_output(folder / name) or folder_kind(name) == "masks":
                 continue
             if reason is None:
                 yield name
@@ -208,11 +207,7 @@ def _why_left_out(name: str, siblings: Sequence[str]) -> str | None:
 
 def _masks_and_outputs(folder: Path, names: list[str]) -> list[str]:
     """The subfolders that are neither masks nor outputs."""
-    return [n for n in names if folder_kind(n) != "masks" and not _is_output(folder / n)]
-
-
-def _is_output(folder: Path) -> bool:
-    return any((folder / file).is_file() for file in _OUTPUT_FILES)
+    return [n for n in names if folder_kind(n) != "masks" and not is_output(folder / n)]
 
 
 def _is_photo_name(file: str) -> bool:
@@ -236,7 +231,7 @@ def _maps_beside(photos: Sequence[str]) -> dict[str, str]:
 
 def _photos_of_dataset(root: Path) -> Path:
     """The folder of the photos of a dataset; ``root`` itself if it is no dataset or has none."""
-    if not (poses_in(root) or _is_output(root)):
+    if not (poses_in(root) or is_output(root)):
         return root
     for name in ("input", "images"):
         if (root / name).is_dir():
@@ -312,8 +307,9 @@ def _shortened(part: str) -> str:
     if len(part.encode()) <= _LONGEST_NAME:
         return part
     path = PurePosixPath(part)
-    room = max(0, _LONGEST_NAME - len(path.suffix.encode()))
-    return path.stem.encode()[:room].decode(errors="ignore") + path.suffix
+    end = path.stem[-_KEPT_END:] + path.suffix  # with the number of the photo
+    room = max(0, _LONGEST_NAME - len(end.encode()))
+    return path.stem.encode()[:room].decode(errors="ignore") + end
 
 
 def _free(name: str, taken: set[str]) -> str:
