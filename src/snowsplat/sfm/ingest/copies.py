@@ -28,10 +28,10 @@ _COPY = re.compile(
     r"(.+?)(?:(?: -)?[ _-](?:copy|kopie|copie|copia|副本|コピー))?(?: ?\(\d{1,3}\)| \d)?"
     r"(?:[._-](?:edited|bearbeitet|thumb|thumbnail|small|preview))?"
 )
-# Photos are compared at this size. Photos from different places have a correlation below 0.98; a
-# copy of another size and quality has more than 0.996, even of a picture with much fine detail.
-_SIDE = 64
-_SAME = 0.995
+# Photos are compared at this size. Photos from different places have a correlation below 0.99; a
+# copy of another size and quality has more than 0.998, even of a picture with much fine detail.
+_SIDE = 32
+_SAME = 0.996
 # A share of opaque pixels that tells something.
 _FEWEST_OPAQUE = 0.02
 # More names than this that differ only as copies do are numbers: "photo (1)" to "photo (300)".
@@ -172,7 +172,7 @@ def _small(path: Path) -> tuple[tuple[int, int], np.ndarray, np.ndarray] | None:
     try:
         with open_image(path) as opened:
             width, height = opened.size
-            opened.draft("RGB", (4 * _SIDE, 4 * _SIDE))
+            opened.draft("RGB", (8 * _SIDE, 8 * _SIDE))
             image = ImageOps.exif_transpose(opened).convert("RGBA")
     except Exception:  # Pillow raises many kinds of exceptions for damaged files
         return None
