@@ -19,6 +19,7 @@ import logging
 import math
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +44,8 @@ _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE
 # Converts OpenGL's camera axes to OpenCV's; it is its own inverse.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
+# Parts of a path of another computer that are tried.
+_MOST_PARTS = 16
 # Two statements of a focal length differ by less than this factor, or contradict each other.
 _SAME_LENS = 1.05
 
@@ -221,8 +224,17 @@ def _named_splits(scene: _Json) -> dict[str, _Split]:
 
 
 def _path_inside(where: str, root: Path, name: str) -> Path:
-    """``root / name``; raises `UserError` if that is outside the folder ``root``."""
-    path = inside(root, name.replace("\\", "/"))
+    """``root / name``, or if that is not there, the end of ``name`` that is a path in ``root``.
+
+    Raises:
+        UserError: there is no such file, and ``root / name`` is outside the folder ``root``.
+    """
+    name = name.replace("\\", "/")
+    path = inside(root, name)
+    if path is None or not is_file(path):
+        parts = [part for part in name.split("/") if part not in ("", ".", "..")]
+        ends = ["/".join(parts[-count:]) for count in range(min(len(parts), _MOST_PARTS), 1, -1)]
+        path = next((root / end for end in ends if is_file(root / end)), path)
     if path is None:
         raise UserError(
             f"{where}: {quoted(name)} is not in the folder of the JSON file; copy it there and use "
@@ -268,8 +280,12 @@ def _mask(where: str, root: Path, frame: Mapping[str, Any]) -> Path | None:
 def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
     """The depth map of a frame; None if it is missing, because most recipes do not need it."""
     name = frame.get("depth_file_path")
-    path = inside(root, name.replace("\\", "/")) if isinstance(name, str) and name else None
-    return path if path is not None and is_file(path) else None
+    if not isinstance(name, str) or not name:
+        return None
+    with suppress(UserError):
+        path = _path_inside("", root, name)
+        return path if is_file(path) else None
+    return None
 
 
 def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:

@@ -13,7 +13,7 @@ from snowsplat.util.natural_order import natural_key
 
 # What is in a folder of this name. The name is compared without regard to case, and without "_" and
 # "." at its start and "_2", "_4" or "_8" at its end.
-_MASKS = {"mask", "masks", "image_masks", "dynamic_mask", "dynamic_masks"}
+_MASKS = re.compile(r"mask|(\w+_)?masks|(dynamic|images?)_mask|mask_images?")
 _MAPS = {
     *("depth", "depths", "depth_map", "depth_maps", "depthmaps", "depth_images"),
     *("confidence", "confidences", "confidence_maps", "normal", "normals", "normal_maps"),
@@ -42,12 +42,12 @@ def folder_kind(name: str) -> FolderKind:
     """What the name of a folder says about the images inside; "photos" if it says nothing."""
     name = name.casefold().replace("-", "_").replace(" ", "_").lstrip("._")
     divided = _DIVIDED.fullmatch(name)
-    names = {name, divided["original"]} if divided else {name}
-    if names & _MASKS:
+    name = divided["original"] if divided else name
+    if _MASKS.fullmatch(name):
         return "masks"
-    if names & _MAPS:
+    if name in _MAPS:
         return "maps"
-    return "thumbnails" if names & _THUMBNAILS else "photos"
+    return "thumbnails" if name in _THUMBNAILS else "photos"
 
 
 def is_output(folder: Path) -> bool:

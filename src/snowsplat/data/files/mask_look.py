@@ -6,9 +6,14 @@ Programs do not agree whether black or white marks what to ignore. Here it is bl
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+
+from snowsplat.data.files.mask_pixels import MASK_FORMATS, mask_levels
+from snowsplat.data.image_file import open_image
 
 # The share of a typical photo below which hardly anything is used.
 _LITTLE = 0.05
@@ -20,6 +25,8 @@ _IGNORED, _KEPT = 0.1, 0.98
 # Masks are placed where something is to see, and so are the points of a model. In what masks keep
 # there are not far fewer points than elsewhere.
 _FEWER_POINTS = 0.25
+# Mask files that are decoded to judge all.
+_SAMPLE = 16
 #: What to do about masks that are the wrong way round.
 INVERT = "black pixels of a mask are ignored: if black marks what to keep, invert the masks"
 
@@ -66,6 +73,16 @@ def doubt_about_masks(looks: Sequence[MaskLook], points_kept: float | None = Non
     if len(looks) >= _FEWEST_MASKS and around >= _MOST_PHOTOS * len(looks):
         return f"the masks keep the border of most photos and ignore their middle; {INVERT}"
     return None
+
+
+def doubt_about_files(masks: Sequence[Path]) -> str | None:
+    """What is doubtful about mask files, by a sample; files that cannot be read are left out."""
+    chosen = np.unique(np.linspace(0, len(masks) - 1, min(len(masks), _SAMPLE)).astype(int))
+    looks = []
+    for path in (masks[i] for i in chosen):
+        with suppress(Exception), open_image(path, MASK_FORMATS) as image:
+            looks.append(look_of(mask_levels(image) >= 128))
+    return doubt_about_masks(looks)
 
 
 def _percent(share: float) -> str:

@@ -9,7 +9,8 @@ from PIL import Image
 
 from snowsplat.data.image_file import open_image
 
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
+#: The formats of masks, by the names of Pillow.
+MASK_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 # A mask is black and white, except for its edges and the noise of JPEG.
 _DARK, _BRIGHT = 64, 192
 _LEAST_BLACK_AND_WHITE = 0.9
@@ -76,7 +77,7 @@ def looks_like_mask(path: Path) -> bool:
     A file that cannot be read does not.
     """
     try:
-        with open_image(path, _FORMATS) as opened:
+        with open_image(path, MASK_FORMATS) as opened:
             opened.draft("RGB", (_SMALL_SIDE, _SMALL_SIDE))
             image = opened.resize(_small_size(opened), Image.Resampling.NEAREST)
             image.info = opened.info

@@ -28,6 +28,8 @@ _COPY = re.compile(
     r"(.+?)(?:(?: -)?[ _-](?:copy|kopie|copie|copia|副本|コピー))?(?: ?\(\d{1,3}\)| \d)?"
     r"(?:[._-](?:edited|bearbeitet|thumb|thumbnail|small|preview))?"
 )
+# The edited photo IMG_E0001 of IMG_0001, as phones call it.
+_EDITED = re.compile(r"^img_e(?=\d)")
 # Photos are compared at this size. Photos from different places have a correlation below 0.99; a
 # copy of another size and quality has more than 0.998, even of a picture with much fine detail.
 _SIDE = 32
@@ -120,7 +122,8 @@ def _stem_and_kind(name: str) -> tuple[str, _Kind]:
     stem = folded(path.stem)
     match = _COPY.fullmatch(stem)
     base = match[1] if match else stem
-    return base, _Kind(str(path.parent), path.suffix.lower(), stem[len(base) :])
+    kind = _Kind(str(path.parent), path.suffix.lower(), stem[len(base) :])
+    return _EDITED.sub("img_", base), kind
 
 
 def _equal_files(root: Path, names: Sequence[str]) -> Iterator[tuple[str, str]]:
