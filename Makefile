@@ -18,9 +18,11 @@ NO_PYTHON := snowsplat: $(BOOTSTRAP) is missing or older than 3.10; choose anoth
 NO_VENV := snowsplat: $(BOOTSTRAP) cannot create environments; install venv (Debian/Ubuntu: apt install python3-venv)
 
 ifdef PYTHON
+TOOLS :=
 ENVIRONMENT :=
 else
 PYTHON := .venv/bin/python
+TOOLS := .venv/.tools
 ENVIRONMENT := .venv/.installed
 endif
 # Tools (cmake, ninja, ruff, …) come from the environment, the package from this checkout.
@@ -37,7 +39,7 @@ CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp'
 .PHONY: demo quick test nightly dev docs format native wheel compiler lint types layers clean
 .PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
 
-demo: native
+demo: native $(ENVIRONMENT)
 	$(PYTHON) -m snowsplat demo -o out/demo
 
 quick: lint
@@ -46,16 +48,26 @@ quick: lint
 test: lint
 	@$(MAKE) --no-print-directory -j2 types layers pytest
 
-dev: native
+# What compiles is a small part of the environment, so the rest is installed at the same time.
+dev:
+	@$(MAKE) --no-print-directory -j2 native $(ENVIRONMENT)
 
-# The environment. The editable installation builds nothing: `make native` installs the libraries into src/.
-.venv/.installed: pyproject.toml | compiler
+# The part of the environment that compiles: the pinned tools among the packages for development.
+COMPILING := cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
+.venv/.tools: pyproject.toml | compiler
 	@$(BOOTSTRAP) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || \
 	    { echo "$(NO_PYTHON)" >&2; exit 1; }
 	@$(BOOTSTRAP) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(NO_VENV)" >&2; exit 1; }
 	$(BOOTSTRAP) -m venv .venv
 	.venv/bin/python -m pip install --quiet --upgrade pip
-	.venv/bin/python -m pip install --editable '.[dev,docs]' \
+	sed -nE '/^dev = /,/^]/ s/^ *"(($(COMPILING))==.*)",$$/\1/p' pyproject.toml >.venv/tools.txt
+	.venv/bin/python -m pip install --quiet --no-compile --requirement .venv/tools.txt
+	@touch $@
+
+# The editable installation builds nothing: `make native` installs the libraries into src/. Python
+# compiles the modules that it imports; most of those of torch are never imported.
+.venv/.installed: .venv/.tools
+	.venv/bin/python -m pip install --no-compile --no-build-isolation --editable '.[dev,docs]' \
 	    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
 	@touch $@
 
@@ -65,7 +77,7 @@ compiler:
 
 # One library per instruction set and the kernels for each GPU architecture, into src/snowsplat/_lib; the page
 # of the viewer, into src/snowsplat/_viewer. Only changed files are compiled.
-native: $(ENVIRONMENT) | compiler
+native: $(TOOLS) | compiler
 	@mkdir -p $(BUILD)
 	@$(LOCK) env -u MAKEFLAGS sh -ec ' \
 	    cmake -G Ninja -S . -B $(BUILD) --log-level=NOTICE \
@@ -106,37 +118,39 @@ PROCESSES = $(if $(filter 1,$(JOBS)),,-n $(JOBS) --dist worksteal)
 # Slow tests have a mark, and `quick` excludes these marks (listed in pyproject.toml).
 QUICK := not (sfm or browser or build or emulated or gpu or kill or slow or nightly)
 ISA := isa and not (emulated or gpu or nightly)
+# The tests of kernels that other instruction sets do not repeat: threads and the loops over long images
+# are the same for each of them; and on each, results and gradients are compared with those of the reference,
+# so finite differences would only test the reference again.
+SAME := test_determinism or number_of_threads or long_images or \
+    (finite_differences and (test_photometric or test_project or test_rasterize))
 # Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
 SANITIZED := emulated-float32 or sanitizers_find
 REPEATED := build/pytest-repeated.log
 
-pytest-quick: native
+pytest-quick: native $(ENVIRONMENT)
 	$(PYTEST) -m '$(QUICK)'
 
 # All tests on the best instruction set. Some of them wait for browsers and servers. Therefore, at the same
 # time, with half as many processes and a lower priority: on each other instruction set and in an emulator
 # of Arm, the tests that depend on it; and the GPU kernels on the CPU under sanitizers. Tests that run under sanitizers are not
 # repeated without them.
-pytest: native
+pytest: native $(ENVIRONMENT)
 	@$(MAKE) --no-print-directory -j2 pytest-best pytest-repeated
 
 pytest-best:
 	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
-nightly: native
+nightly: native $(ENVIRONMENT)
 	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
-# used for them. The two longest tests of threads take minutes there, and threads do not depend on the
-# instruction set.
+# used for them.
 NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py \
-    --ignore tests/ops/test_native.py \
-    --deselect tests/ops/test_determinism.py::test_rasterize_in_bands \
-    --deselect tests/ops/test_determinism.py::test_training_steps
+    --ignore tests/ops/test_native.py -k 'not ($(SAME))'
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
-neon: native
-	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)' $(NEON_TESTS)"; \
+neon: native $(ENVIRONMENT)
+	@$(if $(NEON_FOUND),echo "neon: $(PYTEST) -m '$(ISA)'" $(NEON_TESTS); \
 	    SNOWSPLAT_NEON=run $(PYTEST) -m '$(ISA)' $(NEON_TESTS), \
 	    echo "neon: skipped; it needs a compiler and an emulator (Debian/Ubuntu: apt install g++-aarch64-linux-gnu qemu-user)")
 
@@ -146,11 +160,13 @@ pytest-repeated:
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
+ISA_TESTS := tests/ops tests/sfm/colmap/test_matching.py \
+    tests/training/test_pose_refinement.py tests/training/test_step_runner.py -k 'not ($(SAME))'
 pytest-isas:
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
 	    for isa in $$isas; do \
-	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training tests/sfm/colmap/test_matching.py"; \
-	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' tests/ops tests/training tests/sfm/colmap/test_matching.py || exit 1; \
+	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)'" $(ISA_TESTS); \
+	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' $(ISA_TESTS) || exit 1; \
 	    done
 
 # The GPU kernels on the CPU under AddressSanitizer and UndefinedBehaviorSanitizer, with the threads of a
@@ -159,7 +175,7 @@ pytest-isas:
 # Python that was built without them. Reports need no call stack of each allocation, which costs time.
 SANITIZERS = $(strip $(foreach name,libasan.so libubsan.so,$(wildcard $(shell g++ -print-file-name=$(name) 2>&1))))
 
-sanitized: native
+sanitized: native $(ENVIRONMENT)
 	@$(if $(SANITIZERS),echo "sanitized: $(PYTEST) tests/ops -m emulated -k '$(SANITIZED)'"; \
 	    LD_PRELOAD="$(SANITIZERS)" ASAN_OPTIONS=detect_leaks=0:malloc_context_size=1 CXX=g++ \
 	    SNOWSPLAT_EMULATION=sanitized SNOWSPLAT_ORDER=backward \

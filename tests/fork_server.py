@@ -2,9 +2,9 @@
 
     python fork_server.py 3      the server; 3 is its end of a socket
 
-A program has its own streams, environment, handling of Ctrl-C and exit code. Tests of imports, and
-of variables that are read by Python or while libraries are loaded, need a process that is really
-new.
+A program has its own streams, environment, handling of Ctrl-C and exit code. If it starts Python
+itself, it can fork for that, too. Tests of imports, and of variables that are read by Python or
+while libraries are loaded, need a process that is really new.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from concurrent.futures import thread as pools
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,6 +35,7 @@ def popen(
     stdin: int = subprocess.DEVNULL,
     stdout: int = subprocess.PIPE,
     stderr: int = subprocess.PIPE,
+    forks: bool = False,
 ) -> Process | subprocess.Popen:
     """``python arguments``: ``-m module …``, ``-c code …`` or ``script …``.
 
@@ -43,19 +45,24 @@ def popen(
         stdin: or PIPE.
         stdout: or a file descriptor.
         stderr: or STDOUT, or a file descriptor.
+        forks: the program starts Python with `subprocess.Popen`; these processes are its forks.
+            It must not have computed anything in several threads before.
     """
     texts = [str(argument) for argument in arguments]
     if hasattr(os, "pidfd_open"):
-        return Process(texts, dict(env), stdin, stdout, stderr)
+        return Process(texts, dict(env), stdin, stdout, stderr, forks)
     command = [sys.executable, *texts]
     return subprocess.Popen(command, env=env, stdin=stdin, stdout=stdout, stderr=stderr, text=True)
 
 
 def run(
-    *arguments: object, env: Mapping[str, str] = ENVIRONMENT, timeout: float = 300
+    *arguments: object,
+    env: Mapping[str, str] = ENVIRONMENT,
+    timeout: float = 300,
+    forks: bool = False,
 ) -> subprocess.CompletedProcess[str]:
     """Like `popen`, but waits for the end."""
-    process = popen(*arguments, env=env)
+    process = popen(*arguments, env=env, forks=forks)
     out, err = process.communicate(timeout)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
@@ -64,7 +71,13 @@ class Process:
     """A process that the server started. Its methods are those of `subprocess.Popen`."""
 
     def __init__(
-        self, arguments: list[str], env: dict[str, str], stdin: int, stdout: int, stderr: int
+        self,
+        arguments: list[str],
+        env: dict[str, str],
+        stdin: int,
+        stdout: int,
+        stderr: int,
+        forks: bool = False,
     ) -> None:
         self.args = arguments
         self.returncode: int | None = None
@@ -81,7 +94,7 @@ class Process:
             err, self.stderr = _pipe("r")
         else:
             err = os.dup(out if stderr == subprocess.STDOUT else stderr)
-        request = {"argv": arguments, "env": env, "cwd": os.getcwd()}
+        request = {"argv": arguments, "env": env, "cwd": os.getcwd(), "forks": forks}
         streams = [theirs, out, err]
         self.pid = _server().ask(request, streams)
         for stream in streams:
@@ -175,9 +188,54 @@ class _Server:
         self._process.wait()
 
 
+class _This:
+    """This process, in place of the server: it forks itself."""
+
+    def ask(self, request: dict, streams: list[int] | None = None) -> int:
+        if "ended" in request:
+            return _exit_code_of(request["ended"])
+        pid = os.fork()
+        if pid == 0:
+            pools._threads_queues.clear()  # a fork has no threads of pools, so none to wait for
+            _take(streams or [])
+            _run_and_exit(request)
+        return pid
+
+
 @functools.cache
-def _server() -> _Server:
+def _server() -> _Server | _This:
     return _Server()
+
+
+def _fork_instead_of_start() -> None:
+    """From now on, Python programs that this process starts are its forks."""
+
+    def start(command, env=None, stdin=None, stdout=None, stderr=None, **_: object) -> Process:
+        assert command[0] == sys.executable
+        streams = [sys.stdout, sys.stderr]
+        for i, stream in enumerate((stdout, stderr)):
+            if stream == subprocess.DEVNULL:
+                streams[i] = null
+            elif stream is not None:
+                streams[i] = stream
+        numbers = [s if isinstance(s, int) else s.fileno() for s in streams]
+        environment = dict(os.environ if env is None else env)
+        return Process(command[1:], environment, stdin or subprocess.DEVNULL, *numbers, forks=True)
+
+    null = os.open(os.devnull, os.O_WRONLY)
+    globals()["_server"] = functools.cache(_This)
+    subprocess.Popen = start
+
+
+def _take(streams: list[int]) -> None:
+    """Make these the standard streams."""
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+        os.close(stream)
+
+
+def _exit_code_of(child: int) -> int:
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def _serve(ours: socket.socket) -> dict:
@@ -188,15 +246,12 @@ def _serve(ours: socket.socket) -> dict:
             os._exit(0)
         request = json.loads(data)
         if "ended" in request:
-            _, status = os.waitpid(request["ended"], 0)
-            ours.send(b"%d" % os.waitstatus_to_exitcode(status))
+            ours.send(b"%d" % _exit_code_of(request["ended"]))
             continue
         pid = os.fork()
         if pid == 0:
             ours.close()
-            for number, stream in enumerate(streams):
-                os.dup2(stream, number)
-                os.close(stream)
+            _take(streams)
             return request
         for stream in streams:
             os.close(stream)
@@ -208,6 +263,8 @@ def _execute(request: dict) -> None:
     os.environ.clear()
     os.environ.update(request["env"])
     os.chdir(request["cwd"])
+    if request["forks"]:
+        _fork_instead_of_start()
     first, *rest = request["argv"]
     if first == "-m":
         sys.path[0], sys.argv = os.getcwd(), rest

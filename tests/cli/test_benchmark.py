@@ -8,7 +8,6 @@ import math
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -19,11 +18,15 @@ from PIL import Image
 
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult
-from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
+from snowsplat.pipeline.benchmark.run import BenchmarkOptions
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
+from ..fork_server import popen
+from ..fork_server import run as started
+
+BENCHMARK = ("-m", "snowsplat", "benchmark")
 FLAGS = ("--iterations", "60", "--jobs", "2")
 
 
@@ -41,9 +44,8 @@ def scenes(tmp_path_factory) -> Path:
 def finished(scenes) -> Path:
     """The results of the two scenes."""
     out = scenes.parent / "out"
-    settings = {"iterations": 60}
-    report = benchmark(scenes, out, BenchmarkOptions(settings=settings, jobs=2))
-    assert not report.failures
+    result = started(*BENCHMARK, scenes, "-o", out, *FLAGS, forks=True)
+    assert result.returncode == 0, result.stderr
     return out
 
 
@@ -88,15 +90,16 @@ def test_finished_scenes_are_not_repeated(run, refused, scenes, finished):
 
 
 @pytest.mark.slow
-def test_a_scene_that_fails_does_not_stop_the_others(run, scenes, tmp_path):
+def test_a_scene_that_fails_does_not_stop_the_others(scenes, tmp_path):
     for name in ("lego", "ship"):
         (tmp_path / "scenes").mkdir(exist_ok=True)
         (tmp_path / "scenes" / name).symlink_to(scenes / name)
     (tmp_path / "scenes" / "mic" / "sparse").mkdir(parents=True)
     only = ("--scenes", "mic", "lego")
-    result = run("benchmark", tmp_path / "scenes", "-o", tmp_path / "out", *FLAGS, *only)
-    assert result.code == 2
-    assert re.search(r"^mic: .*sparse", result.out, re.MULTILINE)
+    arguments = (tmp_path / "scenes", "-o", tmp_path / "out", *FLAGS, *only)
+    result = started(*BENCHMARK, *arguments, forks=True)
+    assert result.returncode == 2
+    assert re.search(r"^mic: .*sparse", result.stdout, re.MULTILINE)
     rows = (tmp_path / "out" / "results.csv").read_text(encoding="utf-8").splitlines()
     assert [row.split(",")[0] for row in rows] == ["scene", "lego"]
     assert "mic: " in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
@@ -107,16 +110,17 @@ def test_a_scene_that_fails_does_not_stop_the_others(run, scenes, tmp_path):
 def test_killed_and_called_again(scenes, finished, tmp_path):
     """The process of the scene ends with the one that was killed; the result is the same."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "snowsplat", "benchmark", str(scenes), "-o", str(out)]
-    command += ["--iterations", "60", "--scenes", "lego", "--suite", "blender"]
-    killed = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    command = (*BENCHMARK, scenes, "-o", out, "--iterations", "60")
+    command += ("--scenes", "lego", "--suite", "blender")
+    killed = popen(*command, forks=True)
     claim = out / "lego.claim"
     while not claim.exists():
         assert killed.poll() is None
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=300)
+    again = started(*command, forks=True)
+    assert again.returncode == 0, again.stderr
     first, second = (
         json.loads((folder / "lego" / "benchmark.json").read_text(encoding="utf-8"))
         for folder in (finished, out)

@@ -71,7 +71,7 @@ def test_pose_is_cam_from_world_of_the_quaternion(dataset_copy):
     image = read_model(folder / "sparse/0").images[1]
     camera = load_dataset(folder, hold_out=None).train[1].camera
     rotation = rotation_from_quat(torch.tensor(image.pose[:4], dtype=torch.float64))
-    assert torch.equal(camera.cam_from_world[:, :3], rotation)
+    torch.testing.assert_close(camera.cam_from_world[:, :3], rotation, atol=1e-15, rtol=0)
     assert camera.cam_from_world[:, 3].tolist() == list(image.pose[4:])
 
 

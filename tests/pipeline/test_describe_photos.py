@@ -1,5 +1,7 @@
 """`snowsplat info` of photos and videos: what would be used of them."""
 
+import zipfile
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -38,3 +40,18 @@ def test_a_video_is_described(tmp_path):
 def test_a_folder_without_photos_and_poses_is_refused(tmp_path):
     with pytest.raises(UserError, match="no camera poses here"):
         describe(tmp_path)
+
+
+def test_a_zip_file_is_described_and_not_unpacked(tmp_path):
+    photo().save(tmp_path / "1.jpg")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.write(tmp_path / "1.jpg", "x/1.jpg")
+        archive.writestr("x/notes.txt", "text")
+    facts = describe(tmp_path / "a.zip")
+    assert (facts["kind"], facts["photos"], facts["videos"], facts["files"]) == (
+        "zip file",
+        1,
+        0,
+        2,
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"1.jpg", "a.zip"}

@@ -17,13 +17,14 @@ from snowsplat.pipeline.run import processes
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
+from ..fork_server import popen, run
+
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc, and the name lo")
 FLAGS = ["--iterations", "120", "--batch", "4", "--checkpoint-every", "40", "--eval", "-q"]
 SCENE = "point_cloud/iteration_120/point_cloud.ply"
 
 
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "snowsplat", "train", *map(str, arguments)]
+TRAIN = ("-m", "snowsplat", "train")
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +41,17 @@ def scene(dataset: Path) -> bytes:
     return (out / SCENE).read_bytes()
 
 
+def children_of(process: int) -> list[int]:
+    """The two processes that train, in the order of their numbers."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    assert len(children) == 2
+    return [int(child) for child in children]
+
+
 @pytest.mark.slow
 def test_several_processes_write_the_files_of_one(dataset, scene, tmp_path):
     out = tmp_path / "out"
-    run = command(dataset, "-o", out, *FLAGS, "--processes", 2)
-    done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    done = run(*TRAIN, dataset, "-o", out, *FLAGS, "--processes", 2, forks=True)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert re.search(r"120 steps in .*\n.*report of the training\nstep 120: \d views", done.stdout)
@@ -59,15 +66,13 @@ def test_a_killed_process_ends_all_and_another_number_of_processes_resumes(
     dataset, scene, tmp_path, killed
 ):
     out = tmp_path / "out"
-    run = command(dataset, "-o", out, *FLAGS, "--processes", 2)
-    parent = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    parent = popen(*TRAIN, dataset, "-o", out, *FLAGS, "--processes", 2, forks=True)
     try:
         while not list(out.glob("checkpoints/step_*")):
             assert parent.poll() is None
             time.sleep(0.02)
-        children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
-        assert len(children) == 2
-        os.kill(int(children[killed]), signal.SIGKILL)
+        children = children_of(parent.pid)
+        os.kill(children[killed], signal.SIGKILL)
         begin = time.monotonic()
         _, errors = parent.communicate(timeout=60)
         assert time.monotonic() - begin < 30  # on a busy machine; usually 3 s
@@ -87,13 +92,13 @@ def test_a_killed_process_ends_all_and_another_number_of_processes_resumes(
 def test_ctrl_c_saves_the_scene_and_a_checkpoint(dataset, tmp_path):
     out = tmp_path / "out"
     flags = [flag if flag != "120" else "100000" for flag in FLAGS]
-    run = command(dataset, "-o", out, *flags, "--processes", 2)
-    parent = subprocess.Popen(run, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    parent = popen(*TRAIN, dataset, "-o", out, *flags, "--processes", 2, forks=True)
     try:
         while not list(out.glob("checkpoints/step_*")):
             assert parent.poll() is None
             time.sleep(0.02)
-        os.killpg(parent.pid, signal.SIGINT)
+        for process in (parent.pid, *children_of(parent.pid)):  # as a terminal does
+            os.kill(process, signal.SIGINT)
         output, _ = parent.communicate(timeout=60)
     finally:
         parent.kill()
@@ -105,16 +110,24 @@ def test_ctrl_c_saves_the_scene_and_a_checkpoint(dataset, tmp_path):
 
 @pytest.mark.slow
 def test_torchrun(dataset, scene, tmp_path):
-    run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    run += ["-m", "snowsplat", "train", str(dataset), "-o", str(tmp_path / "out"), *FLAGS]
-    subprocess.run(run, check=True, timeout=300, stderr=subprocess.DEVNULL)
+    """Here, all processes are new ones, not forks."""
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+    ]
+    command += ["-m", "snowsplat", "train", str(dataset), "-o", str(tmp_path / "out"), *FLAGS]
+    subprocess.run(command, check=True, timeout=300, stderr=subprocess.DEVNULL)
     assert (tmp_path / "out" / SCENE).read_bytes() == scene
 
 
 @pytest.mark.slow
 def test_an_error_of_the_first_process_is_reported_once(dataset, tmp_path):
-    run = command(dataset, "-o", tmp_path / "out", "--images", "absent", "--processes", 2)
-    done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+    absent = ("--images", "absent")
+    done = run(*TRAIN, dataset, "-o", tmp_path / "out", *absent, "--processes", 2, forks=True)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "absent" in done.stderr

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 
 import pytest
@@ -51,6 +52,16 @@ class Recorder(Observer):
 
 def options(steps: int, **changes) -> TrainOptions:
     return TrainOptions(settings={"iterations": steps}, **changes)
+
+
+def test_a_damaged_held_out_photo_is_found_before_the_training(dataset, tmp_path):
+    """The training does not read it, so the error would come at the end."""
+    shutil.copytree(dataset, tmp_path / "d")
+    first = min((tmp_path / "d" / "images").iterdir())
+    first.write_bytes(first.read_bytes()[:-200])
+    with pytest.raises(UserError, match=f"{first.name}: cannot be decoded"):
+        train(tmp_path / "d", tmp_path / "out", options(5, hold_out=8))
+    assert not (tmp_path / "out").exists()
 
 
 def test_learnt_exposures_are_written(dataset, tmp_path):

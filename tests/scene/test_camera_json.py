@@ -30,7 +30,7 @@ def test_round_trip(tmp_path):
 def test_the_format_is_that_of_cameras_json(tmp_path):
     """Position and rotation are those of world_from_cam; the rotation is a list of rows."""
     pose = torch.tensor([[0.0, 1, 0, 4], [-1, 0, 0, 5], [0, 0, 1, 6]], dtype=torch.float64)
-    one = Camera(64, 48, 55.0, 56.0, 30.0, 20.0, pose)
+    one = Camera(64, 48, 55.0, 56.0, 30.0, 20.0, pose, near=0.4)
     write_cameras(tmp_path / "list.json", [("a", one), ("b", one)])
     entry = {
         "img_name": "a",
@@ -40,15 +40,17 @@ def test_the_format_is_that_of_cameras_json(tmp_path):
         "rotation": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
         "fx": 55.0,
         "fy": 56.0,
+        "near": 0.4,
     }
     written = json.loads((tmp_path / "list.json").read_text())
     assert written == [entry | {"id": 0}, entry | {"id": 1, "img_name": "b"}]
-    # Nothing but the pose and the sizes is read. The principal point is in the middle.
-    del entry["img_name"]
+    # Other programs write only the pose and the sizes. The principal point is in the middle.
+    del entry["img_name"], entry["near"]
     (tmp_path / "list.json").write_text(json.dumps([entry, entry]))
     names, cameras = read_cameras(tmp_path / "list.json")
     assert names == ["0", "1"]
     assert (cameras[0].cx, cameras[0].cy) == (32.0, 24.0)
+    assert cameras[0].near == 0.2
     torch.testing.assert_close(cameras[0].cam_from_world, pose)
 
 

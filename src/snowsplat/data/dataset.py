@@ -17,6 +17,7 @@ from snowsplat.data.bounds import EXTENT_FACTOR, scene_bounds
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.lens.model import LensModel
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.origin import HERE, Origin
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ _MAX_COORDINATE = 1e18
 class Points:
     """A coloured point cloud in the world frame."""
 
-    xyz: Tensor  # (P, 3) float32, finite
+    xyz: Tensor  # (P, 3) float32, finite; readers return float64 if the file has it
     rgb: Tensor  # (P, 3) uint8
 
     def __len__(self) -> int:
@@ -50,8 +51,6 @@ def usable_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None
         xyz: (P, 3) positions in the world frame, of any float dtype.
         rgb: (P, 3) colours in 0..255.
     """
-    with np.errstate(over="ignore"):
-        xyz = np.ascontiguousarray(xyz, np.float32)
     usable = (np.abs(xyz) < _MAX_COORDINATE).all(axis=1)
     if not usable.all():
         count = (~usable).sum()
@@ -59,7 +58,8 @@ def usable_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None
         xyz, rgb = xyz[usable], rgb[usable]
     if not len(xyz):
         return None
-    return Points(torch.from_numpy(xyz), torch.from_numpy(np.ascontiguousarray(rgb, np.uint8)))
+    rgb = np.ascontiguousarray(rgb, np.uint8)
+    return Points(torch.from_numpy(np.ascontiguousarray(xyz)), torch.from_numpy(rgb))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +86,7 @@ class Dataset:
     points: Points | None  # None: the dataset has no points; `bounds` is estimated from cameras
     extent: float  # world units; see `scene_extent`
     description: str = ""  # the files it was read from, for messages
+    origin: Origin = HERE  # of cameras and points, in the world frame of the files
 
     def __post_init__(self) -> None:
         prefix = f"{self.description}: " if self.description else ""

@@ -1,6 +1,7 @@
 """Decoding an image file: its header, its pixels as planes, and scaling down.
 
-All functions are pure functions of the file, so they may run in any thread.
+All functions may run in any thread. The result depends only on the file, and for pixels of 16 bits
+on the files beside it.
 """
 
 from __future__ import annotations
@@ -14,18 +15,20 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
+from snowsplat.data.bit_depth import eight_bits
+from snowsplat.data.colour_profile import is_transparent, to_srgb
 from snowsplat.data.files.mask_pixels import mask_levels
-from snowsplat.data.image_file import open_image, reason_of
+from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
 # Formats of photos (Pillow opens the MPO files of phones as JPEG). Other formats are excluded,
 # because Pillow starts external programs for some of them.
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Pixels are converted in bands of this size, to limit the memory for temporary arrays.
 _BAND_PIXELS = 1 << 20
 #: Suffixes that are tried if a dataset names its images without a suffix.
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".avif")
 _EXIF_ORIENTATION = 0x0112
 
 
@@ -122,8 +125,7 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
     """
     try:
         with open_image(source.path, _FORMATS) as opened:
-            image = ImageOps.exif_transpose(opened) if source.apply_orientation else opened
-            planes = _planes(image)
+            planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
     except Exception as error:  # as above
         raise _unreadable(source.path, error) from None
     if planes.shape[0] == 4:
@@ -145,8 +147,8 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
     try:
         with open_image(source.path, _FORMATS) as opened:
             opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
-            image = ImageOps.exif_transpose(opened) if source.apply_orientation else opened
-            planes = [Image.fromarray(plane) for plane in _planes(image)]
+            image = _upright(eight_bits(opened, source.path), source)
+            planes = [Image.fromarray(plane) for plane in _planes(image, source.path)]
     except Exception as error:  # as above
         raise _unreadable(source.path, error) from None
     small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in planes]
@@ -223,20 +225,20 @@ def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:
     return means
 
 
-def _planes(image: Image.Image) -> np.ndarray:
-    """(3, H, W) or (4, H, W) uint8, not premultiplied."""
-    if image.mode.startswith("I"):  # 16-bit grey; convert() would clip it instead of scaling it
-        grey = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255).astype(np.uint8)
-        return np.repeat(grey[None], 3, axis=0)
-    if image.mode == "F":
-        raise ValueError("floating-point pixels are not supported")
-    transparent = image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
+def _upright(image: Image.Image, source: ImageSource) -> Image.Image:
+    return ImageOps.exif_transpose(image) if source.apply_orientation else image
+
+
+def _planes(image: Image.Image, path: Path) -> np.ndarray:
+    """(3, H, W) or (4, H, W) uint8 sRGB, not premultiplied, of an image of 8 bits per channel."""
+    transparent = is_transparent(image)
     mode = "RGBA" if transparent else "RGB"
     planes: np.ndarray = np.empty((len(mode), image.height, image.width), np.uint8)
     rows = max(1, _BAND_PIXELS // image.width)
     for top in range(0, image.height, rows):
         band = image.crop((0, top, image.width, min(top + rows, image.height)))
-        planes[:, top : top + rows] = np.asarray(band.convert(mode)).transpose(2, 0, 1)
+        pixels = np.asarray(to_srgb(band, path))
+        planes[:, top : top + rows] = pixels if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
     if transparent and planes[3].min() == 255:
         return planes[:3].copy()
     return planes

@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from PIL import Image
+from PIL import Image, features
 
+#: Formats that depend on how Pillow was built.
+OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
 #: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
 #: million. The size is known before the image is decoded.
 MOST_PIXELS = 178_956_970
@@ -39,13 +41,16 @@ _JPEG = b"\xff\xd8"  # the first bytes of a JPEG
 _PNG = b"\x89PNG\r\n\x1a\n"  # the first bytes of a PNG
 
 
-def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False) -> Image.Image:
+def open_image(
+    path: Path, formats: Sequence[str], *, header_only: bool = False, page: int = 0
+) -> Image.Image:
     """Open an image file without decoding its pixels.
 
     Args:
         path: the file.
         formats: the formats to accept, by Pillow's names.
         header_only: the caller does not decode the pixels, so the scans of a JPEG are not checked.
+        page: which page of a file with several, from 0.
 
     Raises:
         ValueError: larger than `MOST_PIXELS` or `LONGEST_SIDE`, or malicious.
@@ -55,6 +60,8 @@ def open_image(path: Path, formats: Sequence[str], *, header_only: bool = False)
         _check_header(file)
     image = Image.open(path, formats=list(formats))
     try:
+        if page:
+            image.seek(page)
         _check_size(image)
         if not header_only and image.format in ("JPEG", "MPO"):
             _check_scans(image, path)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from snowsplat.data.colmap import find_models, find_models_below, read_colmap
@@ -15,7 +15,10 @@ from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.files.mask_pixels import has_shape
 from snowsplat.data.files.photos import photos_below
 from snowsplat.data.mask_lookup import with_masks
+from snowsplat.data.near import near_of
+from snowsplat.data.place import moved_to_origin
 from snowsplat.data.transforms_json import find_transforms, read_transforms
+from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.natural_order import natural_key
 from snowsplat.util.safe_json import is_file, quoted
@@ -77,13 +80,14 @@ def load_dataset(
     ).dataset(resolution)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class DatasetFiles:
     """The files of a dataset, read and checked: they become a `Dataset` at any resolution.
 
     Attributes:
         images: each image, the header of its file, and the result of `_file_sizes`.
         test_names: names of the views to hold out.
+        origin: see `Dataset.origin`.
     """
 
     root: Path
@@ -91,6 +95,7 @@ class DatasetFiles:
     points: Points | None
     description: str
     test_names: set[str]
+    origin: Origin
 
     def dataset(self, resolution: int | None) -> Dataset:
         """The dataset at a resolution, see `load_dataset`; reads no file.
@@ -102,6 +107,9 @@ class DatasetFiles:
         views = sorted(
             (_view(*image, resolution) for image in self.images), key=lambda view: view.name
         )
+        points = None if self.points is None else self.points.xyz
+        near = near_of([view.camera for view in views], points)
+        views = [replace(view, camera=replace(view.camera, near=near)) for view in views]
         train = [view for view in views if view.name not in self.test_names]
         if not train:
             raise UserError(
@@ -114,6 +122,7 @@ class DatasetFiles:
             points=self.points,
             extent=scene_extent([view.camera for view in train]),
             description=self.description,
+            origin=self.origin,
         )
 
 
@@ -135,6 +144,7 @@ def read_files(
     """
     root = Path(path)
     posed, points, description = _read(root, images)
+    posed, points, origin = moved_to_origin(posed, points)
     folder = root.parent if root.is_file() else root
     posed = with_masks(folder, _with_depth_maps(folder / "depths", posed))
     posed = _with_smaller_copies(posed, resolution)
@@ -153,6 +163,7 @@ def read_files(
         points,
         description,
         _test_names(posed, hold_out, first_held_out, test_list),
+        origin,
     )
 
 
@@ -166,6 +177,11 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         models = find_models_below(root, images) or models
     if transforms and not models:
         return read_transforms(transforms, images)
+    if root.suffix.lower() == ".zip" and root.is_file():
+        raise UserError(
+            f"{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
+            f"it, run: snowsplat make {root} -o OUT"
+        )
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
     if not models or not ((root / images).is_dir() or photos_below(root)):
@@ -198,7 +214,7 @@ def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
         stems = (str(Path(image.file).with_suffix("")), image.file)
         names = (folder / (stem + suffix) for stem in stems for suffix in DEPTH_SUFFIXES)
         depth = image.depth or next((name for name in names if is_file(name)), None)
-        found.append(dataclasses.replace(image, depth=depth))
+        found.append(replace(image, depth=depth))
     return found
 
 
@@ -227,7 +243,7 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
                     "is missing" if found is None else f"is not 1/{resolution} of the large image",
                 )
             return posed
-        smaller.append(dataclasses.replace(image, folder=folder, file=found, divided=resolution))
+        smaller.append(replace(image, folder=folder, file=found, divided=resolution))
     return smaller
 
 

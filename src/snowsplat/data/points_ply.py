@@ -36,7 +36,7 @@ def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: xyz (P, 3) float32 and rgb (P, 3) uint8.
+    """Read a point cloud: xyz (P, 3) float32, or float64 as in the file, and rgb (P, 3) uint8.
 
     Floating-point colours are expected in 0..1. Without colours, all points are grey (128).
 
@@ -46,7 +46,8 @@ def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     table = open_table(path)
     if not all(name in table.columns for name in _POSITION):
         raise UserError(f"{path}: not a point cloud; the PLY file needs columns x, y, z")
-    xyz = np.empty((table.count, 3), np.float32)
+    double = any(np.dtype(table.columns[name]) == np.float64 for name in _POSITION)
+    xyz = np.empty((table.count, 3), np.float64 if double else np.float32)
     rgb = np.full((table.count, 3), 128, np.uint8)
     colors = [name for name in _RGB if name in table.columns]
     with np.errstate(over="ignore", invalid="ignore"):

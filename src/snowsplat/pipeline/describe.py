@@ -15,11 +15,13 @@ from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
+from snowsplat.sfm.ingest.archive import files_in, is_zip
 from snowsplat.training.core import checkpoint_file
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import read_json
 
+_ROOT_OF_SOG = "meta.json"  # the file that a zip file with a scene has
 _PERCENTILES = (1, 50, 99)
 
 
@@ -34,6 +36,7 @@ def describe(path: Path | str) -> dict[str, Any]:
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
       ``path`` is the output folder of `train` or of `make`.
+    - "zip file": number of photos and videos.
     - "photos" or "video": what `sfm` and `make` would use of it; see `describe_photos`.
     - "dataset": number and sizes of the photos, focal lengths, number of points, extent, and
       what is impossible or doubtful about the cameras.
@@ -51,6 +54,10 @@ def describe(path: Path | str) -> dict[str, Any]:
         return _checkpoint(path)
     if (path / INDEX).is_file():
         path = path / INDEX
+    if is_zip(path) and not any(name.endswith(_ROOT_OF_SOG) for name in files_in(path)):
+        from snowsplat.pipeline.describe_photos import describe_zip  # pycolmap and torch
+
+        return describe_zip(path)
     if path.is_file():
         try:
             format = format_for_reading(path)

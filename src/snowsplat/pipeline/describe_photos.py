@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from snowsplat.data.files.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, steps_of
+from snowsplat.sfm.ingest.archive import files_in
 from snowsplat.sfm.ingest.clip import max_frame_count, read_clip
 from snowsplat.sfm.ingest.photo_files import Header, Unusable, read_header
-from snowsplat.sfm.ingest.sources import Source, Sources
+from snowsplat.sfm.ingest.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sources
 from snowsplat.sfm.survey import survey
 from snowsplat.util.duration import duration
 from snowsplat.util.files import shown
@@ -50,6 +52,23 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
         **({} if doubt is None else {"doubtful": doubt}),
         "camera_poses": f"none; to estimate them takes about {time}",
         "next": f"snowsplat make {path}",
+    }
+
+
+def describe_zip(path: Path) -> dict[str, Any]:
+    """What a zip file contains; it is not unpacked.
+
+    Raises:
+        UserError: see `snowsplat.sfm.ingest.archive.unpack`.
+    """
+    suffixes = [PurePosixPath(name).suffix.lower() for name in files_in(path)]
+    return {
+        "kind": "zip file",
+        "path": str(path),
+        "photos": sum(suffix in PHOTO_SUFFIXES for suffix in suffixes),
+        "videos": sum(suffix in VIDEO_SUFFIXES for suffix in suffixes),
+        "files": len(suffixes),
+        "next": f"snowsplat make {path}, which unpacks it into a folder beside it",
     }
 
 

@@ -19,6 +19,7 @@ from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
+from snowsplat.pipeline.run.photo_check import check_test_photos
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainResult
@@ -249,6 +250,7 @@ class _Job:
         files = settings.read_files()
         dataset = files.dataset(settings.resolution)
         self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
+        check_test_photos(dataset.test)
         plan = None
         if budget is not None:
             plan = budget.plan(

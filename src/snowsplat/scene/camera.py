@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid, transform_points
+from snowsplat.scene.near_plane import NEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +21,8 @@ class Camera:
     pixel in column i and row j is at (i + 0.5, j + 0.5). This is also COLMAP's convention.
 
     Raises:
-        ValueError: a size or focal length is not positive, or the shape of the pose is not (3, 4).
+        ValueError: a size, a focal length or the near plane is not positive, or the shape of the
+            pose is not (3, 4).
     """
 
     width: int  # pixels
@@ -30,12 +32,15 @@ class Camera:
     cx: float  # pixels
     cy: float  # pixels
     cam_from_world: Tensor  # (3, 4) float64, [R | t]; may require grad
+    near: float = NEAR  # world units, > 0; nearer Gaussians are not drawn; see `near_plane`
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a camera needs a positive size, not {self.width}x{self.height}")
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError(f"a camera needs positive focal lengths, not {self.fx}, {self.fy}")
+        if not self.near > 0:
+            raise ValueError(f"a camera needs a positive near plane, not {self.near}")
         if self.cam_from_world.shape != (3, 4):
             raise ValueError(f"cam_from_world is (3, 4), not {tuple(self.cam_from_world.shape)}")
 

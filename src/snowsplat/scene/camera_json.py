@@ -14,6 +14,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
+from snowsplat.scene.near_plane import NEAR
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import read_json
@@ -51,6 +52,7 @@ def entries_of(cameras: Iterable[tuple[str, Camera]]) -> list[dict[str, Any]]:
                 "rotation": pose[:, :3].tolist(),
                 "fy": camera.fy,
                 "fx": camera.fx,
+                "near": camera.near,
             }
         )
     return entries
@@ -99,4 +101,5 @@ def _camera(entry: dict[str, Any]) -> Camera:
     # The file has rounded numbers; this makes the matrix exactly orthonormal.
     rotation = rotation_from_quat(quat_from_rotation(rotation))
     pose = torch.cat([rotation.T, -(rotation.T @ position)[:, None]], 1)
-    return Camera(width, height, fx, fy, width / 2, height / 2, pose)
+    near = float(entry.get("near", NEAR))  # other programs do not write it
+    return Camera(width, height, fx, fy, width / 2, height / 2, pose, near)

@@ -47,6 +47,7 @@ def view_of(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) 
         camera.cx,
         camera.cy,
         sh_degree=degree,
+        near=camera.near,
         antialiased=gaussians.antialiased,
     )
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.placement import Placement, placement_of
+from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.evaluation import verdict
 from snowsplat.sfm.more_photos import Advice, advice
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
@@ -234,7 +235,7 @@ def _thumbnail(path: Path) -> Image.Image:
     with Image.open(path) as image:
         image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # faster JPEG decoding
         width = max(1, round(image.width * _THUMBNAIL_HEIGHT / image.height))
-        small = image.convert("RGBA" if "A" in image.mode else "RGB")
+        small = plain_pixels(image, path)
         small = small.resize((width, _THUMBNAIL_HEIGHT), Image.Resampling.LANCZOS)
     if small.mode == "RGBA":
         ground = Image.new("RGBA", small.size, (128, 128, 128, 255))

@@ -29,6 +29,7 @@ from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.pinhole_model import write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -185,16 +186,15 @@ def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
             with _atomic_path_in_new_folder(target) as temporary:
                 shutil.copyfile(source, temporary)
         if job.pinhole.nodes is not None or divisors or job.mask:
-            profile = opened.info.get("icc_profile")
-            photo = _eight_bit(_decode(opened, source))
+            photo = _decode(opened, source)
             opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
         if job.pinhole.nodes is not None or divisors:
             image = undistort_image(photo, job.pinhole)
             if job.pinhole.nodes is not None:
-                _save(image, target, form, profile)
+                _save(image, target, form)
             for divisor in divisors:
                 folder = dataset / f"images_{divisor}"
-                _save(_reduced(image, divisor), folder / job.name, form, profile)
+                _save(_reduced(image, divisor), folder / job.name, form)
     return job.mask and _undistort_mask(dataset, job, opaque)
 
 
@@ -234,21 +234,11 @@ def _open_photo(path: Path, job: _Job) -> Image.Image:
 
 
 def _decode(opened: Image.Image, path: Path) -> Image.Image:
+    """Mode L or RGB, or RGBA if the image may have transparent pixels."""
     try:
-        opened.load()
+        return plain_pixels(opened, path)
     except Exception as error:  # as in `_open_photo`
         raise UserError(f"{path}: cannot be decoded ({reason_of(error)}); replace it") from None
-    return opened
-
-
-def _eight_bit(image: Image.Image) -> Image.Image:
-    """Mode L or RGB, or RGBA if the image may have transparent pixels."""
-    if image.mode.startswith("I"):  # 16-bit grey: convert() would clip it, not scale it
-        grey = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255).astype(np.uint8)
-        return Image.fromarray(grey)
-    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
-        return image.convert("RGBA")
-    return image if image.mode in ("L", "RGB") else image.convert("RGB")
 
 
 def _reduced(image: Image.Image, divisor: int) -> Image.Image:
@@ -267,7 +257,7 @@ def _atomic_path_in_new_folder(path: Path) -> AbstractContextManager[Path]:
     return atomic_path(path)
 
 
-def _save(image: Image.Image, path: Path, form: str, profile: bytes | None = None) -> None:
-    """Save without metadata except the colour profile, which defines the colours."""
+def _save(image: Image.Image, path: Path, form: str) -> None:
+    """Save without metadata: the colours are those of sRGB."""
     with _atomic_path_in_new_folder(path) as temporary:
-        image.save(temporary, form, icc_profile=profile, **_SAVING[form])
+        image.save(temporary, form, icc_profile=None, **_SAVING[form])

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
+from snowsplat.scene.near_plane import near_plane
 from snowsplat.trajectory.focus import (
     DEFAULT_UP,
     focus_of,
@@ -152,7 +153,8 @@ def orbit_path(
     elevation = math.radians(15)
     focal = 1.2 * min(width, height)
     pose = look_at(focus - torch.tensor([0.0, 0.0, radius]), focus, DEFAULT_UP)
-    lens = Camera(width, height, focal, focal, width / 2, height / 2, pose)
+    near = near_plane(radius)
+    lens = Camera(width, height, focal, focal, width / 2, height / 2, pose, near)
 
     def circle(t: Tensor) -> Tensor:
         angle = 2 * math.pi * t

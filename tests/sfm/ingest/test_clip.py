@@ -3,9 +3,19 @@
 from fractions import Fraction
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
+from av.stream import Disposition
 
-from snowsplat.sfm.ingest.clip import Clip, decoded_frames, max_frame_count, open_video, read_clip
+from snowsplat.sfm.ingest.clip import (
+    Clip,
+    decoded_frames,
+    is_video,
+    max_frame_count,
+    open_video,
+    read_clip,
+)
 from snowsplat.util.errors import UserError
 
 from ..pictures import HEIGHT, WIDTH, pan, write_video
@@ -52,6 +62,50 @@ def test_empty_truncated_and_text_files(tmp_path):
         (tmp_path / "b.mp4").write_bytes(content)
         with pytest.raises(UserError, match=r"b.mp4: no frame of this video can be decoded.*copy"):
             read_clip(tmp_path / "b.mp4")
+
+
+def write_streams(path, films) -> None:
+    """A file with several video streams: (pictures, codec, disposition) each."""
+    with av.open(str(path), "w") as container:
+        streams = []
+        for pictures, codec, disposition in films:
+            stream = container.add_stream(codec, rate=10)
+            stream.height, stream.width = pictures[0].shape[:2]
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            stream.disposition = disposition
+            streams.append(stream)
+        for stream, (pictures, _, _) in zip(streams, films, strict=True):
+            for picture in pictures:
+                frame = av.VideoFrame.from_ndarray(picture, "rgb24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv"])
+def test_the_film_is_read_and_not_a_cover_or_a_preview(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    small = [np.ascontiguousarray(picture[::2, ::2]) for picture in pan(6)]
+    cover, default = Disposition.attached_pic, Disposition.default
+    none = Disposition(0)
+    write_streams(
+        path,
+        [(pan(1), "mjpeg", cover), (small, "libx264", none), (pan(6), "libx264", none)],
+    )
+    found = read_clip(path)
+    assert (found.width, found.packets) == (WIDTH, 6)
+    with open_video(path) as container:
+        assert len(list(decoded_frames(container))) == 6
+    write_streams(path, [(small, "libx264", default), (pan(6), "libx264", none)])
+    assert read_clip(path).width == WIDTH
+    write_streams(path, [(pan(6), "libx264", none), (pan(4), "libx264", default)])
+    assert read_clip(path).packets == 4
+
+
+def test_a_file_with_only_a_cover_picture(tmp_path):
+    write_streams(tmp_path / "a.mp4", [(pan(1), "mjpeg", Disposition.attached_pic)])
+    assert not is_video(tmp_path / "a.mp4")
+    with pytest.raises(UserError, match=r"a.mp4: has no video; use"):
+        read_clip(tmp_path / "a.mp4")
 
 
 def clip(seconds, rate=30):

@@ -373,3 +373,28 @@ def test_find_inputs_lists_all_files_that_are_read(tmp_path):
     assert listed == ["p/0.jpg", "p/1.jpg", "p/masks/1.png", "p/2.jpg", "a.mp4"]
     with pytest.raises(UserError):
         find_inputs([tmp_path / "absent"])
+
+
+def test_the_pages_of_a_scan_are_photos(tmp_path):
+    root = tmp_path / "p"
+    root.mkdir()
+    pages = [photo(20 * i) for i in range(3)]
+    small = photo().resize((80, 60))  # a preview
+    pages[0].save(root / "scan.tif", save_all=True, append_images=[*pages[1:], small])
+    made = gathered(root, tmp_path / "out")
+    assert [p.name for p in made.photos] == ["scan.png", "scan_page002.png", "scan_page003.png"]
+    for p, offset in zip(made.photos, (0, 20, 40), strict=True):
+        with Image.open(tmp_path / "out" / "input" / p.name) as image:
+            assert np.array_equal(np.asarray(image), wall(offset))
+
+
+@pytest.mark.parametrize("ending", ["webp", "png"])
+def test_an_animation_is_named(tmp_path, ending):
+    root = write_photos(tmp_path / "p")
+    pages = [photo(20 * i) for i in range(4)]
+    pages[0].save(root / f"a.{ending}", save_all=True, append_images=pages[1:])
+    made = gathered(root, tmp_path / "out")
+    assert len(made.photos) == 4
+    assert [reason for _, reason in made.skipped] == [
+        "is an animation of 4 pictures, of which one is used; save the others as photos or a video"
+    ]

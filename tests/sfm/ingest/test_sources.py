@@ -56,15 +56,16 @@ def test_names_of_several_inputs_do_not_collide(tmp_path):
 
 
 def test_videos_beside_photos_are_skipped_and_named(tmp_path):
-    root = write_photos(tmp_path / "p", 2)
-    write_video(root / "0.MOV", pan(3))
+    root = write_photos(tmp_path / "p", 3)
+    write_video(root / "9.MOV", pan(3))
     found = find_sources([root])
-    assert [s.name for s in found.files] == ["0.jpg", "1.jpg"]
-    assert found.left_out[0][0].endswith("0.MOV")
-    os.remove(root / "0.jpg"), os.remove(root / "1.jpg")
+    assert [s.name for s in found.files] == ["0.jpg", "1.jpg", "2.jpg"]
+    assert found.left_out[0][0].endswith("9.MOV")
+    for name in ("0.jpg", "1.jpg", "2.jpg"):
+        os.remove(root / name)
     assert names(root) == [""]
     write_video(root / "1.mkv", pan(3))
-    assert names(root) == ["0", "1"]
+    assert names(root) == ["1", "9"]
 
 
 def test_masks_are_found_by_both_names_and_in_both_folders(tmp_path):
@@ -156,7 +157,7 @@ def test_the_kind_of_a_file_is_determined_by_its_content(tmp_path):
         ("a.JPG", "not a photo"),
         ("a.txt", "neither a photo nor a video"),
         ("a", "neither"),
-        ("a.CR2", "is a raw photo; save it as JPEG"),
+        ("a.CR2", "is a CR2 photo, which cannot be read; save it as JPEG"),
     ],
 )
 def test_text_files_of_any_name(name, message, tmp_path):
@@ -174,9 +175,9 @@ def test_no_photos_found(tmp_path):
     with pytest.raises(UserError, match="no photos .* and no videos found"):
         find_sources([tmp_path])
     (tmp_path / "IMG_1.dng").write_bytes(b"II*\0")
-    with pytest.raises(UserError, match="only raw photos"):
+    with pytest.raises(UserError, match="has 1 DNG photo, which cannot be read"):
         find_sources([tmp_path])
-    with pytest.raises(UserError, match="is a raw photo; save it as JPEG"):
+    with pytest.raises(UserError, match="is a DNG photo, which cannot be read"):
         find_sources([tmp_path / "IMG_1.dng"])
 
 

@@ -26,6 +26,9 @@ from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
 
+# A quaternion whose squared norm differs from 1 by less than this was a unit quaternion.
+_ROUNDED = 1e-5
+
 # The supported camera models. They are pinhole cameras if all parameters after the principal point
 # are 0. The value is the number of focal lengths: 1 (f, cx, cy) or 2 (fx, fy, cx, cy).
 _FOCAL_LENGTHS = {
@@ -152,7 +155,14 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
         raise UserError(
             f"{model.folder}: the pose of image {image.name[:80]} is damaged; copy the model again"
         )
-    pose = torch.cat([rotation_from_quat(quat), translation[:, None]], 1)
+    rotation = rotation_from_quat(quat)
+    # COLMAP and its scripts compute R and t = −R C from a quaternion as it is, without dividing by
+    # its norm. If C is far from 0, this R restores C even if the quaternion is rounded.
+    norm2 = quat.square().sum()
+    if abs(float(norm2) - 1.0) < _ROUNDED:
+        identity = torch.eye(3, dtype=torch.float64)
+        rotation = identity + norm2 * (rotation - identity)
+    pose = torch.cat([rotation, translation[:, None]], 1)
     return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)
 
 

@@ -21,6 +21,9 @@ _FORMATS = (
 )
 _MAX_PIXELS = 1 << 26  # maximum number of pixels of a frame: 8192×8192
 
+# Codecs of cover pictures and previews, if there are other streams.
+_PICTURE_CODECS = ("mjpeg", "png", "bmp", "webp", "gif")
+
 # An mp4 file consists of nested boxes. A box is a header (its length and its kind) and content.
 _BOX_HEADER = 8  # bytes
 _KIND = re.compile(rb"[ -~\xa9]{4}")
@@ -36,6 +39,7 @@ _ALWAYS_ALLOWED = 1 << 16  # frames that a file of any size may declare
 if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
+    from av.video.stream import VideoStream
 
 
 @dataclass(frozen=True)
@@ -87,15 +91,42 @@ def _check_boxes(path: Path) -> None:
             start = end
 
 
+#: Why a recording of sound, perhaps with a cover picture, is no video.
+ONLY_SOUND = "has only sound, no video"
+
+
+class NoVideoError(ValueError):
+    """A file has sound or pictures, but no video; the message says so."""
+
+
 def is_video(path: Path) -> bool:
-    """Whether a file contains a video stream, by its content."""
+    """Whether a file contains a video stream, by its content. A cover picture is none."""
+    return why_no_video(path) is None
+
+
+def why_no_video(path: Path) -> str | None:
+    """Why a file is no readable video, e.g. "has only sound"; None if it is one."""
+    import av
+
+    try:
+        open_video(path).close()
+    except NoVideoError as error:
+        return str(error)
+    except (av.FFmpegError, OSError, ValueError):
+        return "is not a readable video, it may be truncated or damaged"
+    return None
+
+
+def film_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of the stored frames, as the header says; None if it is not a video."""
     import av
 
     try:
         with open_video(path) as container:
-            return bool(container.streams.video)
+            codec = video_stream(container).codec_context
+            return codec.width, codec.height
     except (av.FFmpegError, OSError, ValueError):
-        return False
+        return None
 
 
 def read_clip(path: Path) -> Clip:
@@ -110,7 +141,7 @@ def read_clip(path: Path) -> Clip:
     declared_frames = 0
     try:
         with open_video(path) as container:
-            stream = container.streams.video[0]
+            stream = video_stream(container)
             rate = float(stream.average_rate or 30)
             # This number is used only to report how much of a damaged file is missing.
             declared_frames = stream.frames
@@ -123,7 +154,9 @@ def read_clip(path: Path) -> Clip:
                         times.append(float(stamp * packet.time_base) if known else -1.0)
         with open_video(path) as container:
             first = next(decoded_frames(container), None)
-    except (av.FFmpegError, OSError, ValueError, IndexError) as error:
+    except NoVideoError as error:
+        raise UserError(f"{shown(path)}: {error}; use a video or photos") from None
+    except (av.FFmpegError, OSError, ValueError) as error:
         raise undecodable(path, error) from None
     if first is None or not times:
         raise undecodable(path, None)
@@ -185,18 +218,54 @@ def open_video(path: Path) -> InputContainer:
     # The prefix "file:" is needed because a file name may look like a URL. The metadata are not
     # used, but those of some cameras are not UTF-8, which must not raise an error.
     container = av.open(f"file:{path.absolute()}", options=options, metadata_errors="replace")
-    for stream in container.streams.video:
-        if stream.codec_context is None:  # PyAV has no decoder
+    try:
+        codec = video_stream(container).codec_context
+        if codec is None:  # PyAV has no decoder
             raise ValueError("unknown codec")
-        stream.codec_context.options = {"max_pixels": str(_MAX_PIXELS)}
+    except BaseException:
+        container.close()
+        raise
+    codec.options = {"max_pixels": str(_MAX_PIXELS)}
     return container
+
+
+def video_stream(container: InputContainer) -> VideoStream:
+    """The film in a file: of the streams that are not much smaller than the largest, the default.
+
+    Drones and cameras add a cover picture, thumbnails or a small preview as further streams. Some
+    programs mark the first stream as the default one, whatever it is.
+
+    Raises:
+        NoVideoError: there is only sound, or only pictures beside it.
+    """
+    from av.stream import Disposition
+
+    pictures = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
+    films = [stream for stream in container.streams.video if not stream.disposition & pictures]
+    if not films:
+        raise NoVideoError(ONLY_SOUND if container.streams.audio else "has no video")
+
+    def moves(stream: VideoStream) -> tuple[bool, bool]:
+        codec = stream.codec_context
+        return stream.frames != 1, codec is not None and codec.name not in _PICTURE_CODECS
+
+    def pixels(stream: VideoStream) -> int:
+        codec = stream.codec_context
+        return codec.width * codec.height if codec is not None else 0
+
+    films = [stream for stream in films if moves(stream) == max(map(moves, films))]
+    enough = max(map(pixels, films)) / 2
+    return max(
+        (stream for stream in films if pixels(stream) >= enough),
+        key=lambda stream: (bool(stream.disposition & Disposition.default), pixels(stream)),
+    )
 
 
 def decoded_frames(container: InputContainer) -> Iterator[VideoFrame]:
     """All frames that can be decoded. Damaged frames are skipped; the file may be truncated."""
     import av
 
-    stream = container.streams.video[0]
+    stream = video_stream(container)
     stream.thread_type = "AUTO"
     packets = container.demux(stream)
     while True:

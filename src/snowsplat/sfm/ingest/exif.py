@@ -28,6 +28,9 @@ _USER_COMMENT = 0x9286
 _GPS_ERROR = 31  # GPSHPositioningError, m
 _PIXEL_WIDTH = 0xA002
 _PIXEL_HEIGHT = 0xA003
+_COLOUR_SPACE = 0xA001
+_SRGB = 1
+_INTEROPERABILITY = 0xA005
 
 _PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
@@ -134,7 +137,7 @@ def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
 
 
 def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
-    """EXIF data for a copy of a photo that is upright and has this size.
+    """EXIF data for a copy of a photo that is upright, in sRGB, and has this size.
 
     Empty if the data are damaged or do not fit into a JPEG file.
     """
@@ -147,6 +150,8 @@ def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
         for tag in (_MAKER_NOTE, _USER_COMMENT, _PLANE_X, _PLANE_Y, _PLANE_UNIT):
             details.pop(tag, None)
         details[_PIXEL_WIDTH], details[_PIXEL_HEIGHT] = width, height
+        details[_COLOUR_SPACE] = _SRGB
+        details.pop(_INTEROPERABILITY, None)  # it may say that the colours are those of Adobe RGB
         content = copy.tobytes()
     except Exception:  # as in `_ifd`
         return b""

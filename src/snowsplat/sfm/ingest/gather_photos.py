@@ -41,6 +41,7 @@ class Planned:
     source: Source
     header: Header
     name: str  # relative to input/
+    page: int = 0  # of the file
 
 
 def plan_photos(
@@ -61,11 +62,22 @@ def plan_photos(
             if header.panorama:
                 skipped.append((shown(source.path), header.panorama))
                 continue
-            read.append((header.file_name(source.name, longest), source, header))
+            if header.animated > 1:
+                reason = f"is an animation of {header.animated} pictures, of which one is used; "
+                skipped.append(
+                    (shown(source.path), reason + "save the others as photos or a video")
+                )
+            name = header.file_name(source.name, longest)
+            read += [(_page_name(name, page), source, header, page) for page in header.pages]
     read.sort(key=lambda entry: (entry[0] != entry[1].name, entry[0]))
-    names = free_names([name for name, _, _ in read])
-    planned = [Planned(s, h, name) for name, (_, s, h) in zip(names, read, strict=True)]
+    names = free_names([entry[0] for entry in read])
+    planned = [Planned(s, h, name, p) for name, (_, s, h, p) in zip(names, read, strict=True)]
     return sorted(planned, key=lambda plan: natural_key(plan.name))
+
+
+def _page_name(name: str, page: int) -> str:
+    path = PurePosixPath(name)
+    return str(path.with_name(f"{path.stem}_page{page + 1:03d}{path.suffix}")) if page else name
 
 
 def evenly_spread(planned: Sequence[Planned], count: int) -> list[Planned]:
@@ -127,7 +139,7 @@ def _write_photo(
     if ready and not header.transparent:
         image = decode_small(source.path, CONTENT_SIDE)
     else:
-        image = decode(source.path, header, longest)
+        image = decode(source.path, header, longest, plan.page)
     used = read_mask(source.mask, header, header.size(longest)) if source.mask else None
     if shows_all_around(image):
         raise Unusable(PANORAMA)

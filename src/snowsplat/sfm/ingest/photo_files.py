@@ -13,15 +13,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-import numpy as np
 from PIL import Image, ImageOps
 
 from snowsplat.data import image_file
-from snowsplat.data.image_file import reason_of
+from snowsplat.data.colour_profile import is_transparent
+from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of
+from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import panorama_in_xmp
 
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Formats that COLMAP reads, by file extension.
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"),
@@ -29,8 +30,9 @@ _SUFFIXES = {
     "PNG": (".png",),
     "TIFF": (".tif", ".tiff"),
 }
-_LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")
-_TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
+_LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
+_MOST_PAGES = 1000  # of a file; further ones are not looked for
+_ANIMATIONS = ("WEBP", "PNG", "AVIF")
 _SMALLEST_SIDE = 32  # pixels; smaller images are icons
 
 
@@ -48,6 +50,9 @@ class Header:
     plain: bool  # 8 bits per channel; grey, RGB, or RGBA in a PNG
     transparent: bool  # has an alpha channel
     exif: ExifInfo
+    #: The pages of the size of the first one, from 0: a scanner writes several photos to a TIFF.
+    pages: tuple[int, ...] = (0,)
+    animated: int = 1  # number of pictures of an animation, of which only the first is used
     panorama: str | None = None  # `PANORAMA` or `STITCHED`, if the metadata say so
 
     @property
@@ -63,7 +68,8 @@ class Header:
     def is_ready(self, longest: int | None) -> bool:
         """Whether COLMAP can read the file unchanged, and its pixels are upright."""
         as_stored = self.size(longest) == (self.width, self.height)
-        return self.format in _SUFFIXES and self.plain and self.exif.orientation == 1 and as_stored
+        upright = self.exif.orientation == 1 and as_stored
+        return self.format in _SUFFIXES and self.plain and upright and len(self.pages) == 1
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
@@ -96,7 +102,7 @@ def read_header(path: Path) -> Header:
             # order to find EXIF data after them.
             has_exif = "exif" in image.info or image.format == "TIFF"
             exif = image.getexif() if has_exif else Image.Exif()
-            transparent = image.mode in _TRANSPARENT or "transparency" in image.info
+            transparent = is_transparent(image)
             plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
             xmp = _xmp(image)
@@ -110,12 +116,27 @@ def read_header(path: Path) -> Header:
                 transparent=transparent,
                 exif=read_exif(exif, width, height, xmp, image.info.get("original_orientation")),
                 panorama=panorama_in_xmp(xmp),
+                animated=getattr(image, "n_frames", 1) if image.format in _ANIMATIONS else 1,
+                pages=_pages(image),  # the last, because it reads another page
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
     return header
+
+
+def _pages(image: Image.Image) -> tuple[int, ...]:
+    """The pages of the size of the first one. Smaller ones are previews of it."""
+    if image.format != "TIFF":
+        return (0,)
+    pages, size = [0], image.size
+    with suppress(Exception):  # EOFError after the last page; other errors if one is damaged
+        for page in range(1, _MOST_PAGES):
+            image.seek(page)
+            if image.size == size:
+                pages.append(page)
+    return tuple(pages)
 
 
 def _xmp(image: Image.Image) -> bytes:
@@ -146,23 +167,23 @@ def _bits(path: Path, image: Image.Image) -> int:
     return 8
 
 
-def open_image(path: Path, *, header_only: bool = False) -> Image.Image:
+def open_image(path: Path, *, header_only: bool = False, page: int = 0) -> Image.Image:
     """Open a photo; its pixels are decoded later. Raises the errors of `image_file.open_image`."""
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
-    return image_file.open_image(path, _FORMATS, header_only=header_only)
+    return image_file.open_image(path, _FORMATS, header_only=header_only, page=page)
 
 
-def decode(path: Path, header: Header, longest: int | None) -> Image.Image:
+def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Image.Image:
     """The photo, upright and resized: mode L, RGB or, with transparent pixels, RGBA.
 
     Raises:
         Unusable: the photo is damaged.
     """
     try:
-        with open_image(path) as opened:
-            image = _eight_bits(ImageOps.exif_transpose(opened))
+        with open_image(path, page=page) as opened:
+            image = ImageOps.exif_transpose(plain_pixels(opened, path))
     except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:
@@ -179,22 +200,9 @@ def decode_small(path: Path, side: int) -> Image.Image:
     try:
         with open_image(path) as opened:
             opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
-            return _eight_bits(opened)
+            return plain_pixels(opened, path)
     except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
-
-
-def _eight_bits(image: Image.Image) -> Image.Image:
-    """Decode and convert to mode L, RGB or RGBA; raises ValueError for floating-point pixels."""
-    if image.mode.startswith("I"):  # 16-bit grey: convert() would clip it, not scale it
-        values = np.clip(np.asarray(image).astype(np.int64) // 256, 0, 255)
-        return Image.fromarray(values.astype(np.uint8))
-    if image.mode == "F":
-        raise ValueError("floating-point pixels")
-    if image.mode in _TRANSPARENT or "transparency" in image.info:
-        return image.convert("RGBA")
-    image.load()
-    return image if image.mode == "L" else image.convert("RGB")
 
 
 def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
@@ -208,20 +216,17 @@ def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
 def save(image: Image.Image, path: Path, source: Path | None = None) -> None:
     """Write as JPEG (nearly lossless) or PNG, as the extension of ``path`` says.
 
-    EXIF data and the colour profile are copied from the file ``source``, if it is given.
+    EXIF data are copied from the file ``source``, if it is given. The colours are those of sRGB.
 
     Raises:
         OSError: the disk is full.
     """
-    extra: dict[str, bytes] = {}
+    extra: dict[str, bytes | None] = {"icc_profile": None}  # not the one in ``image.info``
     if source is not None:
         with open_image(source, header_only=True) as original:
             exif = exif_for_copy(original.getexif(), *image.size)
-            profile = original.info.get("icc_profile")
-            profile_is_valid = original.mode not in ("CMYK", "LAB", "I;16")
-        extra = {"exif": exif} if exif else {}
-        if profile and profile_is_valid:  # a CMYK profile is not valid for RGB pixels
-            extra["icc_profile"] = profile
+        if exif:
+            extra["exif"] = exif
     if path.suffix.lower() == ".png":
         image.save(path, "PNG", compress_level=3, **extra)
     else:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     FIXED_SIDE,
@@ -108,7 +109,7 @@ def _cropped_and_masked(
         # The file may be a link to the original, which must not be changed.
         new = path.with_name(f".{path.name}")
         with open_image(path) as image:
-            cropped = image.crop(box)
+            cropped = plain_pixels(image, path).crop(box)
         save(cropped, new, path)
         os.replace(new, path)
     used = ~_enlarged(fixed, (photo.width, photo.height))[box[1] : box[3], box[0] : box[2]]

@@ -10,9 +10,17 @@ from typing import Literal
 
 from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
+from snowsplat.data.image_file import OPTIONAL_FORMATS
 from snowsplat.data.load import poses_in
-from snowsplat.sfm.ingest.clip import is_video
+from snowsplat.sfm.ingest.archive import files_in, is_zip, other_archive, unpack
+from snowsplat.sfm.ingest.clip import ONLY_SOUND, why_no_video
 from snowsplat.sfm.ingest.copies import find_copies
+from snowsplat.sfm.ingest.photo_or_film import photos_or_films
+from snowsplat.sfm.ingest.unread_formats import (
+    UNREAD_SUFFIXES,
+    format_name,
+    unread_photos,
+)
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
@@ -21,11 +29,13 @@ def _suffixes(names: str) -> frozenset[str]:
     return frozenset(f".{name}" for name in names.split())
 
 
-PHOTO_SUFFIXES = _suffixes("jpg jpeg jpe jfif mpo png webp tif tiff heic heif hif bmp ppm")
+PHOTO_SUFFIXES = _suffixes(
+    "jpg jpeg jpe jfif mpo png webp tif tiff heic heif hif bmp ppm "
+    + " ".join(OPTIONAL_FORMATS).lower()
+)
 VIDEO_SUFFIXES = _suffixes(
     "mp4 mov m4v mkv avi webm mpg mpeg mts m2ts ts 3gp 3g2 wmv ogv mjpeg flv insv gif"
 )
-_RAW_SUFFIXES = _suffixes("dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw")
 #: The record of the stages of a dataset, and its name in version 0.1.0.
 RECORDS = ("sfm.json", "capture.json")
 _LONGEST_NAME = 200  # bytes of a name in input/
@@ -92,8 +102,9 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     thumbnails. Of photos of the same picture, one is used. Of a dataset, the photos in ``input`` or
     ``images`` are used. Videos in a folder
     with photos are also skipped, because some phones save a video of three seconds with every
-    photo. If there is a single input, the files keep their names. If there are several, each input
-    folder and each video gets its own folder in ``input/``, so that equal names do not collide.
+    photo. A zip file is unpacked into a folder beside it. If there is a single input, the files
+    keep their names. If there are several, each input folder and each video gets its own folder in
+    ``input/``, so that equal names do not collide.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
@@ -118,6 +129,8 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     for path in inputs:
         if not path.exists():
             raise UserError(f"{shown(path)}: no such file or folder")
+        if is_zip(path):
+            path = _unpacked(path)
         if not path.is_dir():
             kind = kind_of_file(path)
             if kind == "photo":
@@ -133,21 +146,18 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
             )
         photo_folder = _photos_of_dataset(path)
         found = _search(photo_folder)
+        chosen = photos_or_films(photo_folder, found.photos, found.videos)
         prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
         left_out += found.left_out
-        for relative in found.photos:
+        left_out += [(shown(photo_folder / file), reason) for file, reason in chosen.left_out]
+        for relative in chosen.photos:
             name = str(PurePosixPath(prefix) / shown(relative))
             add(Source(photo_folder / relative, "photo", name, found.masks.of.get(relative)))
         unused += found.masks.unused
-        for relative in found.videos:
-            if found.photos:
-                reason = "is a video in a folder of photos; add it as an input to use its frames"
-                left_out.append((shown(photo_folder / relative), reason))
-            else:
-                stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
-                only = len(found.videos) == 1
-                video = prefix if only else _free(stem, folders)
-                add(Source(photo_folder / relative, "video", video))
+        for relative in chosen.videos:
+            stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
+            video = prefix if len(chosen.videos) == 1 else _free(stem, folders)
+            add(Source(photo_folder / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
     return Sources(tuple(inputs), files, left_out, unused, notes)
@@ -182,6 +192,8 @@ def _search(root: Path) -> _Folder:
         found.left_out = []  # only photos called depth/1.png: they are the photos
         files = files_below(root, _masks_and_outputs)
     photos = [file for file in files if _is_photo_name(file)]
+    if unread := unread_photos(files, photos):
+        found.left_out.append((shown(root), unread))
     found.videos = [file for file in files if _is_video_name(file)]
     for copy in find_copies(root, photos):
         found.left_out.append((shown(root / copy.name), f"is the same picture as {copy.used}"))
@@ -239,6 +251,16 @@ def _photos_of_dataset(root: Path) -> Path:
     return root
 
 
+def _unpacked(path: Path) -> Path:
+    """The folder of a zip file of photos or videos. Raises UserError if it has none."""
+    names = [PurePosixPath(name) for name in files_in(path)]
+    if any(name.name in ("means_l.webp", "lod-meta.json") for name in names):
+        raise UserError(f"{shown(path)}: is a scene, and no photos; see it with: snowsplat view")
+    if not any(name.suffix.lower() in PHOTO_SUFFIXES | VIDEO_SUFFIXES for name in names):
+        raise UserError(f"{shown(path)}: is a zip file without photos and videos")
+    return unpack(path)
+
+
 def kind_of_file(path: Path) -> Literal["photo", "video"]:
     """The kind of a file that was given as an input; it is determined by the content.
 
@@ -251,26 +273,29 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
     except OSError as error:
         raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
     suffix = path.suffix.lower()
-    if suffix in _RAW_SUFFIXES:  # many are TIFF files with a small preview
-        raise UserError(f"{shown(path)}: is a raw photo; save it as JPEG or PNG first")
+    if suffix in UNREAD_SUFFIXES:  # many are TIFF files with a small preview
+        raise UserError(
+            f"{shown(path)}: is a {format_name(path.name)} photo, which cannot be read; save it as "
+            "JPEG or PNG first"
+        )
     if _is_photo(head):
         return "photo"
-    if is_video(path):
+    if archive := other_archive(path):
+        raise UserError(f"{shown(path)}: is a {archive} archive; unpack it first")
+    no_video = why_no_video(path)
+    if no_video is None:
         return "video"
     if suffix in PHOTO_SUFFIXES:
         raise UserError(f"{shown(path)}: not a photo, despite its extension; use another file")
-    if suffix in VIDEO_SUFFIXES:
-        raise UserError(
-            f"{shown(path)}: not a readable video, it may be truncated or damaged; copy it again, "
-            "or use another file"
-        )
+    if suffix in VIDEO_SUFFIXES or no_video == ONLY_SOUND:
+        raise UserError(f"{shown(path)}: {no_video}; copy it again, or use another file")
     raise UserError(f"{shown(path)}: neither a photo nor a video; use another file")
 
 
 def _is_photo(head: bytes) -> bool:
     """Whether the first bytes are the signature of a photo format."""
     if head[4:8] == b"ftyp":  # HEIF shares its container with mp4
-        return head[8:12] in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
+        return head[8:12] in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
     if head[:4] == b"RIFF":
         return head[8:12] == b"WEBP"
     signatures = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"BM", b"P5", b"P6")
@@ -280,11 +305,8 @@ def _is_photo(head: bytes) -> bool:
 def _nothing_in(inputs: Sequence[Path]) -> UserError:
     names = ", ".join(map(shown, inputs))
     for path in inputs:
-        if any(
-            Path(file).suffix.lower() in _RAW_SUFFIXES
-            for file in files_below(path, _masks_and_outputs)
-        ):
-            return UserError(f"{names}: only raw photos; save them as JPEG or PNG first")
+        if unread := unread_photos(files_below(path, _masks_and_outputs), []):
+            return UserError(f"{names}: {unread}")
     return UserError(
         f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
         "that contains them"

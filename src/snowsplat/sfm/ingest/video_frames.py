@@ -26,6 +26,7 @@ from snowsplat.sfm.ingest.clip import (
     decoded_frames,
     open_video,
     undecodable,
+    video_stream,
 )
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
@@ -35,6 +36,7 @@ from snowsplat.sfm.ingest.fixed_parts import (
     describe_bars,
     find_fixed_parts,
 )
+from snowsplat.sfm.ingest.interlace import field_order, whole_frames
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
 from snowsplat.sfm.ingest.panorama import shows_all_around, spherical_video
@@ -108,6 +110,7 @@ def extract_frames(
     name = clip.path.name
     try:
         parts = _fixed_parts(clip)
+        order = field_order(clip)
     except (av.FFmpegError, ValueError) as error:
         raise undecodable(clip.path, error) from None
     crop = parts.crop if parts else None
@@ -116,8 +119,9 @@ def extract_frames(
     motion = FrameMotion(fixed)
     try:
         with open_video(clip.path) as container:
-            rate = float(container.streams.video[0].average_rate or 30)
-            for frame in decoded_frames(container):
+            rate = float(video_stream(container).average_rate or 30)
+            decoded = decoded_frames(container)
+            for frame in decoded if order is None else whole_frames(decoded, order):
                 timed = frame.time is not None
                 seconds = frame.time - clip.start if timed else frames.read / rate
                 grey = _cropped(_grey(frame), crop)
@@ -134,7 +138,9 @@ def extract_frames(
         raise undecodable(clip.path, None)
     frames.skipped = candidates.skipped
     if parts is not None and crop is not None:
-        frames.notes = [describe_bars(parts, True, "all frames")]
+        frames.notes.append(describe_bars(parts, True, "all frames"))
+    if order is not None:
+        frames.notes.append("the video is interlaced; rows between those of one field are computed")
     report(clip.packets, clip.packets, f"frames of {name}")
     _log_summary(clip, frames)
     return frames
@@ -282,7 +288,7 @@ def _spread_copies(clip: Clip, key_frames: bool) -> list[np.ndarray]:
     step = 1
     with open_video(clip.path) as container:
         if key_frames:
-            container.streams.video[0].codec_context.skip_frame = "NONKEY"
+            video_stream(container).codec_context.skip_frame = "NONKEY"
         for i, frame in enumerate(decoded_frames(container)):
             if i % step == 0:
                 copies.append(_grey(frame))

@@ -33,6 +33,8 @@ NOISE_SHARPNESS = 100.0
 #: On the CPU, Gaussians whose sigmoid is below this value get no noise, so that few random numbers
 #: are needed.
 NOISE_NEGLIGIBLE = 1e-4
+#: λ_Σ of the paper is for scenes of this extent, in world units; COLMAP's have 4 to 6.
+USUAL_EXTENT = 5.0
 
 
 @dataclass
@@ -41,6 +43,7 @@ class McmcDensityControl:
 
     settings: McmcDensity
     schedule: Schedule
+    extent: float
     generator: torch.Generator
     shards: Shards = ALONE
 
@@ -50,12 +53,13 @@ class McmcDensityControl:
         settings: McmcDensity,
         *,
         schedule: Schedule,
+        extent: float,
         generator: torch.Generator,
         shards: Shards = ALONE,
         **_: object,
     ) -> McmcDensityControl:
         """The initial state; see `DensityConfig.control`. The other arguments are not used."""
-        return cls(settings, schedule, generator, shards)
+        return cls(settings, schedule, extent, generator, shards)
 
     @property
     def first(self) -> int:
@@ -72,7 +76,8 @@ class McmcDensityControl:
         opacities, scales = gaussians.opacities, gaussians.scales
         count = self.shards.total(len(gaussians))
         opacity_weight = self.settings.opacity_regularizer / count
-        scale_weight = self.settings.scale_regularizer / (3 * count)
+        # λ_Σ is relative to the scene; the paper's is per world unit.
+        scale_weight = self.settings.scale_regularizer * USUAL_EXTENT / (3 * count * self.extent)
         for parameter, term in (
             (gaussians.opacity_logits, opacity_weight * opacities * (1.0 - opacities)),
             (gaussians.log_scales, scale_weight * scales),

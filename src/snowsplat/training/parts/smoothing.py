@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 INTERVAL = 100
 #: s: the variance of the filter, in units of the distance between samples, squared.
 VARIANCE = 0.2
-#: Photos show only what is farther away, in world units: the default of `ops.project`.
-_NEAR = 0.2
 
 
 class SmoothingFilter(Part):
@@ -62,7 +60,7 @@ def sampling_rates(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
     for camera in cameras:
         pixel, depth = camera.project(means)
         size = pixel.new_tensor([camera.width, camera.height])
-        inside = (depth > _NEAR) & (pixel >= 0.0).all(1) & (pixel <= size).all(1)
+        inside = (depth > camera.near) & (pixel >= 0.0).all(1) & (pixel <= size).all(1)
         rate = max(camera.fx, camera.fy) / depth
         rates = torch.maximum(rates, rate.where(inside, 0.0).to(rates.dtype))
     return rates

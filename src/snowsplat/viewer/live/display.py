@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, rotation_from_quat
+from snowsplat.scene.near_plane import NEAR
 
 Mode = Literal["color", "depth", "alpha", "normals", "points", "ellipsoids", "cost", "error"]
 
@@ -46,6 +47,7 @@ class Pose:
         position: (3,) float64, camera centre in the world frame.
         fov: vertical field of view in radians.
         width, height: size of the window in pixels.
+        near: the near plane, in world units.
     """
 
     quat: Tensor = field(repr=False)
@@ -53,12 +55,14 @@ class Pose:
     fov: float
     width: int
     height: int
+    near: float = NEAR
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of an image of this size."""
         focal = 0.5 * height / math.tan(0.5 * min(max(self.fov, _NARROWEST), _WIDEST))
         pose = torch.cat([rotation_from_quat(self.quat), self.position[:, None]], 1)
-        return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, invert_rigid(pose))
+        cx, cy = 0.5 * width, 0.5 * height
+        return Camera(width, height, focal, focal, cx, cy, invert_rigid(pose), self.near)
 
     def is_near(self, other: Pose) -> bool:
         """Whether both are the same pose, except for rounding in the browser."""
@@ -98,4 +102,4 @@ class PhotoRectangle:
         """The camera of the whole image, ``width`` × ``height``; ``camera``: of the photo."""
         inner = camera.scaled(self.width, self.height)
         cx, cy = inner.cx + self.left, inner.cy + self.top
-        return Camera(width, height, inner.fx, inner.fy, cx, cy, camera.cam_from_world)
+        return replace(inner, width=width, height=height, cx=cx, cy=cy)

@@ -150,7 +150,7 @@ class Photos:
         placed = PhotoRectangle.within(camera, width, height).camera(camera, width, height)
         pose = camera.world_from_cam.detach().to(torch.float64)
         fov = 2.0 * math.atan(0.5 * height / placed.fy)
-        return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height)
+        return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height, camera.near)
 
     def _look_at(self, camera: Camera) -> Tensor:
         """The point on the optical axis, in front of the camera, nearest to the scene centre."""

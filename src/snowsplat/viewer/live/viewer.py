@@ -97,6 +97,7 @@ class NetworkViewer:
         self.session = Session()
         self.background = torch.tensor(background, dtype=torch.float32)
         self._bounds = dataset.bounds
+        self._near = (dataset.train or dataset.test)[0].camera.near
         running = start_server(host, port, label)
         self.server, self.url, self.others = running.server, running.url, running.others
         set_theme(self.server.gui, dark=True)
@@ -145,7 +146,7 @@ class NetworkViewer:
                 move(pose)
 
         async def moved(camera: viser.CameraHandle) -> None:
-            pose = _pose(camera)
+            pose = _pose(camera, self._near)
             if pose is not None:
                 move(pose)
 
@@ -230,13 +231,13 @@ class NetworkViewer:
                 self.wait()
 
 
-def _pose(camera: viser.CameraHandle) -> Pose | None:
+def _pose(camera: viser.CameraHandle, near: float) -> Pose | None:
     """The pose of a browser; None if it is not valid."""
     quat, position = torch.from_numpy(camera.wxyz.copy()), torch.from_numpy(camera.position.copy())
     turned = _SMALL < float(quat.norm()) < 1.0 / _SMALL
-    near = float(position.norm()) < 1.0 / _SMALL
-    if not (turned and near) or min(camera.image_width, camera.image_height) < 1:
+    inside = float(position.norm()) < 1.0 / _SMALL
+    if not (turned and inside) or min(camera.image_width, camera.image_height) < 1:
         return None
     if not camera.fov > 0:
         return None
-    return Pose(quat, position, camera.fov, camera.image_width, camera.image_height)
+    return Pose(quat, position, camera.fov, camera.image_width, camera.image_height, near)

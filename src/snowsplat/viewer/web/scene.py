@@ -166,7 +166,11 @@ def ready(
         gaussians = transform(gaussians, change)
         depth *= change.scale
         cameras = [
-            replace(camera, cam_from_world=change.apply_to_poses(camera.cam_from_world))
+            replace(
+                camera,
+                cam_from_world=change.apply_to_poses(camera.cam_from_world),
+                near=change.scale * camera.near,
+            )
             for camera in cameras
         ]
     stops = stops_of(gaussians, cameras, depth, background)

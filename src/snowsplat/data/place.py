@@ -1,0 +1,46 @@
+"""Moves a dataset that is far from 0, before its numbers become float32; see `scene.origin`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from snowsplat.data.dataset import Points, PosedImage
+from snowsplat.scene.origin import HERE, Origin, origin_of
+
+
+def moved_to_origin(
+    posed: Sequence[PosedImage], points: Points | None
+) -> tuple[list[PosedImage], Points | None, Origin]:
+    """Cameras, points and the origin of a dataset as it is stored.
+
+    The poses and points that are returned are relative to the origin. It is `HERE`, and nothing is
+    moved, unless the camera centres are so far away that float32 would bend the scene.
+
+    Args:
+        posed: at least one, with poses in float64.
+        points: may be in float64; the result is in float32.
+    """
+    centres = torch.stack([image.camera.position for image in posed]).numpy()
+    # The points are the scene. But a cloud of a laser scanner may have been moved without the
+    # poses; it is the judge that finds this.
+    known = centres if points is None else np.concatenate([centres, points.xyz.double().numpy()])
+    origin = origin_of(known)
+    if origin == HERE:
+        return list(posed), _float32(points), origin
+    offset = torch.tensor(origin, dtype=torch.float64)
+    moved = []
+    for image in posed:
+        pose = image.camera.cam_from_world.clone()
+        pose[:, 3] += pose[:, :3] @ offset
+        moved.append(replace(image, camera=replace(image.camera, cam_from_world=pose)))
+    if points is not None:
+        points = Points(points.xyz.double() - offset, points.rgb)
+    return moved, _float32(points), origin
+
+
+def _float32(points: Points | None) -> Points | None:
+    return None if points is None else Points(points.xyz.float().contiguous(), points.rgb)
