@@ -239,6 +239,18 @@ def test_masks(scene, tmp_path):
         load_dataset(folder)
 
 
+@pytest.mark.parametrize("prefix", ["/home/me/scan/", "C:\\scan\\", "../"])
+def test_paths_of_another_computer(scene, prefix):
+    masks, depths = f"{prefix}m/1.png", f"{prefix}d/1.png"
+    folder = scene({"fl_x": 50}, [{"mask_path": masks, "depth_file_path": depths}])
+    for name in ("m", "d"):
+        (folder / name).mkdir()
+        Image.new("L", (40, 30), 255).save(folder / name / "1.png")
+    (view,) = load_dataset(folder, hold_out=None).train
+    assert view.mask.path == folder / "m/1.png"
+    assert view.depth == folder / "d/1.png"
+
+
 def test_depth_maps(scene, tmp_path):
     """Of nerfstudio; missing ones and those outside of the folder are ignored."""
     (tmp_path / "0.npy").touch()

@@ -55,11 +55,11 @@ def exif(tags=None, details=None, gps=None) -> Image.Exif:
     return data
 
 
-def write_photos(folder, count=3, ending="jpg"):
-    """Write ``0.jpg`` … to a new folder; returns the folder."""
+def write_photos(folder, count=3, ending="jpg", start=0):
+    """Write ``0.jpg`` … to a new folder; returns the folder. ``start`` > 0: of other places."""
     folder.mkdir(parents=True, exist_ok=True)
     for i in range(count):
-        photo(20 * i).save(folder / f"{i}.{ending}", quality=95)
+        photo(20 * (start + i)).save(folder / f"{i}.{ending}", quality=95)
     return folder
 
 

@@ -29,9 +29,8 @@ class Sfm:
       snowsplat train garden -o out         the next step
 
     Notes:
-      The mask of PHOTOS/IMG.jpg is PHOTOS/masks/IMG.jpg.png or
-      PHOTOS/masks/IMG.png (black pixels are ignored), or the transparency of the
-      photo.
+      The mask of PHOTOS/IMG.jpg is PHOTOS/masks/IMG.png, IMG.jpg.png or
+      IMG_mask.png (black pixels are ignored), or the transparency of the photo.
       DATASET/dataset_report.html shows the cameras and lists unused photos.
       If the command is interrupted, run it again to resume.
     """

@@ -19,7 +19,8 @@ def _demo(taken: dict[str, Any]) -> list[str]:
 
 def _photos(gathered: dict[str, Any]) -> list[str]:
     photos, skipped = gathered["photos"], gathered["skipped"]
-    line = f"{len(photos)} photos"
+    masks = sum(bool(photo.get("mask")) for photo in photos)
+    line = f"{len(photos)} photos" + (f" ({masks} with masks)" if masks else "")
     if skipped:
         line += f", {len(skipped)} skipped"
     notes = gathered.get("notes", [])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from snowsplat.data.bit_depth import eight_bits
 from snowsplat.data.colour_profile import is_transparent, to_srgb
+from snowsplat.data.files.mask_pixels import mask_levels
 from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of
 from snowsplat.data.lens.resample import resampled
 from snowsplat.data.lens.views import LensView
@@ -165,9 +166,9 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
 
 
 def load_mask(source: ImageSource) -> Tensor:
-    """Decode a mask to (H, W) bool: True where its largest channel is 128 or more.
+    """Decode a mask to (H, W) bool: True where its level is 128 or more, see `mask_levels`.
 
-    Transparent pixels count as black, and so do those of a view that the lens does not show.
+    Pixels of a view that the lens does not show are False.
 
     Raises:
         UserError: see `load_image`.
@@ -175,8 +176,13 @@ def load_mask(source: ImageSource) -> Tensor:
     covered = torch.from_numpy(_covered(source.view, source.width, source.height))
     if source.blank:
         return covered
-    planes = load_image(source, background=(0.0, 0.0, 0.0))
-    return (planes.amax(0) >= 128) & covered
+    try:
+        with open_image(source.path, _FORMATS) as opened:
+            levels = mask_levels(_upright(opened, source))
+    except Exception as error:  # as above
+        raise _unreadable(source.path, error) from None
+    scaled = _scaled(levels[None], source.view, source.width, source.height)[0]
+    return torch.from_numpy(scaled >= 128) & covered
 
 
 def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:

@@ -10,21 +10,24 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.data.colmap import find_models, read_colmap
+from snowsplat.data.colmap import find_models, find_models_below, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.files.photos import photos_below
 from snowsplat.data.imports import find_export, read_export
 from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
+from snowsplat.data.mask_lookup import with_masks
 from snowsplat.data.near import near_of
 from snowsplat.data.place import moved_to_origin
 from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.natural_order import natural_key
 from snowsplat.util.safe_json import is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -63,9 +66,9 @@ def load_dataset(
         resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
             they are complete. Any other number is a width in pixels to which wider images are
             scaled down. None or −1 keeps the size.
-        hold_out: every ``hold_out``-th image in the order of names is held out for testing. If the
-            dataset has its own split, this split is used instead. None: no image is held out, even
-            if the dataset has its own split.
+        hold_out: every ``hold_out``-th image in the natural order of names (img_9 before img_10)
+            is held out for testing. If the dataset has its own split, this split is used instead.
+            None: no image is held out, even if the dataset has its own split.
         first_held_out: index of the first of these images. 0 is the protocol of the papers. If
             there are not so many images, the middle one is held out.
         test_list: names of the test images, or a text file with one name per line. It replaces
@@ -160,7 +163,8 @@ def read_files(
     root = Path(path)
     posed, points, description = _read(root, images)
     posed, points, origin = moved_to_origin(posed, points)
-    posed = _with_depth_maps((root.parent if root.is_file() else root) / "depths", posed)
+    folder = root.parent if root.is_file() else root
+    posed = with_masks(folder, _with_depth_maps(folder / "depths", posed))
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
     sizes = _file_sizes(posed, headers)
@@ -190,9 +194,9 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse") or ([] if transforms else find_models(root))
     models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
-    if models:
-        return read_colmap(root, models, images)
-    if transforms:
+    if not transforms and not (models and (root / images).is_dir()):  # dense/0/sparse, sfm …
+        models = find_models_below(root, images) or models
+    if transforms and not models:
         return read_transforms(transforms, images)
     export = export or find_export(root)
     if export and export.cameras and not models:
@@ -204,12 +208,27 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         )
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
+    if not models or not ((root / images).is_dir() or photos_below(root)):
+        above = next((p for p in root.absolute().parents[:2] if poses_in(p)), None)
+        if above is not None:
+            raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
+    if models:
+        return read_colmap(root, models, images)
     if (known := advice(root)) is not None:
         raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
     raise NoPosesError(
         f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
         "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"
     )
+
+
+def poses_in(root: Path) -> str | None:
+    """What gives the poses of the photos in a folder: "sparse/0" or "transforms.json"; or None."""
+    models = find_models(root / "sparse")
+    files = models[:1] or find_transforms(root)
+    if not files and (export := find_export(root)) and export.cameras:
+        return f"{export.kind.name}, {export.cameras.relative_to(root).as_posix()}"
+    return files[0].relative_to(root).as_posix() if files and root.is_dir() else None
 
 
 def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
@@ -450,7 +469,7 @@ def _test_names(
     first: int,
     test_list: Path | str | Sequence[str] | None,
 ) -> set[str]:
-    names = sorted(image.name for image in posed)
+    names = sorted((image.name for image in posed), key=natural_key)
     if test_list is not None:
         return _listed(names, test_list)
     if hold_out is None:

@@ -20,7 +20,9 @@ from __future__ import annotations
 import logging
 import math
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +32,7 @@ import torch
 from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
+from snowsplat.data.files.photos import find_photos
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.transforms_lens import is_panorama, lens_of
@@ -43,6 +46,8 @@ logger = logging.getLogger(__name__)
 # Converts OpenGL's camera axes to OpenCV's; it is its own inverse.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
+# Parts of a path of another computer that are tried.
+_MOST_PARTS = 16
 # Two statements of a focal length differ by less than this factor, or contradict each other.
 _SAME_LENS = 1.05
 
@@ -75,9 +80,51 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
     Raises:
         UserError: a file is damaged or of another kind, or no image is there.
     """
+    root = files[0].parent
+    shown = " + ".join(path.name for path in files)
+    frames, first_scene = _frames(files)
+    found = _files_of(root / shown, root, [frame.name for frame in frames], images)
+    split = _without_overlap(root, files, frames, found)
     posed: dict[str, PosedImage] = {}
-    missing: list[str] = []
-    frame_count = 0
+    seen: set[tuple[str, _Split | None]] = set()
+    for frame in frames:
+        file = found.get(frame.name)
+        if file is None:
+            continue
+        if (file, frame.split) in seen:
+            raise UserError(
+                f"{frame.where}: the image {file} also belongs to another frame; remove one of them"
+            )
+        seen.add((file, frame.split))
+        if file not in posed:
+            posed[file] = _posed_image(frame.where, root, file, frame.values, split[file])
+    missing = [frame.name for frame in frames if frame.name not in found]
+    if not posed:
+        problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"
+        hint = f" (the first is {quoted(missing[0])})" if missing else ""
+        raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
+    if missing:
+        logger.warning(
+            "%s: %d of %d images are missing (the first is %s); skipped",
+            root / shown,
+            len(missing),
+            len(frames),
+            quoted(missing[0]),
+        )
+    return list(posed.values()), _points(root, first_scene), shown
+
+
+@dataclass(frozen=True)
+class _Frame:
+    where: str  # the start of error messages
+    name: str  # its file_path
+    values: ChainMap[str, Any]  # the entries of the frame, then those of the file
+    split: _Split | None
+
+
+def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
+    """The frames of all files, and the first file."""
+    frames: list[_Frame] = []
     first_scene: _Json = {}
     for index, path in enumerate(files):
         scene = _read_json(path)
@@ -91,34 +138,37 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
             where = f"{path}: frame {number}"
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise UserError(f"{where}: no file_path; export the file again")
-            frame_count += 1
-            file = _find_file(where, path.parent, frame["file_path"], images)
-            if file is None:
-                missing.append(frame["file_path"][:80])
-                continue
-            image_split = split or splits.get(safe_name(frame["file_path"]))
-            image = _posed_image(where, path.parent, file, ChainMap(frame, scene), image_split)
-            if image.name in posed:
-                raise UserError(
-                    f"{where}: the image {file} also belongs to another frame; remove one of them"
-                )
-            posed[image.name] = image
-    shown = " + ".join(path.name for path in files)
-    if not posed:
-        problem = (
-            f"all of its {frame_count} images are missing" if frame_count else "it has no frames"
-        )
-        hint = f" (the first is {missing[0]!r})" if missing else ""
-        raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
-    if missing:
-        logger.warning(
-            "%s: %d of %d images are missing (the first is %r); skipped",
-            files[0].parent / shown,
-            len(missing),
-            frame_count,
-            missing[0],
-        )
-    return list(posed.values()), _points(files[0].parent, first_scene), shown
+            name = frame["file_path"]
+            named = split or splits.get(safe_name(name))
+            frames.append(_Frame(where, name, ChainMap(frame, scene), named))
+    return frames, first_scene
+
+
+def _without_overlap(
+    root: Path, files: list[Path], frames: list[_Frame], found: Mapping[str, str]
+) -> dict[str, _Split | None]:
+    """The split of each image file. Logs a line if images are in both splits.
+
+    Such images are held out. But if all images for training are held out, the second file says
+    nothing about a split, for example as a copy of the first one.
+    """
+    splits: dict[str, set[_Split | None]] = {}
+    for frame in frames:
+        if frame.name in found:
+            splits.setdefault(found[frame.name], set()).add(frame.split)
+    both = {file for file, named in splits.items() if len(named) > 1}
+    single = {file: next(iter(named)) for file, named in splits.items() if file not in both}
+    if not both:
+        return single
+    shown = " and ".join(path.name for path in files)
+    if "train" in single.values():
+        logger.warning("%s: %d images are in both %s; they are held out", root, len(both), shown)
+        return single | dict.fromkeys(both, "test")
+    if "test" in single.values():
+        logger.warning("%s: %d images are in both %s; trained on", root, len(both), shown)
+        return single | dict.fromkeys(both, "train")
+    logger.warning("%s: the same images are in %s, so this is no split", root, shown)
+    return dict.fromkeys(both)
 
 
 def _posed_image(
@@ -168,8 +218,17 @@ def _named_splits(scene: _Json) -> dict[str, _Split]:
 
 
 def _path_inside(where: str, root: Path, name: str) -> Path:
-    """``root / name``; raises `UserError` if that is outside the folder ``root``."""
-    path = inside(root, name.replace("\\", "/"))
+    """``root / name``, or if that is not there, the end of ``name`` that is a path in ``root``.
+
+    Raises:
+        UserError: there is no such file, and ``root / name`` is outside the folder ``root``.
+    """
+    name = name.replace("\\", "/")
+    path = inside(root, name)
+    if path is None or not is_file(path):
+        parts = [part for part in name.split("/") if part not in ("", ".", "..")]
+        ends = ["/".join(parts[-count:]) for count in range(min(len(parts), _MOST_PARTS), 1, -1)]
+        path = next((root / end for end in ends if is_file(root / end)), path)
     if path is None:
         raise UserError(
             f"{where}: {quoted(name)} is not in the folder of the JSON file; copy it there and use "
@@ -178,10 +237,20 @@ def _path_inside(where: str, root: Path, name: str) -> Path:
     return path
 
 
-def _find_file(where: str, root: Path, name: str, images: str) -> str | None:
-    """The path of a frame's image relative to ``root``; None if it is missing."""
+def _files_of(where: Path, root: Path, names: Sequence[str], images: str) -> dict[str, str]:
+    """The files that the names of images mean, relative to ``root``; see `find_photos`."""
+    names = list(dict.fromkeys(names))
+    found = {name: file for name in names if (file := _find_file(root, name, images))}
+    if left := [name for name in names if name not in found]:
+        found |= find_photos(where, root, left, set(found.values()))
+    return found
+
+
+def _find_file(root: Path, name: str, images: str) -> str | None:
+    """The path of a frame's image relative to ``root``, if it is where its name says."""
     name = name.replace("\\", "/").removeprefix("./")
-    _path_inside(where, root, name)  # after removeprefix: ".//x" has become the absolute path "/x"
+    if inside(root, name) is None:
+        return None
     if images != "images" and name.startswith("images/"):
         name = f"{images}/{name.removeprefix('images/')}"
     for suffix in ("", *IMAGE_SUFFIXES, *(s.upper() for s in IMAGE_SUFFIXES)):
@@ -205,8 +274,12 @@ def _mask(where: str, root: Path, frame: Mapping[str, Any]) -> Path | None:
 def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
     """The depth map of a frame; None if it is missing, because most recipes do not need it."""
     name = frame.get("depth_file_path", frame.get("depth_path"))
-    path = inside(root, name.replace("\\", "/")) if isinstance(name, str) and name else None
-    return path if path is not None and is_file(path) else None
+    if not isinstance(name, str) or not name:
+        return None
+    with suppress(UserError):
+        path = _path_inside("", root, name)
+        return path if is_file(path) else None
+    return None
 
 
 def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from snowsplat.data.files.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, steps_of
@@ -25,7 +26,8 @@ _NAMED = 5
 def describe_photos(sources: Sources) -> dict[str, Any]:
     """The properties of the photos and videos in a file or folder, as a JSON object.
 
-    Reads headers only: the frames of videos and the pixels of photos are not decoded.
+    Reads headers, and decodes up to 16 masks: the frames of videos and the pixels of photos are not
+    decoded, unless two photos may be copies.
 
     Raises:
         UserError: a video is not readable.
@@ -39,6 +41,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
     speed = measure_speed(thread_count(None))
     steps = steps_of(photos, PRESETS["normal"].photos, "normal").values()
     time = duration(sum(step.seconds(speed) for step in steps))
+    doubt = doubt_about_files([s.mask for s in sources.photos if s.mask is not None])
     return {
         "kind": "photos" if usable else "video",
         "path": str(path),
@@ -46,6 +49,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
         **({"videos": _of_videos(sources.videos)} if sources.videos else {}),
         **_first(left_out, "not_used"),
         **_first([(shown(p), "has no photo") for p in sources.unused_masks], "unused_masks"),
+        **({} if doubt is None else {"doubtful": doubt}),
         "camera_poses": f"none; to estimate them takes about {time}",
         "next": f"snowsplat make {path}",
     }

@@ -439,7 +439,12 @@ def _gaussians_in(start: Checkpoint) -> int:
 def _described(dataset: Dataset) -> str:
     camera = dataset.train[0].camera
     points = "no points" if dataset.points is None else f"{len(dataset.points):,} points"
+    masks = sum(view.mask is not None for view in dataset.train)
     return (
-        f"{dataset.description}: {len(dataset.train)} photos to train on, {len(dataset.test)} "
-        f"held out, {camera.width}x{camera.height}, {points}"
+        f"{dataset.description}: {len(dataset.train)} photos to train on{_with_masks(masks)}, "
+        f"{len(dataset.test)} held out, {camera.width}x{camera.height}, {points}"
     )
+
+
+def _with_masks(count: int) -> str:
+    return f" ({count} with masks)" if count else ""

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.util.natural_order import natural_key
+
 #: At most about this number of points is measured.
 _POINTS = 20_000
 #: Two photos are neighbours if they share at least this share of the points of one of them.
@@ -48,7 +50,7 @@ def measure_coverage(model: Path) -> Coverage:
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction(model)
-    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    images = sorted(reconstruction.images.values(), key=lambda image: natural_key(image.name))
     row = {image.image_id: i for i, image in enumerate(images)}
     ids = sorted(reconstruction.point3D_ids())
     points = [reconstruction.point3D(i) for i in ids[:: -(-len(ids) // _POINTS) or 1]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.trajectory.focus import positions_of, rotations_of
+from snowsplat.util.natural_order import natural_key
 
 #: If there are more cameras than this, only every n-th camera is used. A tour through all of them
 #: would take long to compute and would look the same.
@@ -29,7 +29,7 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
         names: their names.
         distance: world units from the cameras to what they see.
     """
-    by_name = sorted(range(len(names)), key=lambda i: _sort_key(names[i]))
+    by_name = sorted(range(len(names)), key=lambda i: natural_key(names[i]))
     step = -(-len(by_name) // MOST_CAMERAS)
     by_name = by_name[::step]
     chosen = [cameras[i] for i in by_name]
@@ -75,9 +75,3 @@ def short_tour(lengths: Tensor) -> list[int]:
 
 def _length(lengths: Tensor, tour: list[int]) -> float:
     return float(lengths[tour[:-1], tour[1:]].sum())
-
-
-def _sort_key(name: str) -> list[tuple[int, str]]:
-    """The sort key of a name. Numbers are compared by value, so img_9 comes before img_10."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]

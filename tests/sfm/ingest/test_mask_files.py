@@ -66,8 +66,8 @@ def test_a_pixel_of_a_smaller_mask_is_set_if_all_covered_pixels_are():
 
 
 def test_wrong_size_and_not_an_image(tmp_path):
-    Image.new("L", (30, 20)).save(tmp_path / "m.png")
-    with pytest.raises(UserError, match=r"m.png: the mask is 30x20, but its photo is 40x60; make"):
+    Image.new("L", (30, 25)).save(tmp_path / "m.png")
+    with pytest.raises(UserError, match=r"m.png: the mask is 30x25, but its photo is 40x60; make"):
         read_mask(tmp_path / "m.png", header(60, 40, orientation=8), (40, 60))
     (tmp_path / "m.png").write_text("no image")
     with pytest.raises(UserError, match=r"m.png: the mask cannot be decoded"):

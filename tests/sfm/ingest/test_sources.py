@@ -2,9 +2,12 @@
 
 import os
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from snowsplat.sfm.ingest.sources import find_sources, free_names, kind_of_file
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
 from ..pictures import pan, photo, write_photos, write_video
@@ -16,11 +19,11 @@ def names(*inputs):
 
 def test_a_folder_is_searched_recursively(tmp_path):
     root = write_photos(tmp_path / "p")
-    write_photos(root / "näher dran", 2, "PNG")
+    write_photos(root / "näher dran", 2, "PNG", start=5)
     write_photos(root / "masks", 2, "png")
     write_photos(root / ".thumbnails")
     photo().save(root / ".hidden.jpg")
-    photo().save(root / "Ünïcode name (1).JPG")
+    photo(200).save(root / "Ünïcode name (1).JPG")
     (root / "notes.txt").write_text("x")
     for name in ("sfm.json", "capture.json", "cfg_args"):
         write_photos(root / f"made with {name}" / "input")
@@ -30,7 +33,7 @@ def test_a_folder_is_searched_recursively(tmp_path):
 
 
 def test_symbolic_links_and_cycles(tmp_path):
-    root, other = write_photos(tmp_path / "p"), write_photos(tmp_path / "other")
+    root, other = write_photos(tmp_path / "p"), write_photos(tmp_path / "other", start=5)
     (root / "linked").symlink_to(other)
     (root / "circle").symlink_to(root)
     (other / "back").symlink_to(root)
@@ -39,7 +42,7 @@ def test_symbolic_links_and_cycles(tmp_path):
     found = find_sources([root])
     expected = ["0.jpg", "1.jpg", "2.jpg", "linked/0.jpg", "linked/1.jpg", "linked/2.jpg"]
     assert [s.name for s in found.files] == expected
-    assert found.left_out == [(str(root / "one more.jpg"), f"is the same file as {root / '0.jpg'}")]
+    assert found.left_out == [(str(root / "one more.jpg"), "is the same picture as 0.jpg")]
 
 
 def test_names_of_several_inputs_do_not_collide(tmp_path):
@@ -67,7 +70,7 @@ def test_videos_beside_photos_are_skipped_and_named(tmp_path):
 
 def test_masks_are_found_by_both_names_and_in_both_folders(tmp_path):
     root = write_photos(tmp_path / "p", 4)
-    write_photos(root / "sub", 2)
+    write_photos(root / "sub", 2, start=5)
     for mask in ("masks/0.jpg.png", "masks/1.PNG", "masks/2.tif", "masks/9.png"):
         (root / mask).parent.mkdir(exist_ok=True)
         photo().save(root / mask)
@@ -86,6 +89,57 @@ def test_masks_are_found_by_both_names_and_in_both_folders(tmp_path):
     ]
     assert found.unused_masks == [root / "masks" / "9.png"]
     assert find_sources([root / "0.jpg"]).files[0].mask == root / "masks" / "0.jpg.png"
+
+
+def test_masks_maps_thumbnails_and_copies_are_no_photos(tmp_path):
+    root = write_photos(tmp_path / "p")
+    for folder in ("depth", "thumbnails", "confidence_maps"):
+        write_photos(root / folder, start=5)
+    photo(100).save(root / "0_depth.png")
+    photo(20).resize((160, 120)).save(root / "1 (1).jpg")
+    mask = Image.fromarray(np.eye(240, 320, dtype=np.uint8) * 255)
+    mask.save(root / "2_mask.png")
+    mask.save(root / "7_mask.png")
+    found = find_sources([root])
+    assert {s.name: s.mask and s.mask.name for s in found.files} == {
+        "0.jpg": None,
+        "1.jpg": None,
+        "2.jpg": "2_mask.png",
+    }
+    assert {name.removeprefix(f"{root}/") for name, _ in found.left_out} == {
+        *("depth", "thumbnails", "confidence_maps", "0_depth.png", "1 (1).jpg")
+    }
+    assert found.unused_masks == [root / "7_mask.png"]
+
+
+def test_folders_that_are_named_like_maps_may_hold_the_photos(tmp_path):
+    write_photos(tmp_path / "p" / "depth")
+    assert names(tmp_path / "p") == ["depth/0.jpg", "depth/1.jpg", "depth/2.jpg"]
+
+
+@pytest.mark.parametrize("folder", ["images", "input"])
+def test_of_a_dataset_the_photos_are_used_and_the_poses_named(folder, tmp_path):
+    root = write_toy_dataset(tmp_path / "d", "colmap-bin", 3, 32, 24).rename(tmp_path / "e")
+    (root / "images_2").mkdir()
+    for path in (root / "images").iterdir():
+        Image.open(path).reduce(2).save(root / "images_2" / path.name)
+    if folder == "input":
+        write_photos(root / "input")
+        (root / "sfm.json").write_text("{}")
+    found = find_sources([root])
+    assert {source.path.parent for source in found.files} == {root / folder}
+    assert len(found.files) == 3
+    (note,) = found.notes
+    assert f"has camera poses already (sparse/0); to use them: snowsplat train {root}" in note
+
+
+def test_photos_are_in_the_order_of_their_numbers_and_names_are_short(tmp_path):
+    root = write_photos(tmp_path / "p", 11)
+    assert names(root) == [f"{i}.jpg" for i in range(11)]
+    long = [f"{'雪' * 80}_{i:02d}.jpg" for i in range(3)]
+    shorter = list(free_names(long))
+    assert [name[-7:] for name in shorter] == ["_00.jpg", "_01.jpg", "_02.jpg"]
+    assert {len(name.encode()) <= 200 for name in shorter} == {True}
 
 
 def test_the_kind_of_a_file_is_determined_by_its_content(tmp_path):

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.data.colmap.model import count_images, model_is_text, read_model, read_points
+from snowsplat.data.colmap.model import count_images, read_model, read_points
+from snowsplat.data.colmap.places import workspace_of
 from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
+from snowsplat.data.files.photos import find_photos, photos_below
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.lens.project import intrinsics
@@ -28,18 +30,6 @@ logger = logging.getLogger(__name__)
 
 # A quaternion whose squared norm differs from 1 by less than this was a unit quaternion.
 _ROUNDED = 1e-5
-
-
-def find_models(parent: Path) -> list[Path]:
-    """The folders that hold a COLMAP model: ``parent`` and its direct subfolders.
-
-    They are sorted by their number of images, the largest first.
-    """
-    if not parent.is_dir():
-        return []
-    folders = [*sorted(p for p in parent.iterdir() if p.is_dir()), parent]
-    models = [folder for folder in folders if model_is_text(folder) is not None]
-    return sorted(models, key=lambda folder: -count_images(folder))  # stable for equal counts
 
 
 def read_colmap(
@@ -62,7 +52,7 @@ def read_colmap(
     model = read_model(folder)
     if not model.images:
         raise UserError(f"{folder}: the COLMAP model has no images; run COLMAP again")
-    posed = _images_on_disk(root, root / images, model)
+    posed = _images_on_disk(workspace_of(folder, root, images), images, model)
     points = read_points(folder)
     ply = folder / "points3D.ply"
     if points is None and ply.is_file():
@@ -83,50 +73,64 @@ def _warn_of_other_models(root: Path, models: Sequence[Path]) -> None:
     )
 
 
-def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedImage]:
-    """The images of a model whose files are in ``folder``; warns of those that are missing."""
-    if not folder.is_dir():
-        found = sorted(p.name for p in root.iterdir() if p.is_dir())
-        existing = f" (existing folders: {', '.join(found)})" if found else ""
-        raise SettingError("images", f"no such folder: {folder}; use the right one{existing}")
+def _images_on_disk(root: Path, images: str, model: ColmapModel) -> list[PosedImage]:
+    """The images of a model whose files exist; warns of those that are missing.
+
+    They are in the folder ``root / images``. If they are not, they may be elsewhere in ``root``.
+    """
+    folder = root / images
+    exact = [
+        image.name
+        for image in model.images
+        if inside(folder, image.name) is not None and is_file(folder / image.name)
+    ]
+    places = {name: (folder, name, name) for name in exact}  # folder, file in it, name of the view
+    for place in (folder, *([root] if not exact and images == "images" else [])):
+        left = [image.name for image in model.images if image.name not in places]
+        if not left or not place.is_dir():
+            continue
+        found = find_photos(model.folder, place, left, places.keys())
+        for name, file in found.items():
+            first = "" if place == folder else file.rpartition("/")[0].partition("/")[0]
+            places[name] = (place / first, file.removeprefix(f"{first}/"), file)
+    if not places:
+        raise _no_images(root, images, model)
     posed, missing = [], []
     for image in model.images:
-        if inside(folder, image.name) is None:
-            raise UserError(
-                f"{model.folder}: names the image {quoted(image.name)}, which is not in {folder}; "
-                "run COLMAP again, with the images in one folder"
-            )
-        if not is_file(folder / image.name):
+        if image.name not in places:
             missing.append(image.name)
             continue
-        camera = posed_camera(model, image)
-        mask = _find_mask(root / "masks", image.name)
-        lens = _lens(model.cameras[image.camera_id])
+        where, file, name = places[image.name]
+        camera, lens = posed_camera(model, image), _lens(model.cameras[image.camera_id])
         posed.append(
             PosedImage(
-                safe_name(image.name),
-                camera,
-                folder,
-                image.name,
-                mask,
-                lens=None if is_pinhole(lens) else lens,
+                safe_name(name), camera, where, file, lens=None if is_pinhole(lens) else lens
             )
-        )
-    if not posed:
-        raise SettingError(
-            "images",
-            f"{folder} has none of the {len(missing)} images of the model (the first is "
-            f"{quoted(missing[0])}); use the right folder",
         )
     if missing:
         logger.warning(
-            "%s: %d of %d images are missing (the first is %r); skipped",
+            "%s: %d of %d images are missing (the first is %s); skipped",
             folder,
             len(missing),
             len(model.images),
-            missing[0][:80],
+            quoted(missing[0]),
         )
     return posed
+
+
+def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
+    folder, first = root / images, quoted(model.images[0].name)
+    if not folder.is_dir():
+        found = sorted(p.name for p in root.iterdir() if p.is_dir())
+        existing = f" (existing folders: {', '.join(found)})" if found else ""
+        return SettingError("images", f"no such folder: {folder}; use the right one{existing}")
+    names = photos_below(folder)
+    instead = f"; it has {len(names)} others, e.g. {quoted(names[0])}" if names else ""
+    return SettingError(
+        "images",
+        f"{folder} has none of the {len(model.images)} images of the model (the first is {first})"
+        f"{instead}; use the right folder",
+    )
 
 
 def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
@@ -166,11 +170,3 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
 
 def _lens(camera: ColmapCamera) -> LensModel:
     return LensModel(camera.model, camera.width, camera.height, camera.params)
-
-
-def _find_mask(folder: Path, name: str) -> Path | None:
-    """``IMG.jpg.png``, as COLMAP names the mask of ``IMG.jpg``, or ``IMG.png``."""
-    for candidate in (f"{name}.png", str(Path(name).with_suffix(".png"))):
-        if is_file(folder / candidate):
-            return folder / candidate
-    return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 # A camera has at most 4 + 12 words. More are not split, to limit the memory for a damaged line.
 _MAX_CAMERA_WORDS = 20
+# Characters of the name of an image.
+_LONGEST_NAME = 1000
 # Lines of points3D.txt that are parsed at once.
 _LINES_PER_BLOCK = 50_000
 # Characters of a long line whose words are counted at once.
@@ -104,24 +107,50 @@ def read_images(path: Path) -> list[ColmapImage]:
     Raises:
         UserError: the file is unreadable or damaged.
     """
-    images = []
-    lines = _lines(path)
-    for line in filter(None, lines):
-        words = line.split(maxsplit=9)
-        try:
-            pose = tuple(map(float, words[1:8]))
-            image = ColmapImage(words[9], int(words[8]), pose)
-        except (ValueError, IndexError):
-            raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
-        images.append(image)
-        check_count(path, "images", len(images))
-        # Each image has a second line: x, y and point id of each observation. It may be empty.
-        observations = next(lines, "")
-        if _count_words(observations) % 3:
-            name = image.name[:80]
-            raise damaged(path, f"the line after image {name} should hold its observations")
+    images: list[ColmapImage] = []
+    # Each image has a second line: x, y and point id of each observation. It may be empty. Some
+    # programs do not write it.
+    observations_follow = False
+    for line in _lines(path):
+        if observations_follow and not _is_image(line):
+            observations_follow = False
+            if _count_words(line) % 3:
+                name = images[-1].name[:80]
+                raise damaged(path, f"the line after image {name} should hold its observations")
+        elif line:
+            observations_follow = True
+            words = line.split(maxsplit=9)
+            try:
+                pose = tuple(map(float, words[1:8]))
+                images.append(ColmapImage(words[9], int(words[8]), pose))
+            except (ValueError, IndexError):
+                raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
+            check_count(path, "images", len(images))
     _warn_if_fewer(path, "images", len(images))
     return images
+
+
+def _is_image(line: str) -> bool:
+    """Whether a line is an image: a rotation and a name. Observations are numbers, in threes."""
+    words = line.split(maxsplit=9)
+    if len(words) < 10 or len(words[9]) > _LONGEST_NAME:
+        return False
+    try:
+        _, _ = int(words[0]), int(words[8])
+        norm = math.hypot(*map(float, words[1:5]))
+    except ValueError:
+        return False
+    if not (0.5 < norm < 2.0 and all(map(_is_number, words[5:8]))):
+        return False
+    return not all(map(_is_number, words[9].split())) or _count_words(line) % 3 != 0
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

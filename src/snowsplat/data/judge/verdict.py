@@ -1,4 +1,4 @@
-"""`judge`: are the cameras of a dataset possible? Asked before every training.
+"""`judge`: are the cameras and masks of a dataset possible? Asked before every training.
 
 Three witnesses are heard, as far as the dataset has them:
 
@@ -22,11 +22,13 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.judge.colour_evidence import Agreement, ColourEvidence
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
+from snowsplat.data.judge.mask_check import mask_findings
 from snowsplat.data.judge.match_evidence import Fit, MatchEvidence
 from snowsplat.data.judge.photo_sample import PhotoSample
 from snowsplat.data.judge.position_check import position_findings
 from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs, zooms
 from snowsplat.data.judge.rig import Rig
+from snowsplat.util.natural_order import natural_key
 
 # Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
 _COLOURS_AGREE = 0.6
@@ -49,18 +51,19 @@ _SHARPER = 2.0
 
 
 def judge(dataset: Dataset) -> list[Finding]:
-    """What is impossible or doubtful about the cameras of a dataset; empty if nothing is.
+    """What is impossible or doubtful about the cameras and masks of a dataset; empty if nothing is.
 
-    Decodes up to 24 photos at a small size. Takes less than a second for most datasets.
+    Decodes up to 24 photos and 16 masks at a small size. Takes less than a second for most.
     """
-    views = sorted([*dataset.train, *dataset.test], key=lambda view: view.name)
+    views = sorted([*dataset.train, *dataset.test], key=lambda view: natural_key(view.name))
+    masks = mask_findings(views, dataset.points)
     rig = Rig.of([view.camera for view in views])
     lenses, positions = _lenses(views), position_findings(rig)
     if any(finding.impossible for finding in lenses):
-        return lenses
+        return [*lenses, *masks]
     poses = _poses(views, rig, dataset.points)
     # Wrong poses may have any positions; what is wrong with the poses says more.
-    return [*lenses, *poses, *([] if poses else positions)]
+    return [*lenses, *poses, *([] if poses else positions), *masks]
 
 
 def _lenses(views: list[View]) -> list[Finding]:

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
+from snowsplat.data.files.mask_look import MaskLook, look_of
 from snowsplat.sfm.ingest.mask_files import read_mask, write_mask
 from snowsplat.sfm.ingest.panorama import PANORAMA, shows_all_around
 from snowsplat.sfm.ingest.photo import Photo
@@ -30,6 +31,7 @@ from snowsplat.sfm.ingest.sharpness import CONTENT_SIDE, grey_copy, why_unusable
 from snowsplat.sfm.ingest.sources import Source, free_names
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
+from snowsplat.util.natural_order import natural_key
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def plan_photos(
     read.sort(key=lambda entry: (entry[0] != entry[1].name, entry[0]))
     names = free_names([entry[0] for entry in read])
     planned = [Planned(s, h, name, p) for name, (_, s, h, p) in zip(names, read, strict=True)]
-    return sorted(planned, key=lambda plan: plan.name)
+    return sorted(planned, key=lambda plan: natural_key(plan.name))
 
 
 def _page_name(name: str, page: int) -> str:
@@ -93,10 +95,11 @@ def write_photos(
     in_place: bool,
     skipped: list[tuple[str, str]],
     report: Report,
-) -> list[Photo]:
+) -> tuple[list[Photo], list[MaskLook]]:
     """Write photos to ``input/``, and their masks to ``distorted/masks``, in up to four threads.
 
-    Each thread has one photo in memory. The result has the order of ``planned``. Photos that cannot
+    Each thread has one photo in memory. The photos have the order of ``planned``, and so have the
+    looks of the masks of some of them. Photos that cannot
     be used are appended to ``skipped``, with the reason.
 
     Args:
@@ -104,29 +107,32 @@ def write_photos(
         in_place: the photos are in ``input/`` already; write only the masks.
     """
 
-    def work(plan: Planned) -> Photo | str:
+    def work(plan: Planned) -> tuple[Photo, MaskLook | None] | str:
         try:
             return _write_photo(plan, dataset, longest, in_place)
         except Unusable as error:
             return str(error)
 
-    photos = []
+    photos, looks = [], []
     pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="snowsplat-photos")
     try:
         for done, (plan, outcome) in enumerate(
             zip(planned, pool.map(work, planned), strict=True), 1
         ):
-            if isinstance(outcome, Photo):
-                photos.append(outcome)
-            else:
+            if isinstance(outcome, str):
                 skipped.append((shown(plan.source.path), outcome))
+            else:
+                photos.append(outcome[0])
+                looks += [look for look in outcome[1:] if look is not None]
             report(done, len(planned), "photos")
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return photos
+    return photos, looks
 
 
-def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bool) -> Photo:
+def _write_photo(
+    plan: Planned, dataset: Path, longest: int | None, in_place: bool
+) -> tuple[Photo, MaskLook | None]:
     source, header = plan.source, plan.header
     target = dataset / "input" / plan.name
     ready = header.is_ready(longest)
@@ -154,7 +160,7 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
     exif = header.exif
     scale = max(width, height) / max(header.width, header.height)
     folder = str(PurePosixPath(plan.name).parent)
-    return Photo(
+    photo = Photo(
         name=plan.name,
         source=shown(source.path),
         width=width,
@@ -168,6 +174,7 @@ def _write_photo(plan: Planned, dataset: Path, longest: int | None, in_place: bo
         location_error=exif.location_error,
         attitude=exif.attitude,
     )
+    return photo, None if used is None or source.mask is None else look_of(used)
 
 
 def _check_content(image: Image.Image, used: np.ndarray | None) -> None:

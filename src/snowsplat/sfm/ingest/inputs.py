@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from snowsplat.data.files.mask_look import doubt_about_masks
 from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
 from snowsplat.sfm.ingest.gather_photos import (
     Planned,
@@ -38,6 +39,7 @@ from snowsplat.sfm.ingest.video_frames import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import shown
+from snowsplat.util.natural_order import natural_key
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +49,7 @@ _MIN_SIZE = 128  # pixels
 
 @dataclass(frozen=True)
 class Gathered:
-    """The usable photos and frames, sorted by name, and the skipped ones."""
+    """The usable photos and frames, in natural order of names, and the skipped ones."""
 
     photos: list[Photo]
     skipped: list[tuple[str, str]]  # file, or file and time of a frame; reason
@@ -99,6 +101,8 @@ def gather(
     _check(options)
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     folder = dataset / "input"
+    for note in sources.notes:
+        logger.warning("%s", note)
     skipped = list(sources.left_out)
     in_place = sources.contain(folder)
     planned = plan_photos(sources.photos, options.size, skipped)
@@ -114,11 +118,11 @@ def gather(
     notes: list[str] = []
     _check_disk_space(dataset, planned, clips, options)
     try:
-        photos = write_photos(planned, dataset, options.size, in_place, skipped, report)
+        photos, looks = write_photos(planned, dataset, options.size, in_place, skipped, report)
         photos = _without_panoramas(photos, folder, in_place, skipped)
         for source, clip in clips:
             photos += _take_frames(source, clip, folder, options, skipped, notes, report)
-        photos.sort(key=lambda photo: photo.name)
+        photos.sort(key=lambda photo: natural_key(photo.name))
         photos, found = set_fixed_parts_aside(photos, dataset, in_place)
         notes += found
     except OSError as error:
@@ -127,10 +131,15 @@ def gather(
                 "disk: full; free some space, or set a smaller size, e.g. 1600"
             ) from None
         raise
-    for mask in sources.unused_masks:
+    if sources.unused_masks:
         logger.warning(
-            "%s: mask not used, there is no such photo; masks are named IMG.jpg.png", shown(mask)
+            "%s: mask not used, there is no such photo%s; the mask of IMG.jpg is masks/IMG.png, "
+            "IMG.jpg.png or IMG_mask.png",
+            shown(sources.unused_masks[0]),
+            f" (nor of {others} other masks)" if (others := len(sources.unused_masks) - 1) else "",
         )
+    if doubt := doubt_about_masks(looks):
+        logger.warning("warning: %s", doubt)
     if len(photos) < _MIN_PHOTOS:
         raise _too_few(len(photos), skipped)
     return Gathered(photos, skipped, notes)

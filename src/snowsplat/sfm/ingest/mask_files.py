@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from snowsplat.data.files.mask_pixels import has_shape, mask_levels
 from snowsplat.data.image_file import reason_of
 from snowsplat.sfm.ingest.exif import ORIENTATION
 from snowsplat.sfm.ingest.photo_files import Header, made_upright, open_image
@@ -24,31 +25,30 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
 
     Args:
         photo: the header of the original photo.
-        size: width and height of the copied photo. If the mask is larger, a pixel of the result is
-            used if all pixels of the mask that it covers are used.
+        size: width and height of the copied photo. A mask of another size is scaled. If it is
+            larger, a pixel of the result is used if all pixels that it covers are used.
 
     Raises:
-        UserError: the mask cannot be decoded, or its size is not that of the photo.
+        UserError: the mask cannot be decoded, or its aspect ratio is not that of the photo.
     """
     try:
         with open_image(path) as opened:
             has_orientation = opened.getexif().get(ORIENTATION, 1) != 1
-            image = ImageOps.exif_transpose(opened).convert("RGBA")
+            image = ImageOps.exif_transpose(opened)
+            image.load()
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise UserError(
             f"{shown(path)}: the mask cannot be decoded ({reason_of(error)}); replace or remove it"
         ) from None
     stored, upright = (photo.width, photo.height), photo.size(None)
-    if not has_orientation and image.size == stored:
+    if not has_orientation and has_shape(image.size, stored):
         image = made_upright(image, photo.exif.orientation)
-    elif image.size != upright:
+    elif not has_shape(image.size, upright):
         raise UserError(
             f"{shown(path)}: the mask is {image.width}x{image.height}, but its photo is "
-            f"{upright[0]}x{upright[1]}; make a mask of this size"
+            f"{upright[0]}x{upright[1]}; make a mask of this shape"
         )
-    pixels = np.asarray(image)
-    used = (pixels[..., :3].max(axis=2) >= 128) & (pixels[..., 3] >= 128)
-    return shrunk(used, size)
+    return shrunk(mask_levels(image) >= 128, size)
 
 
 def shrunk(used: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import os
+import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
+from snowsplat.data.files.masks import FoundMasks, find_masks
 from snowsplat.data.image_file import OPTIONAL_FORMATS
+from snowsplat.data.imports import find_export
+from snowsplat.data.load import poses_in
 from snowsplat.sfm.ingest.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.clip import ONLY_SOUND, why_no_video
+from snowsplat.sfm.ingest.copies import find_copies
 from snowsplat.sfm.ingest.photo_or_film import photos_or_films
 from snowsplat.sfm.ingest.unread_formats import (
     UNREAD_SUFFIXES,
@@ -32,11 +37,14 @@ PHOTO_SUFFIXES = _suffixes(
 VIDEO_SUFFIXES = _suffixes(
     "mp4 mov m4v mkv avi webm mpg mpeg mts m2ts ts 3gp 3g2 wmv ogv mjpeg flv insv gif"
 )
-MASKS = "masks"
 #: The record of the stages of a dataset, and its name in version 0.1.0.
 RECORDS = ("sfm.json", "capture.json")
-# Folders that contain one of these files are datasets or output folders. They are skipped.
-_OUTPUT_FILES = (*RECORDS, "cfg_args")
+_LONGEST_NAME = 200  # bytes of a name in input/
+_KEPT_END = 12  # characters at the end of a longer name
+# The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
+_MAP = re.compile(
+    r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
+)
 
 
 @dataclass(frozen=True)
@@ -57,15 +65,17 @@ class Sources:
 
     Attributes:
         inputs: the files and folders that were searched.
-        files: in the order of the inputs; files of a folder are sorted by name.
-        left_out: path and reason of each photo or video that is not used.
+        files: in the order of the inputs; files of a folder are in natural order.
+        left_out: path and reason of each photo, video or folder that is not used.
         unused_masks: masks without a photo.
+        notes: lines for the user.
     """
 
     inputs: tuple[Path, ...]
     files: list[Source]
     left_out: list[tuple[str, str]]
     unused_masks: list[Path]
+    notes: list[str] = field(default_factory=list)
 
     @property
     def photos(self) -> list[Source]:
@@ -89,7 +99,9 @@ class Sources:
 def find_sources(inputs: Sequence[Path]) -> Sources:
     """Find photos and videos in files and folders; folders are searched recursively.
 
-    Hidden files, ``masks`` folders, datasets and output folders are skipped. Videos in a folder
+    Hidden files, datasets and output folders are skipped; so are folders of masks, depth maps and
+    thumbnails. Of photos of the same picture, one is used. Of a dataset, the photos in ``input`` or
+    ``images`` are used. Videos in a folder
     with photos are also skipped, because some phones save a video of three seconds with every
     photo. A zip file is unpacked into a folder beside it. If there is a single input, the files
     keep their names. If there are several, each input folder and each video gets its own folder in
@@ -103,8 +115,9 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     files: list[Source] = []
     left_out: list[tuple[str, str]] = []
     unused: list[Path] = []
+    notes: list[str] = []
     seen: dict[Path, Path] = {}
-    folders = {MASKS}  # names in use
+    folders = {"masks"}  # names in use
 
     def add(source: Source) -> None:
         real = source.path.resolve()
@@ -122,115 +135,129 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         if not path.is_dir():
             kind = kind_of_file(path)
             if kind == "photo":
-                add(Source(path, kind, shown(path.name), Masks(path.parent).mask_of(path.name)))
+                mask = find_masks(path.parent, [path.name]).of.get(path.name)
+                add(Source(path, kind, shown(path.name), mask))
             else:
                 add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
             continue
-        photos, videos = _scan(path)
-        if unread := unread_photos(_files_below(path), photos):
-            left_out.append((shown(path), unread))
-        chosen = photos_or_films(path, photos, videos)
-        photos, videos = chosen.photos, chosen.videos
-        left_out += [(shown(path / relative), reason) for relative, reason in chosen.left_out]
+        if (poses := poses_in(path)) is not None:
+            notes.append(
+                f"{shown(path)}: has camera poses already ({poses}); to use them: snowsplat train "
+                f"{shown(path)} -o OUT --eval; here, poses are estimated again"
+            )
+        elif (export := find_export(path)) is not None and export.photos is not None:
+            notes.append(
+                f"{shown(path)}: a capture of {export.kind.name} without camera poses; the photos "
+                f"in {shown(export.photos.relative_to(path).as_posix())} are used"
+            )
+        photo_folder = _photos_of_dataset(path)
+        found = _search(photo_folder)
+        chosen = photos_or_films(photo_folder, found.photos, found.videos)
         prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
-        masks = Masks(path)
-        for relative in photos:
+        left_out += found.left_out
+        left_out += [(shown(photo_folder / file), reason) for file, reason in chosen.left_out]
+        for relative in chosen.photos:
             name = str(PurePosixPath(prefix) / shown(relative))
-            add(Source(path / relative, "photo", name, masks.mask_of(relative)))
-        unused += masks.unused
-        for relative in videos:
+            add(Source(photo_folder / relative, "photo", name, found.masks.of.get(relative)))
+        unused += found.masks.unused
+        for relative in chosen.videos:
             stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
-            only = len(videos) == 1
-            add(Source(path / relative, "video", prefix if only else _free(stem, folders)))
+            video = prefix if len(chosen.videos) == 1 else _free(stem, folders)
+            add(Source(photo_folder / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
-    return Sources(tuple(inputs), files, left_out, unused)
+    return Sources(tuple(inputs), files, left_out, unused, notes)
 
 
-def _scan(root: Path) -> tuple[list[str], list[str]]:
-    """Photos and videos below a folder, by their extensions; relative with "/", sorted."""
-    photos, videos = [], []
-    for relative in _files_below(root):
-        suffix = PurePosixPath(relative).suffix.lower()
-        if suffix in PHOTO_SUFFIXES:
-            photos.append(relative)
-        elif suffix in VIDEO_SUFFIXES:
-            videos.append(relative)
-    return photos, videos
+@dataclass
+class _Folder:
+    """The photos and videos below a folder, relative to it."""
+
+    photos: list[str] = field(default_factory=list)
+    videos: list[str] = field(default_factory=list)
+    masks: FoundMasks = field(default_factory=FoundMasks)
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # file or folder; reason
 
 
-def _files_below(root: Path, leave_out: Sequence[str] = (MASKS,)) -> list[str]:
-    """Files that are not hidden; relative to ``root``, with "/", sorted.
+def _search(root: Path) -> _Folder:
+    """What is in a folder: each photo once, without masks, maps, thumbnails and outputs."""
+    found = _Folder()
 
-    Links to folders are followed, but every folder is searched only once. Folders named as in
-    ``leave_out``, datasets and output folders are skipped.
-    """
+    def enter(folder: Path, names: list[str]) -> Iterator[str]:
+        for name in names:
+            reason = _why_left_out(name, names)
+            if is_output(folder / name) or folder_kind(name) == "masks":
+                continue
+            if reason is None:
+                yield name
+            else:
+                found.left_out.append((shown(folder / name), reason))
 
-    def fail(error: OSError) -> None:
-        raise error
-
-    found = []
-    visited = {root.resolve()}
-    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=fail):
-        here = Path(folder)
-        kept = []
-        for name in sorted(subfolders):
-            real = (here / name).resolve()
-            is_output = any((here / name / file).is_file() for file in _OUTPUT_FILES)
-            if not (name.startswith(".") or name in leave_out or is_output or real in visited):
-                visited.add(real)
-                kept.append(name)
-        subfolders[:] = kept  # os.walk then searches only these
-        found += [
-            (here / name).relative_to(root).as_posix()
-            for name in files
-            if not name.startswith(".") and (here / name).is_file()
-        ]
-    return sorted(found)
+    files = files_below(root, enter)
+    if not any(_is_photo_name(file) or _is_video_name(file) for file in files):
+        found.left_out = []  # only photos called depth/1.png: they are the photos
+        files = files_below(root, _masks_and_outputs)
+    photos = [file for file in files if _is_photo_name(file)]
+    if unread := unread_photos(files, photos):
+        found.left_out.append((shown(root), unread))
+    found.videos = [file for file in files if _is_video_name(file)]
+    for copy in find_copies(root, photos):
+        found.left_out.append((shown(root / copy.name), f"is the same picture as {copy.used}"))
+        photos.remove(copy.name)
+    found.masks = find_masks(root, photos)
+    photos = [photo for photo in photos if photo not in found.masks.beside]
+    for photo, kind in _maps_beside(photos).items():
+        found.left_out.append((shown(root / photo), f"is a {kind} of another photo"))
+        photos.remove(photo)
+    found.photos = photos
+    return found
 
 
-class Masks:
-    """The masks of a folder of photos: ``masks/IMG.jpg.png`` or ``masks/IMG.png`` for ``IMG.jpg``.
+def _why_left_out(name: str, siblings: Sequence[str]) -> str | None:
+    """Why a folder is not searched; None if it is."""
+    kind, original = folder_kind(name), original_of(name, siblings, divided=False)
+    if kind == "maps":
+        return "is a folder of maps, not of photos"
+    if kind == "thumbnails":
+        return "is a folder of small copies"
+    return None if original is None else f"is a folder of changed copies of those in {original}"
 
-    The mask of ``sub/IMG.jpg`` is in ``masks/sub/`` or in ``sub/masks/``. All image formats are
-    accepted; the extension may be in upper or lower case.
-    """
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
-        self._by_folder: dict[Path, dict[str, Path]] = {}
-        self._used: set[Path] = set()
+def _masks_and_outputs(folder: Path, names: list[str]) -> list[str]:
+    """The subfolders that are neither masks nor outputs."""
+    return [n for n in names if folder_kind(n) != "masks" and not is_output(folder / n)]
 
-    def mask_of(self, relative: str) -> Path | None:
-        """The mask of a photo whose path is relative to the root, or None."""
-        name = PurePosixPath(relative)
-        for folder, key in (
-            (self._root / MASKS, relative),
-            ((self._root / relative).parent / MASKS, name.name),
-        ):
-            listed = self._listed(folder)
-            mask = listed.get(key) or listed.get(str(PurePosixPath(key).with_suffix("")))
-            if mask is not None:
-                self._used.add(mask)
-                return mask
-        return None
 
-    @property
-    def unused(self) -> list[Path]:
-        """Masks without a photo; their names are probably misspelt."""
-        there = {path for listed in self._by_folder.values() for path in listed.values()}
-        return sorted(there - self._used)
+def _is_photo_name(file: str) -> bool:
+    return PurePosixPath(file).suffix.lower() in PHOTO_SUFFIXES
 
-    def _listed(self, folder: Path) -> dict[str, Path]:
-        """Paths of the masks in a folder, by their names without extension."""
-        if folder not in self._by_folder:
-            files = _files_below(folder, ()) if folder.is_dir() else []
-            self._by_folder[folder] = {
-                str(PurePosixPath(file).with_suffix("")): folder / file
-                for file in files
-                if PurePosixPath(file).suffix.lower() in PHOTO_SUFFIXES
-            }
-        return self._by_folder[folder]
+
+def _is_video_name(file: str) -> bool:
+    return PurePosixPath(file).suffix.lower() in VIDEO_SUFFIXES
+
+
+def _maps_beside(photos: Sequence[str]) -> dict[str, str]:
+    """Photos that are maps by their names, as IMG_depth.png beside IMG.jpg, and what they are."""
+    stems = {str(PurePosixPath(photo).with_suffix("")) for photo in photos}
+    matches = {photo: _MAP.fullmatch(photo) for photo in photos}
+    return {
+        photo: f"{match['kind']} map"
+        for photo, match in matches.items()
+        if match is not None and match["stem"] in stems
+    }
+
+
+def _photos_of_dataset(root: Path) -> Path:
+    """The folder of the photos of a dataset; ``root`` itself if it is no dataset or has none."""
+    export = find_export(root)
+    if export is not None and export.photos is not None:
+        return export.photos
+    if not (poses_in(root) or is_output(root)):
+        return root
+    for name in ("input", "images"):
+        if (root / name).is_dir():
+            return root / name
+    return root
 
 
 def _unpacked(path: Path) -> Path:
@@ -287,7 +314,7 @@ def _is_photo(head: bytes) -> bool:
 def _nothing_in(inputs: Sequence[Path]) -> UserError:
     names = ", ".join(map(shown, inputs))
     for path in inputs:
-        if unread := unread_photos(_files_below(path), []):
+        if unread := unread_photos(files_below(path, _masks_and_outputs), []):
             return UserError(f"{names}: {unread}")
     return UserError(
         f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
@@ -296,7 +323,8 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
 
 
 def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names, made unique: a name that equals an earlier one except for case gets a suffix.
+    """The names, made unique and not too long: a name that equals an earlier one except for case
+    gets a suffix.
 
     "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on.
     """
@@ -305,9 +333,19 @@ def free_names(names: Sequence[str]) -> Iterator[str]:
         yield _free(name, taken)
 
 
+def _shortened(part: str) -> str:
+    """A name of at most 200 bytes, so that ".NAME.png.tmp" fits into the 255 of a file system."""
+    if len(part.encode()) <= _LONGEST_NAME:
+        return part
+    path = PurePosixPath(part)
+    end = path.stem[-_KEPT_END:] + path.suffix  # with the number of the photo
+    room = max(0, _LONGEST_NAME - len(end.encode()))
+    return path.stem.encode()[:room].decode(errors="ignore") + end
+
+
 def _free(name: str, taken: set[str]) -> str:
     """``name``, or a variant of it that is not in ``taken``; the result is added to ``taken``."""
-    name = shown(name)
+    name = "/".join(_shortened(part) for part in shown(name).split("/"))
     path = PurePosixPath(name)
     candidate, n = name, 1
     while candidate.casefold() in taken:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from snowsplat.util.natural_order import natural_key
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -17,7 +19,10 @@ _POINTS_SAMPLED = 5000  # number of points from which medians are computed
 
 @dataclass(frozen=True)
 class Cameras:
-    """The data of a model that are used here, in the world frame of SfM; cameras sorted by name."""
+    """The data of a model that are used here, in the world frame of SfM.
+
+    The cameras are in the natural order of their names.
+    """
 
     names: list[str]
     rotations: np.ndarray  # (N, 3, 3) of cam_from_world: the rows are the cameras' x, y, z axes
@@ -59,7 +64,8 @@ def read_cameras(model: pycolmap.Reconstruction) -> Cameras:
     Raises:
         ValueError: the model has no cameras.
     """
-    images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
+    images = [model.images[i] for i in model.reg_image_ids()]
+    images.sort(key=lambda image: natural_key(image.name))
     if not images:
         raise ValueError("a model without cameras has no orientation")
     poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)

@@ -1,0 +1,1 @@
+"""The files of a dataset: which there are, which of them are masks, and which a name means."""

@@ -1,0 +1,109 @@
+"""Lists the files of a folder, and tells from the names of folders what is in them."""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal
+
+from snowsplat.util.natural_order import natural_key
+
+# What is in a folder of this name. The name is compared without regard to case, and without "_" and
+# "." at its start and "_2", "_4" or "_8" at its end.
+_MASKS = re.compile(r"mask|(\w+_)?masks|(dynamic|images?)_mask|mask_images?")
+_MAPS = {
+    *("depth", "depths", "depth_map", "depth_maps", "depthmaps", "depth_images"),
+    *("confidence", "confidences", "confidence_maps", "normal", "normals", "normal_maps"),
+}
+_THUMBNAILS = {"thumb", "thumbs", "thumbnail", "thumbnails", "@eadir", "__macosx"}
+_DIVIDED = re.compile(r"(?P<original>.+)_[248]")
+#: Names of folders that say that there are photos inside, and not which ones.
+PHOTO_FOLDERS = frozenset(
+    {
+        *("images", "image", "imgs", "img", "input", "photos", "photo", "pictures"),
+        *("rgb", "color", "colors", "colour", "frames"),
+    }
+)
+# Names of folders that say that they hold changed copies of the photos in another one.
+_CHANGED = re.compile(r"(corrected|undistorted|resized|downscaled)[_-](?P<original>.+)")
+# More files than this are not listed, to bound memory and time: it may be a whole disk.
+_MOST_FILES = 500_000
+
+# Folders that contain one of these files are outputs of snowsplat: datasets, scenes, trainings.
+_OUTPUT_FILES = ("sfm.json", "capture.json", "make.json", "cfg_args")
+
+FolderKind = Literal["masks", "maps", "thumbnails", "photos"]
+
+
+def folder_kind(name: str) -> FolderKind:
+    """What the name of a folder says about the images inside; "photos" if it says nothing."""
+    name = name.casefold().replace("-", "_").replace(" ", "_").lstrip("._")
+    divided = _DIVIDED.fullmatch(name)
+    name = divided["original"] if divided else name
+    if _MASKS.fullmatch(name):
+        return "masks"
+    if name in _MAPS:
+        return "maps"
+    return "thumbnails" if name in _THUMBNAILS else "photos"
+
+
+def is_output(folder: Path) -> bool:
+    """Whether a folder is a dataset or an output folder that snowsplat has written."""
+    return any((folder / file).is_file() for file in _OUTPUT_FILES)
+
+
+def original_of(name: str, siblings: Iterable[str], *, divided: bool = True) -> str | None:
+    """The folder beside ``name`` whose photos it holds undistorted or at another size, or None.
+
+    ``corrected_images`` holds undistorted photos of ``images``; if ``divided``, then ``images_2``,
+    ``images_4`` and ``images_8`` hold smaller ones.
+    """
+    name = name.casefold()
+    match = _CHANGED.fullmatch(name) or (_DIVIDED.fullmatch(name) if divided else None)
+    among = {sibling.casefold(): sibling for sibling in siblings}
+    return None if match is None else among.get(match["original"])
+
+
+def files_below(root: Path, enter: Callable[[Path, list[str]], Iterable[str]]) -> list[str]:
+    """Files that are not hidden; relative to ``root``, with "/", in natural order.
+
+    Links to folders are followed, but every folder is searched only once. Broken links are left
+    out. At most 500,000 files are listed.
+
+    Args:
+        enter: the subfolders of a folder to search, from the names of those that are not hidden.
+
+    Raises:
+        OSError: a folder cannot be read.
+    """
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    found: list[str] = []
+    visited = {root.resolve()}
+    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=fail):
+        here = Path(folder)
+        kept = []
+        for name in enter(here, sorted(name for name in subfolders if not name.startswith("."))):
+            real = (here / name).resolve()
+            if real not in visited:
+                visited.add(real)
+                kept.append(name)
+        subfolders[:] = kept  # os.walk then searches only these
+        found += [
+            (here / name).relative_to(root).as_posix()
+            for name in files
+            if not name.startswith(".") and (here / name).is_file()
+        ]
+        if len(found) > _MOST_FILES:
+            break
+    return sorted(found, key=natural_key)
+
+
+def folded(name: str) -> str:
+    """A name as it is compared: without regard to case and to the form of Unicode."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())

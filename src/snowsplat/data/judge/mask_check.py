@@ -1,0 +1,66 @@
+"""`mask_findings`: whether the masks of a dataset ignore everything, or the wrong side."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from snowsplat.data.dataset import Points, View
+from snowsplat.data.decode import ImageSource, load_mask
+from snowsplat.data.files.mask_look import INVERT, doubt_about_masks, look_of
+from snowsplat.data.judge.finding import Finding
+from snowsplat.scene.camera import Camera
+from snowsplat.util.errors import UserError
+
+# Masks that are decoded, spread over the dataset, and the longer side of their small copies.
+_MOST_MASKS, _SIDE = 16, 128
+# Points that are projected into each photo, and those that must be seen to say something.
+_MOST_POINTS, _FEWEST_SEEN = 5000, 200
+
+
+def mask_findings(views: Sequence[View], points: Points | None) -> list[Finding]:
+    """What is impossible or doubtful about the masks of a dataset; decodes up to 16 of them."""
+    masked = [(view.camera, view.mask) for view in views if view.mask is not None]
+    chosen = np.unique(np.linspace(0, len(masked) - 1, min(len(masked), _MOST_MASKS)).astype(int))
+    sample = [masked[i] for i in chosen]
+    with ThreadPoolExecutor(4, thread_name_prefix="snowsplat-masks") as pool:
+        decoded = list(pool.map(lambda pair: _small(*pair), sample))
+    used = [(camera, mask) for camera, mask in decoded if mask is not None]
+    if not used:
+        return []
+    if not any(mask.any() for _, mask in used):
+        nothing = f"the masks ignore every pixel of every photo ({len(used)} were looked at)"
+        return [Finding("masks", f"{nothing}; {INVERT}", impossible=len(masked) == len(views))]
+    looks = [look_of(mask) for _, mask in used]
+    doubt = doubt_about_masks(looks, None if points is None else _points_kept(used, points))
+    return [] if doubt is None else [Finding("masks", doubt)]
+
+
+def _small(camera: Camera, mask: ImageSource) -> tuple[Camera, np.ndarray | None]:
+    scale = min(1.0, _SIDE / max(mask.width, mask.height))
+    size = max(1, round(mask.width * scale)), max(1, round(mask.height * scale))
+    try:
+        small = load_mask(dataclasses.replace(mask, width=size[0], height=size[1])).numpy()
+    except UserError:  # the training says so
+        return camera, None
+    return camera.scaled(*size), small
+
+
+def _points_kept(used: Sequence[tuple[Camera, np.ndarray]], points: Points) -> float | None:
+    """The share of the points in the photos that lie on pixels that masks keep."""
+    chosen = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
+    xyz = points.xyz.numpy()[chosen].astype(np.float64)
+    seen, kept = 0, 0
+    for camera, mask in used:
+        pose = camera.cam_from_world.detach().numpy().astype(np.float64)
+        x, y, z = pose[:3, :3] @ xyz.T + pose[:3, 3:]
+        front = z > 1e-9 * (np.abs(x) + np.abs(y)) + 1e-12
+        column = np.floor(camera.fx * x[front] / z[front] + camera.cx)
+        row = np.floor(camera.fy * y[front] / z[front] + camera.cy)
+        inside = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
+        seen += int(inside.sum())
+        kept += int(mask[row[inside].astype(int), column[inside].astype(int)].sum())
+    return kept / seen if seen >= _FEWEST_SEEN else None
