@@ -5,14 +5,20 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+import torch
 
 from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
-from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
+from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.lens.circle import image_circle
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.transforms_json import find_transforms, read_transforms
+from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
 
@@ -24,6 +30,8 @@ _DIVISORS = (1, 2, 4, 8)
 _SMALLEST_SIDE = 16
 # The largest ratio between the size of a camera and the size of its image file.
 _LARGEST_FACTOR = 16
+# To find the image circle of a lens: the number of photos, and their longer side in pixels.
+_CIRCLE_PHOTOS, _CIRCLE_SIDE = 12, 400
 
 
 class NoPosesError(UserError):
@@ -79,11 +87,13 @@ class DatasetFiles:
 
     Attributes:
         images: each image, the header of its file, and the result of `_file_sizes`.
-        test_names: names of the views to hold out.
+        circles: the radius of the image circle of each wide lens that has one in the photos.
+        test_names: names of the images to hold out.
     """
 
     root: Path
     images: list[tuple[PosedImage, Header, tuple[int, int, bool]]]
+    circles: Mapping[LensModel, float]
     points: Points | None
     description: str
     test_names: set[str]
@@ -95,18 +105,19 @@ class DatasetFiles:
             SettingError: ``resolution`` is invalid.
             UserError: all images are held out, or cameras are not finite.
         """
-        views = sorted(
-            (_view(*image, resolution) for image in self.images), key=lambda view: view.name
-        )
-        train = [view for view in views if view.name not in self.test_names]
+        train: list[View] = []
+        test: list[View] = []
+        for image, header, size in self.images:
+            views = _views(image, header, size, resolution, self.circles)
+            (test if image.name in self.test_names else train).extend(views)
         if not train:
             raise UserError(
-                f"{self.root}: all {len(views)} images are held out for testing, so no image is "
-                "left for training; hold out fewer or none"
+                f"{self.root}: all {len(self.images)} images are held out for testing, so no image "
+                "is left for training; hold out fewer or none"
             )
         return Dataset(
-            train=train,
-            test=[view for view in views if view.name in self.test_names],
+            train=sorted(train, key=lambda view: view.name),
+            test=sorted(test, key=lambda view: view.name),
             points=self.points,
             extent=scene_extent([view.camera for view in train]),
             description=self.description,
@@ -142,9 +153,11 @@ def read_files(
     if len(count) < len(posed):
         repeated = next(name for name, n in sorted(count.items()) if n > 1)
         raise UserError(f"{root}: has two images named {repeated}; remove one")
+    found = list(zip(posed, headers, sizes, strict=True))
     return DatasetFiles(
         root,
-        list(zip(posed, headers, sizes, strict=True)),
+        found,
+        _circles(found),
         points,
         description,
         _test_names(posed, hold_out, first_held_out, test_list),
@@ -275,16 +288,85 @@ def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]
     return None, False
 
 
-def _view(
-    image: PosedImage, header: Header, size: tuple[int, int, bool], resolution: int | None
+def _circles(
+    images: Sequence[tuple[PosedImage, Header, tuple[int, int, bool]]],
+) -> dict[LensModel, float]:
+    """The radius in pixels of the image circle of each wide lens that has one; see `image_circle`.
+
+    Decodes a few photos of each of these lenses.
+    """
+    # Photos may have a calibration each, of the same lens.
+    kinds: dict[tuple[str, int, int], dict[LensModel, list[ImageSource]]] = {}
+    for image, _, (width, height, sideways) in images:
+        if (lens := image.lens) is not None and is_wide(lens):
+            source = ImageSource(image.path, width, height, sideways)
+            kind = kinds.setdefault((lens.model, lens.width, lens.height), {})
+            kind.setdefault(lens, []).append(source)
+    circles: dict[LensModel, float] = {}
+    for lenses in kinds.values():
+        photos = [photo for sources in lenses.values() for photo in sources]
+        chosen = photos[:: -(-len(photos) // _CIRCLE_PHOTOS)]
+        small = [load_thumbnail(photo, _CIRCLE_SIDE) for photo in chosen]
+        radius = image_circle(next(iter(lenses)), small)
+        if radius is not None:
+            circles |= dict.fromkeys(lenses, radius)
+    return circles
+
+
+def _views(
+    image: PosedImage,
+    header: Header,
+    size: tuple[int, int, bool],
+    resolution: int | None,
+    circles: Mapping[LensModel, float],
+) -> Iterator[View]:
+    """The view of an image; of a wide lens, several views. All of them are without distortion."""
+    width, height, sideways = size
+    if image.lens is None:
+        width, height = _final_size(image, width, height, resolution)
+        mask = None
+        if image.mask is not None:
+            mask = ImageSource(image.mask, width, height, sideways)
+        source = ImageSource(image.path, width, height, sideways, header.width * header.height)
+        yield View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
+        return
+    try:
+        views = lens_views(image.lens, circles.get(image.lens))
+    except ValueError as error:
+        shown = ", ".join(f"{value:.5g}" for value in image.lens.params)
+        raise UserError(
+            f"{image.path}: the lens distortion ({image.lens.model} {shown}) is not possible: "
+            f"{error}; correct the calibration"
+        ) from None
+    for view in views:
+        yield _lens_view(image, view, header, size, resolution)
+
+
+def _lens_view(
+    image: PosedImage,
+    view: LensView,
+    header: Header,
+    size: tuple[int, int, bool],
+    resolution: int | None,
 ) -> View:
     width, height, sideways = size
+    lens = view.lens
+    width = max(1, round(view.width * width / lens.width))
+    height = max(1, round(view.height * height / lens.height))
     width, height = _final_size(image, width, height, resolution)
+    pose = image.camera.cam_from_world
+    if view.rotation is not None:
+        pose = torch.tensor(view.rotation, dtype=pose.dtype) @ pose
+    camera = Camera(view.width, view.height, *view.params, pose).scaled(width, height)
+    stored = header.width * header.height
+    source = ImageSource(image.path, width, height, sideways, stored, view)
     mask = None
     if image.mask is not None:
-        mask = ImageSource(image.mask, width, height, sideways)
-    source = ImageSource(image.path, width, height, sideways, header.width * header.height)
-    return View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
+        mask = dataclasses.replace(source, path=image.mask)
+    elif view.partial:
+        mask = dataclasses.replace(source, blank=True)
+    name = f"{image.name}/{view.name}" if view.name else image.name
+    return View(name, camera, source, mask, image.depth)
 
 
 def _final_size(
