@@ -76,7 +76,7 @@ def lens_evidence(database: Path, photos: Sequence[Photo], scale: float) -> dict
             # The strongest pairs are nearly the same photo twice. The weak ones are mostly false.
             half = own[: max(_PAIRS, len(own) // 2)]
             spread = np.linspace(0, len(half) - 1, min(_PAIRS, len(half)), dtype=int)
-            true = [_true_matches(source, *half[k], scale) for k in spread]
+            true = [_true_matches(source, half[k], scale) for k in spread]
             matches = [pair for pair in true if pair is not None]
             evidence = _compared(matches, photos[own[0][0]], _MAX_ERROR * scale)
             if evidence is not None:
@@ -87,12 +87,14 @@ def lens_evidence(database: Path, photos: Sequence[Photo], scale: float) -> dict
 _Matches = tuple[NDArray[np.float64], NDArray[np.float64]]  # (M, 2) pixels in each of two photos
 
 
-def _true_matches(source: pycolmap.Database, i: int, j: int, scale: float) -> _Matches | None:
+def _true_matches(
+    source: pycolmap.Database, pair: tuple[int, int], scale: float
+) -> _Matches | None:
     """The matches of two photos without those that are false in any lens; None: most are false."""
-    rows = source.read_matches(i + 1, j + 1)
+    rows = source.read_matches(pair[0] + 1, pair[1] + 1)
     one, two = (
-        source.read_keypoints(image)[rows[:, k], :2].astype(np.float64)
-        for k, image in enumerate((i + 1, j + 1))
+        source.read_keypoints(index + 1)[rows[:, k], :2].astype(np.float64)
+        for k, index in enumerate(pair)
     )
     rough = pycolmap.estimate_fundamental_matrix(one, two, _ransac(_MAX_ERROR_OF_ANY * scale))
     if rough is None or rough["num_inliers"] < _MIN_TRUE * len(rows):

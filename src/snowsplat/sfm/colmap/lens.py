@@ -223,11 +223,11 @@ def _implausible_fisheye(camera: pycolmap.Camera) -> str:
     sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
     rays = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine + 0 * turn], -1)
     pixels = np.asarray(camera.img_from_cam(rays.reshape(-1, 3))).reshape(*rays.shape[:2], 2)
-    inside = ((pixels >= 0) & (pixels <= [camera.width, camera.height])).all(-1)
+    inside = np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=-1)
     centre = camera.principal_point_x, camera.principal_point_y
     radius = np.linalg.norm(pixels - centre, axis=-1)
     # A distortion that folds moves pixels back into the photo.
-    if (inside[:-1] & ~(np.diff(radius, axis=0) > 0)).any():
+    if np.any(inside[:-1] & ~(radius[1:] > radius[:-1])):
         return "the lens distortion is not one-to-one over the whole photo"
     return ""
 

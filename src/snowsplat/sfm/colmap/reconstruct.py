@@ -284,9 +284,9 @@ class PoseEstimation:
     def _other_lens(self, best: Attempt) -> list[str]:
         """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
 
-        The models FOV and EUCM describe fisheye lenses, too.
+        The model FOV describes fisheye lenses, too.
         """
-        if best.lens.any_fisheye or best.lens.model in ("FOV", "EUCM"):
+        if best.lens.any_fisheye or best.lens.model == "FOV":
             return []
         if not any(evidence.fisheye for evidence in self.lens_evidence.values()):
             return []
