@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from snowsplat.data.lens.pinhole import Pinhole
+from snowsplat.data.lens.project import directions
 from snowsplat.data.lens.views import LensView
 from snowsplat.scene.geometry import Similarity
 
@@ -101,15 +102,14 @@ def in_views(
 
     for number in sorted(model.reg_image_ids()):
         image = model.image(number)
-        pose, lens = image.cam_from_world(), model.cameras[image.camera_id]
+        pose = image.cam_from_world()
         observed = [point for point in image.points2D if point.has_point3D()]
         xy = np.array([point.xy for point in observed]).reshape(-1, 2)
         ids = [int(point.point3D_id) for point in observed]
         if image.camera_id not in views:
             add(image.name, image.camera_id, pose, xy, ids)
             continue
-        found = [lens.cam_ray_from_img(pixel) for pixel in xy]
-        rays = np.array([[0.0, 0.0, -1.0] if ray is None else ray for ray in found]).reshape(-1, 3)
+        rays = directions(views[image.camera_id][0].lens, xy)
         for view in views[image.camera_id]:
             rotation = np.eye(3) if view.rotation is None else np.array(view.rotation)
             turned = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))

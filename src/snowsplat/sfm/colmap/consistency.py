@@ -37,8 +37,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.lens import is_fisheye
+from snowsplat.sfm.colmap.lens import is_fisheye, lens_of
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
@@ -218,13 +219,12 @@ def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
 def _rays(camera: pycolmap.Camera, pixels: Floats) -> Floats:
     """The positions (N, 2) of ``pixels`` (N, 2) in the normalised image plane of a camera.
 
-    For a fisheye lens, unit vectors (N, 3): its pixels are angles, up to 90° or more to its axis.
-    NaN where the model is not defined.
+    For a fisheye lens, unit vectors (N, 3): its pixels are angles, up to 90° or more to its axis,
+    where COLMAP's are wrong. NaN where the model is not defined.
     """
     if not is_fisheye(camera.model_name):
         return np.asarray(camera.cam_from_img(pixels))
-    rays = [camera.cam_ray_from_img(pixel) for pixel in pixels]
-    return np.array([np.full(3, np.nan) if ray is None else ray for ray in rays]).reshape(-1, 3)
+    return directions(lens_of(camera), pixels)
 
 
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:

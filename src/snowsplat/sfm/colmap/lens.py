@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
+from snowsplat.data.lens.model import LensModel
 from snowsplat.sfm.ingest.photo import Photo
 
 # With fewer photos, the eight parameters of the camera model OPENCV are not well determined.
@@ -103,6 +104,11 @@ class Lens:
 def is_fisheye(model: str) -> bool:
     """Whether a camera model of COLMAP measures angles: its pixels may be at 90° to the axis."""
     return model.endswith("FISHEYE")
+
+
+def lens_of(camera: pycolmap.Camera) -> LensModel:
+    """The lens of a camera of COLMAP."""
+    return LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
 
 
 def camera_ids(photos: Sequence[Photo]) -> list[int]:
