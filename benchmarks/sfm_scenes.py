@@ -9,6 +9,7 @@
     ahead    a street; the camera walks and looks ahead
     side     a street; the camera looks at the façades of the other side
     turns    a street; the camera walks ahead and turns from side to side
+    fisheye  the photos of "room" at the same places, with a fisheye lens of 150°
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
@@ -42,8 +43,9 @@ from torch import Tensor
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic import textures as paint
+from snowsplat.synthetic.lens import FisheyeLens, Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import fisheye_lens, phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
@@ -77,6 +79,7 @@ class Kind:
 
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
+    lens: Callable[[int, int], Lens | FisheyeLens] = phone_lens  # arguments: width, height
 
 
 def cache_folder() -> Path:
@@ -102,7 +105,7 @@ def photos_of(
     """
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{count}-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
-    lens = phone_lens(*size)
+    lens = chosen.lens(*size)
     poses = chosen.path(count, seed)
     return folder, take_photos(folder, lambda: chosen.build(seed, count), lens, poses, seed, report)
 
@@ -123,7 +126,7 @@ def video_of(
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
     poses = in_between(chosen.path(seconds, seed), seconds * FRAMES_PER_SECOND)
-    lens = phone_lens(*size)
+    lens = chosen.lens(*size)
     truth = take_photos(
         folder / "frames", lambda: chosen.build(seed, seconds), lens, poses, seed, report
     )
@@ -410,4 +413,7 @@ KINDS = {
     "ahead": Kind(_street, ahead),
     "side": Kind(_street, to_the_side),
     "turns": Kind(_street, around_corners),
+    "fisheye": Kind(
+        _indoors(_room), loops, lambda width, height: fisheye_lens(width, height, 150.0)
+    ),
 }

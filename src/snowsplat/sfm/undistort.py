@@ -3,7 +3,8 @@
     distorted/sparse/0, input/, distorted/masks/  ->  sparse/0, images/, masks/, images_2/ …
 
 The new model has pinhole cameras and is in the frame of the scene (see `orient`). The files have
-the layout that training reads.
+the layout that training reads. A photo of a lens with a field of view of more than 120° becomes
+several images, "NAME_front.jpg", "NAME_left.jpg" …
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.views import LensView, lens_views
 from snowsplat.data.plain_pixels import plain_pixels
-from snowsplat.sfm.pinhole_model import write_model
+from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _DIVISORS = (2, 4, 8)
+_MASKS = 8  # of a camera that are examined for an image circle
+_CIRCLE = 0.95  # radius of an image circle / distance of the corner of a photo, at most
 _BYTES_PER_PIXEL = 50  # peak memory per photo, reached while it is resized
 # Options for saving each format, without a loss that affects training.
 _SAVING: dict[str, dict[str, Any]] = {
@@ -74,8 +78,13 @@ class _Job:
 
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
-    pinhole: Pinhole
+    views: Sequence[tuple[str, Pinhole | LensView]]  # the images of the photo, and their names
     mask: bool  # whether the photo has a mask
+
+    @property
+    def resampled(self) -> bool:
+        """Whether the image differs from the photo."""
+        return not all(isinstance(v, Pinhole) and v.nodes is None for _, v in self.views)
 
 
 def undistort(
@@ -106,19 +115,35 @@ def undistort(
     import pycolmap
 
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
-    pinholes = {number: _pinhole(camera) for number, camera in model.cameras.items()}
     known = {photo.name: photo for photo in photos}
+    wide, pinholes = dict[int, Sequence[LensView]](), dict[int, Pinhole]()
+    for number, camera in model.cameras.items():
+        masked = [
+            dataset / "distorted" / "masks" / f"{image.name}.png"
+            for image in (model.images[i] for i in sorted(model.reg_image_ids()))
+            if image.camera_id == number and image.name in known and known[image.name].mask
+        ]
+        several = _views_of_wide(camera, masked)
+        if several:
+            wide[number] = several
+        else:
+            pinholes[number] = _pinhole(camera)
     jobs = []
     for number in model.reg_image_ids():
         image = model.images[number]
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
-        masked = photo is not None and photo.mask
+        has_mask = photo is not None and photo.mask
         size = (camera.width, camera.height)
-        jobs.append(_Job(image.name, size, pinholes[image.camera_id], masked))
+        views: list[tuple[str, Pinhole | LensView]]
+        if image.camera_id in wide:
+            views = [(view_name(image.name, view), view) for view in wide[image.camera_id]]
+        else:
+            views = [(image.name, pinholes[image.camera_id])]
+        jobs.append(_Job(image.name, size, views, has_mask))
     jobs.sort(key=lambda job: job.name)
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
-    pixels = max(p.width * p.height for p in pinholes.values())
+    pixels = max(view.width * view.height for job in jobs for _, view in job.views)
     threads = min(
         threads or min(4, os.cpu_count() or 1),
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
@@ -126,15 +151,45 @@ def undistort(
     masks = _run(
         [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
     )
+    if wide:
+        model = in_views(model, wide)
     write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
-    sizes = Counter((job.pinhole.width, job.pinhole.height) for job in jobs)
+    sizes = Counter((view.width, view.height) for job in jobs for _, view in job.views)
     return Undistorted(
-        images=len(jobs),
+        images=sum(sizes.values()),
         masks=sum(masks),
         sizes=[(*size, count) for size, count in sizes.most_common()],
         folders=folders,
-        resampled=any(job.pinhole.nodes is not None for job in jobs),
+        resampled=any(job.resampled for job in jobs),
     )
+
+
+def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
+    """The pinhole views of a lens with a field of view of more than 120°; empty: it is not wide.
+
+    ``masks``: of photos of the camera. If they mask what is outside of an image circle, the views
+    show only the circle.
+    """
+    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+    try:
+        views = lens_views(lens, _circle(camera, masks))
+    except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
+        return ()
+    return () if views[0].rotation is None else views
+
+
+def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
+    """The radius in pixels, around the principal point, outside of which all is masked; or None."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    radius = np.hypot(x - camera.principal_point_x, y - camera.principal_point_y)
+    reach = 0.0
+    for path in masks[:: max(1, len(masks) // _MASKS)]:
+        with open_image(path, ["PNG"]) as mask:
+            used = np.asarray(mask.convert("L")) >= 128
+        if used.shape != radius.shape or not used.any():
+            return None
+        reach = max(reach, float(radius[used].max()))
+    return reach if 0 < reach < _CIRCLE * radius.max() else None
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
@@ -156,7 +211,7 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
     return pinhole
 
 
-def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> list[bool]:
+def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
     """Run jobs in threads; returns their results in any order.
 
     After the first error or Ctrl-C, running jobs finish and the others are cancelled.
@@ -178,45 +233,61 @@ def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> li
 # One photo
 
 
-def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
-    """Write the image, its smaller copies and its mask; returns whether a mask was written."""
-    source, target = dataset / "input" / job.name, dataset / "images" / job.name
+def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> int:
+    """Write the images, their smaller copies and their masks; returns the number of masks."""
+    source = dataset / "input" / job.name
     opaque = None
     with _open_photo(source, job) as opened:
         form = "JPEG" if opened.format == "MPO" else str(opened.format)
-        if job.pinhole.nodes is None:
-            with _atomic_path_in_new_folder(target) as temporary:
+        if not job.resampled:
+            with _atomic_path_in_new_folder(dataset / "images" / job.name) as temporary:
                 shutil.copyfile(source, temporary)
-        if job.pinhole.nodes is not None or divisors or job.mask:
+        if job.resampled or divisors or job.mask:
             photo = _decode(opened, source)
             opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
-        if job.pinhole.nodes is not None or divisors:
-            image = undistort_image(photo, job.pinhole)
-            if job.pinhole.nodes is not None:
-                _save(image, target, form)
+        for name, view in job.views if job.resampled or divisors else ():
+            image = undistort_image(photo, view)
+            if job.resampled:
+                _save(image, dataset / "images" / name, form)
             for divisor in divisors:
                 folder = dataset / f"images_{divisor}"
-                _save(_reduced(image, divisor), folder / job.name, form)
-    return job.mask and _undistort_mask(dataset, job, opaque)
+                _save(_reduced(image, divisor), folder / name, form)
+    return _undistort_masks(dataset, job, opaque)
 
 
-def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool:
-    """Write the mask, unless it masks only transparent pixels; returns whether it was written.
+def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int:
+    """Write the masks of the images of a photo; returns their number.
 
-    ``opaque``: (H, W) bool, the pixels of the photo that are not transparent; None: all.
+    A mask of transparent pixels only, and one of no pixels of a view, is not written. ``opaque``:
+    (H, W) bool, the pixels of the photo that are not transparent; None: all.
     """
-    name = f"{job.name}.png"
-    path = dataset / "distorted" / "masks" / name
-    with _open_photo(path, job) as opened:
-        mask = _decode(opened, path).convert("L")
-    if opaque is not None:
-        # SfM ignores transparent pixels; training uses them as empty space.
-        used = (np.asarray(mask) >= 128) | ~opaque
-        if used.all():
-            return False
-        mask = Image.fromarray(used.astype(np.uint8) * 255)
-    _save(undistort_mask(mask, job.pinhole), dataset / "masks" / name, "PNG")
-    return True
+    mask = None
+    if job.mask:
+        path = dataset / "distorted" / "masks" / f"{job.name}.png"
+        with _open_photo(path, job) as opened:
+            mask = _decode(opened, path).convert("L")
+        if opaque is not None:
+            # SfM ignores transparent pixels; training uses them as empty space.
+            used = (np.asarray(mask) >= 128) | ~opaque
+            mask = None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
+    written = 0
+    for name, view in job.views:
+        made = None if mask is None else undistort_mask(mask, view)
+        if isinstance(view, LensView):
+            made = _with_blank(made, view)
+        if made is not None:
+            _save(made, dataset / "masks" / f"{name}.png", "PNG")
+            written += 1
+    return written
+
+
+def _with_blank(mask: Image.Image | None, view: LensView) -> Image.Image | None:
+    """``mask`` of a view, with the pixels masked that show nothing of the photo; None: nothing."""
+    used = np.ones((view.height, view.width), bool) if mask is None else np.asarray(mask) >= 128
+    if view.partial:
+        for rows, position in view.strips(view.width, view.height):
+            used[rows] &= view.covered(position)
+    return None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
 
 
 def _open_photo(path: Path, job: _Job) -> Image.Image:

@@ -17,7 +17,7 @@ from torch import Tensor
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
-from snowsplat.synthetic.lens import Lens
+from snowsplat.synthetic.lens import FisheyeLens, Lens
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
@@ -27,6 +27,7 @@ _TILE = 64  # pixels along each side; the rays of a tile hit few shapes
 _FOCAL_35MM = 28  # in EXIF, mm; typical of a phone
 _FOCAL_TRUE = 1.013  # the true focal length divided by the one in EXIF, which is inexact
 _DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
+_FISHEYE_DISTORTION = (0.03, -0.008, 0.001, 0.0)  # OPENCV_FISHEYE: k1 … k4; of an action camera
 _WALK_RADIUS = 1.42  # metres, around the centre of the table
 _WALK_HEIGHTS = (0.46, 0.92)  # metres above the table, first and second round
 _FULL_WELL = 15000.0  # electrons of a white pixel; the shot noise is their square root
@@ -38,7 +39,7 @@ _JPEG_QUALITY = 92
 class Truth:
     """The true lens and poses of the photos."""
 
-    lens: Lens
+    lens: Lens | FisheyeLens
     poses: dict[str, Tensor]  # photo name -> cam_from_world (3, 4) float64, metres, z up
 
     def write(self, folder: Path) -> None:
@@ -47,7 +48,7 @@ class Truth:
             ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
             for name, pose in self.poses.items()
         ]
-        camera = ColmapCamera("OPENCV", self.lens.width, self.lens.height, self.lens.params)
+        camera = ColmapCamera(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
         nothing = np.zeros((0, 3))
         write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
 
@@ -84,10 +85,24 @@ def phone_lens(
     return Lens(width, height, focal, distortion)
 
 
+def fisheye_lens(
+    width: int,
+    height: int,
+    angle: float,
+    distortion: tuple[float, float, float, float] = _FISHEYE_DISTORTION,
+) -> FisheyeLens:
+    """A fisheye lens that fills the frame.
+
+    ``angle``: the field of view in degrees from corner to corner; without distortion.
+    """
+    focal = math.hypot(width, height) / 2 / math.radians(angle / 2)
+    return FisheyeLens(width, height, focal, distortion)
+
+
 def take_photos(
     folder: Path | str,
     build: Callable[[], Scene],
-    lens: Lens,
+    lens: Lens | FisheyeLens,
     poses: Sequence[Tensor],
     seed: int = 0,
     report: Report = silent,
@@ -117,7 +132,7 @@ def take_photos(
         random = np.random.default_rng([seed, i])
         pixels = photograph(scene, lens, poses[i], random, passing.get(i))
         with atomic_path(folder / names[i]) as temporary:
-            _save(temporary, pixels)
+            _save(temporary, pixels, lens)
 
     # numpy releases the GIL, so threads run in parallel.
     with ThreadPoolExecutor(2) as pool:
@@ -157,7 +172,7 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 
 def photograph(
     scene: Scene,
-    lens: Lens,
+    lens: Lens | FisheyeLens,
     cam_from_world: Tensor,
     random: np.random.Generator,
     passing: Scene | None = None,
@@ -200,7 +215,7 @@ def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
 
 
 @functools.lru_cache(1)
-def _tiles(lens: Lens) -> list[tuple[slice, slice, np.ndarray]]:
+def _tiles(lens: Lens | FisheyeLens) -> list[tuple[slice, slice, np.ndarray]]:
     """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""
     tiles = []
     for top in range(0, lens.height, _TILE):
@@ -219,10 +234,12 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
     return np.rint(255 * srgb).astype(np.uint8)
 
 
-def _save(path: Path, pixels: np.ndarray) -> None:
+def _save(path: Path, pixels: np.ndarray, lens: Lens | FisheyeLens) -> None:
+    """Save a JPEG. Frames of an action camera, which has a fisheye lens, have no focal length."""
     image = Image.fromarray(pixels)
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "snowsplat", "ray tracer"  # Make, Model
     exif[0x0112] = 1  # Orientation: as stored
-    exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
+    if isinstance(lens, Lens):
+        exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
     image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif)

@@ -37,7 +37,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.lens import is_fisheye, lens_of
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
@@ -145,7 +147,7 @@ def check_pairs(
             if image_id not in rays:
                 camera = model.camera(model.image(image_id).camera_id)
                 pixels = source.read_keypoints(image_id)[:, :2].astype(np.float64)
-                rays[image_id] = np.asarray(camera.cam_from_img(pixels))
+                rays[image_id] = _rays(camera, pixels)
             return rays[image_id][features]
 
         for found in sorted(verified_pairs(database), key=lambda p: (p.first, p.second)):
@@ -214,6 +216,17 @@ def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
     return {photo for photo, count in tears.items() if count >= _MIN_TEARS} - confirmed
 
 
+def _rays(camera: pycolmap.Camera, pixels: Floats) -> Floats:
+    """The positions (N, 2) of ``pixels`` (N, 2) in the normalised image plane of a camera.
+
+    For a fisheye lens, unit vectors (N, 3): its pixels are angles, up to 90° or more to its axis,
+    where COLMAP's are wrong. NaN where the model is not defined.
+    """
+    if not is_fisheye(camera.model_name):
+        return np.asarray(camera.cam_from_img(pixels))
+    return directions(lens_of(camera), pixels)
+
+
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
     """(features,) the id of the point that each feature observes, or ``INVALID_POINT3D_ID``."""
     points = image.points2D
@@ -245,7 +258,8 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
 
     The point is projected into the photo ``other``. The match is a miss if the distance between the
     projection and its feature in ``other`` is larger than ``max_error``, in the normalised image
-    plane, or if the point is behind the camera of ``other``.
+    plane, or if the point is behind the camera of ``other``. For a fisheye lens, the distance is
+    that of unit vectors.
     """
     _, ids, _ = one
     image, _, rays = other
@@ -255,9 +269,13 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
         points = positions[ids[rows]]
         camera = image.cam_from_world().matrix()
         seen = points @ camera[:, :3].T + camera[:, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = np.linalg.norm(seen[:, :2] / seen[:, 2:] - rays[rows], axis=1)
-        missed[rows] = (seen[:, 2] <= 0) | (distance > max_error)
+        if rays.shape[1] == 3:
+            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+            missed[rows] = np.linalg.norm(seen - rays[rows], axis=1) > max_error
+        else:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                distance = np.linalg.norm(seen[:, :2] / seen[:, 2:] - rays[rows], axis=1)
+            missed[rows] = (seen[:, 2] <= 0) | (distance > max_error)
     return missed
 
 
@@ -271,15 +289,17 @@ def agreement(
 
     Args:
         rays1, rays2: (M, 2) positions of the matched features in the normalised image planes of the
-            two cameras.
-        max_error: in the unit of the normalised image plane.
+            two cameras, or (M, 3) unit vectors.
+        max_error: in the unit of the normalised image plane or of the unit sphere.
     """
     rotation, translation = cam2_from_cam1.rotation.matrix(), cam2_from_cam1.translation
     x, y, z = translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    one, two = (np.concatenate([rays, np.ones((len(rays), 1))], 1) for rays in (rays1, rays2))
+    one, two = (_homogeneous(rays) for rays in (rays1, rays2))
     lines1, lines2 = two @ essential, one @ essential.T
-    length = (lines1[:, :2] ** 2).sum(1) + (lines2[:, :2] ** 2).sum(1)
+    # The squared gradient of the product below, along the image plane or the sphere. There, the
+    # part across the sphere is zero on the epipolar line, and small near it.
+    length = (lines1[:, : rays1.shape[1]] ** 2).sum(1) + (lines2[:, : rays2.shape[1]] ** 2).sum(1)
     distance = np.abs((two * lines2).sum(1)) / np.sqrt(np.maximum(length, 1e-300))
     # depth1 · one + translation ≈ depth2 · two, with both rays in the frame of the second camera.
     one = one @ rotation.T
@@ -290,6 +310,11 @@ def agreement(
     is_in_front = (cosine * along2 > along1) & (along2 > cosine * along1)
     is_parallel = cosine > np.cos(np.radians(_MIN_ANGLE))
     return float(np.mean((distance <= max_error) & (is_in_front | is_parallel)))
+
+
+def _homogeneous(rays: Floats) -> Floats:
+    """(M, 3): ``rays``, with z = 1 if they are in an image plane."""
+    return rays.copy() if rays.shape[1] == 3 else np.pad(rays, ((0, 0), (0, 1)), constant_values=1)
 
 
 def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:

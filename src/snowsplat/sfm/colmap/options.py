@@ -10,7 +10,7 @@ from typing import Any, Literal
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
 
-# The camera models of COLMAP that can be undistorted to a pinhole camera.
+# The camera models of COLMAP that can be undistorted to pinhole cameras.
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -23,6 +23,9 @@ CAMERA_MODELS = (
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
 )
 
 
@@ -31,7 +34,8 @@ class SfmOptions:
     """Options of the pose estimation."""
 
     # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
-    # eight parameters, else SIMPLE_RADIAL.
+    # eight parameters, else SIMPLE_RADIAL; of a fisheye lens, OPENCV_FISHEYE or
+    # SIMPLE_RADIAL_FISHEYE.
     camera_model: str = "auto"
     mapper: Mapper = "incremental"
     effort: EffortName = "normal"
@@ -61,6 +65,8 @@ class SfmResult:
     doubts: list[str] = field(default_factory=list)
     # The focal lengths, as text for users, if those of photos of one group differ (`Photo.group`).
     zooms: str = ""
+    # Which photos are from a fisheye lens, as text for users, if this was found from their matches.
+    fisheye: str = ""
 
 
 @dataclass(frozen=True)
