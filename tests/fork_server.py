@@ -27,6 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 _LARGEST_REQUEST = 1 << 17
+_MOST_FILES = 4096
 
 
 def popen(
@@ -198,6 +199,7 @@ class _This:
         if pid == 0:
             pools._threads_queues.clear()  # a fork has no threads of pools, so none to wait for
             _take(streams or [])
+            os.closerange(3, _MOST_FILES)  # among others, the parent's ends of the pipes
             _run_and_exit(request)
         return pid
 

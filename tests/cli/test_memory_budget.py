@@ -1,4 +1,4 @@
-"""`--memory`: a dataset that is ten times as large as the allowed memory."""
+"""`--memory`: a dataset that is four times as large as the allowed memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import snowsplat
 
 SOURCES = Path(snowsplat.__file__).parents[1]
 WIDTH, HEIGHT, BUDGET = 640, 480, 170_000_000
-COUNT = 10 * BUDGET // (3 * WIDTH * HEIGHT)
+COUNT = 4 * BUDGET // (3 * WIDTH * HEIGHT)
 
 
 pytestmark = pytest.mark.slow
@@ -51,7 +51,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_dataset_of_ten_times_the_memory_trains(dataset: Path, tmp_path: Path) -> None:
+def test_a_dataset_of_four_times_the_memory_trains(dataset: Path, tmp_path: Path) -> None:
     arguments = (
         "-o",
         str(tmp_path / "out"),

@@ -111,15 +111,9 @@ def test_ctrl_c_saves_the_scene_and_a_checkpoint(dataset, tmp_path):
 @pytest.mark.slow
 def test_torchrun(dataset, scene, tmp_path):
     """Here, all processes are new ones, not forks."""
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-    ]
-    command += ["-m", "snowsplat", "train", str(dataset), "-o", str(tmp_path / "out"), *FLAGS]
+    command = [sys.executable, "-m", "torch.distributed.run"]
+    command += ["--standalone", "--nproc-per-node=2", "-m", "snowsplat", "train"]
+    command += [str(dataset), "-o", str(tmp_path / "out"), *FLAGS]
     subprocess.run(command, check=True, timeout=300, stderr=subprocess.DEVNULL)
     assert (tmp_path / "out" / SCENE).read_bytes() == scene
 

@@ -34,7 +34,8 @@ def file(scene, tmp_path_factory) -> Path:
 
 @contextmanager
 def opened(file: Path, width: int, height: int, link: str = "") -> Iterator[Page]:
-    with Browser(width, height) as browser:
+    # Few pixels of the screen: the tests look at poses and buttons, not at the picture.
+    with Browser(width, height, 0.25, frames=5.0) as browser:
         page = browser.open(f"{file.as_uri()}?webgl{link}")
         page.wait_for("!!window.app", 60)
         yield page

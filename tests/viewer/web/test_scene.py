@@ -145,7 +145,7 @@ def test_a_real_browser_shows_our_render(trained, tmp_path):
     gaussians, start, *_ = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
     files, headers = site(Description("scene"), trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
-    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
+    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT, frames=5.0) as browser:
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         shown = soon(page, lambda shown: psnr(shown, ours) > 30)
@@ -174,7 +174,7 @@ def test_a_real_browser_shows_levels_of_detail(trained, tmp_path):
     about = Description("scene")
     files, headers = site(about, trained.gaussians, trained.cameras, (0.0, 0.0, 0.0), levels)
     assert "scene.compressed.ply" not in files
-    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
+    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT, frames=5.0) as browser:
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         soon(page, lambda shown: psnr(shown, ours) > 29)
@@ -199,7 +199,7 @@ def test_a_real_browser_shows_an_antialiased_scene(trained, tmp_path):
     ours = picture(shown_scene, camera_of(start))
     unfiltered = dataclasses.replace(shown_scene, antialiased=False)
     files, headers = site(Description("scene"), small, trained.cameras, (0.0, 0.0, 0.0))
-    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT) as browser:
+    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT, frames=5.0) as browser:
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         shown = soon(page, lambda shown: psnr(shown, ours) > 30)
