@@ -175,6 +175,7 @@ def read_files(
     if len(count) < len(posed):
         repeated = next(name for name, n in sorted(count.items()) if n > 1)
         raise UserError(f"{root}: has two images named {repeated}; remove one")
+    _warn_of_cropped(posed)
     found = list(zip(posed, headers, sizes, strict=True))
     return DatasetFiles(
         root,
@@ -384,20 +385,44 @@ def _views(
         camera = image.camera.scaled(width, height)
         yield View(image.name, camera, source, mask, *_depth_of(image))
         return
-    try:
-        views = lens_views(image.lens, circles.get(image.lens))
-    except ValueError as error:
-        shown = ", ".join(f"{value:.5g}" for value in image.lens.params)
-        raise UserError(
-            f"{image.path}: the lens distortion ({image.lens.model} {shown}) is not possible: "
-            f"{error}; correct the calibration"
-        ) from None
-    for view in views:
+    for view in _pinhole_views(image, image.lens, circles.get(image.lens)):
         yield _lens_view(image, view, header, size, resolution)
 
 
 def _depth_of(image: PosedImage) -> tuple[Path | None, float, Path | None]:
     return image.depth, image.depth_unit, image.depth_confidence
+
+
+def _pinhole_views(
+    image: PosedImage, lens: LensModel, circle: float | None
+) -> tuple[LensView, ...]:
+    try:
+        return lens_views(lens, circle)
+    except ValueError as error:
+        shown = ", ".join(f"{value:.5g}" for value in lens.params)
+        raise UserError(
+            f"{image.path}: the lens distortion ({lens.model} {shown}) is not possible: {error}; "
+            "correct the calibration"
+        ) from None
+
+
+def _warn_of_cropped(posed: Sequence[PosedImage]) -> None:
+    """Warn of lenses whose calibration is valid only near the centre of the photos."""
+    cropped = [
+        image
+        for image in posed
+        if image.lens is not None
+        and any(v.cropped for v in _pinhole_views(image, image.lens, None))
+    ]
+    if cropped:
+        logger.warning(
+            "%s: the lens distortion (%s) is valid only near the centre of the photos, so %d of %d "
+            "photos are cropped",
+            cropped[0].path,
+            cropped[0].lens.model if cropped[0].lens else "",
+            len(cropped),
+            len(posed),
+        )
 
 
 def _lens_view(

@@ -44,6 +44,8 @@ _ARIA = ("FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE")
 _ARIA_COEFFICIENTS = 12
 # The largest relative error of the rational function that replaces a polynomial.
 _FIT_ERROR = 1e-5
+# Of the squared tangent of the half field of view, and of the magnification: larger is damaged.
+_LARGEST = 1e6
 
 
 def is_panorama(values: Mapping[str, Any]) -> bool:
@@ -135,18 +137,22 @@ def _rational(
 
     ``largest``: of s, the squared distance from the optical axis at z = 1.
     """
+    impossible = UserError(
+        f"{where}: the lens distortion k4 = {polynomial[3]:g} cannot be undone; undistort the "
+        "photos with the program that made the file"
+    )
     s = np.linspace(0.0, 1.5 * largest, 200)[1:]
     wanted = np.polynomial.polynomial.polyval(s, (1.0, *polynomial))
+    if largest > _LARGEST or np.abs(wanted).max() > _LARGEST:
+        raise impossible
     powers = s[:, None] ** [1, 2, 3]
     matrix = np.hstack([powers, -wanted[:, None] * powers])
-    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     found = np.linalg.lstsq(matrix / scale, wanted - 1.0, rcond=None)[0] / scale
     divisor = 1.0 + powers @ found[3:]
-    made = (1.0 + powers @ found[:3]) / divisor
-    if divisor.min() <= 0 or np.abs(made - wanted).max() > _FIT_ERROR:
-        raise UserError(
-            f"{where}: the lens distortion k4 = {polynomial[3]:g} cannot be undone; undistort the "
-            "photos with the program that made the file"
-        )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        made = (1.0 + powers @ found[:3]) / divisor
+    if not (divisor.min() > 0 and np.abs(made - wanted).max() <= _FIT_ERROR):
+        raise impossible
     k1, k2, k3, k4, k5, k6 = found.tolist()
     return k1, k2, k3, k4, k5, k6

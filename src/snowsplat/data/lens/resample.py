@@ -64,11 +64,15 @@ def resampled(
     """
     made: np.ndarray = np.empty((len(planes), height, width), np.uint8)
     margin = _MARGIN if view.wraps else 0
-    pixels = np.pad(planes.transpose(1, 2, 0), ((0, 0), (margin, margin), (0, 0)), mode="wrap")
+    pixels = np.atleast_3d(cv2.merge([np.ascontiguousarray(plane) for plane in planes]))
+    if margin:
+        pixels = np.pad(pixels, ((0, 0), (margin, margin), (0, 0)), mode="wrap")
     for rows, position in view.strips(width, height):
-        position *= np.array(scale, np.float32)
-        position[..., 0] += margin
-        np.nan_to_num(position, copy=False, nan=-1.0)
+        if scale != (1, 1) or margin:
+            position *= np.array(scale, np.float32)
+            position[..., 0] += margin
+        if np.isnan(position.sum()):
+            np.nan_to_num(position, copy=False, nan=-1.0)
         made[:, rows] = _catmull_rom(pixels, position).transpose(2, 0, 1)
     return made
 

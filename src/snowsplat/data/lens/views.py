@@ -51,6 +51,7 @@ class LensView:
         rotation: (3, 3) in rows, view_from_lens; None: the identity.
         circle: radius in pixels of the image circle around the principal point; None: unlimited.
         partial: some pixels show nothing of the photo; see `covered`.
+        cropped: the model is valid only near the centre, so the outer part is cut off.
     """
 
     lens: LensModel
@@ -61,6 +62,7 @@ class LensView:
     rotation: tuple[tuple[float, ...], ...] | None = None
     circle: float | None = None
     partial: bool = False
+    cropped: bool = False
 
     @property
     def wraps(self) -> bool:
@@ -180,7 +182,8 @@ def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, 
     across, down = reach[0] + reach[2], reach[1] + reach[3]
     if max(across, down) <= _WIDEST and circle is None:
         pinhole = pinhole_of(lens)
-        return (LensView(lens, "", pinhole.width, pinhole.height, pinhole.params),)
+        size = pinhole.width, pinhole.height
+        return (LensView(lens, "", *size, pinhole.params, cropped=pinhole.cropped),)
     rays = field.rays()
     with np.errstate(divide="ignore"):
         half_angles = np.abs(np.arctan(rays[:, :2] / rays[:, 2:])).max(0)
