@@ -9,6 +9,7 @@
     ahead    a street; the camera walks and looks ahead
     side     a street; the camera looks at the façades of the other side
     turns    a street; the camera walks ahead and turns from side to side
+    panorama the room; 360° panoramas, twice as wide as high, on the loops of "room"
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
@@ -30,6 +31,7 @@ from sfm_paths import (
     around_corners,
     around_two,
     in_between,
+    level_loops,
     looking_across,
     looking_down,
     loops,
@@ -42,6 +44,7 @@ from torch import Tensor
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic import textures as paint
+from snowsplat.synthetic.lens import Equirectangular, Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
@@ -77,6 +80,13 @@ class Kind:
 
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
+    all_around: bool = False  # 360° panoramas
+
+    def lens(self, size: tuple[int, int]) -> Lens | Equirectangular:
+        """The camera of photos of this width and height; panoramas have twice this width."""
+        if self.all_around:
+            return Equirectangular(2 * size[0], size[0])
+        return phone_lens(*size)
 
 
 def cache_folder() -> Path:
@@ -102,7 +112,7 @@ def photos_of(
     """
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{count}-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
-    lens = phone_lens(*size)
+    lens = chosen.lens(size)
     poses = chosen.path(count, seed)
     return folder, take_photos(folder, lambda: chosen.build(seed, count), lens, poses, seed, report)
 
@@ -123,13 +133,13 @@ def video_of(
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
     poses = in_between(chosen.path(seconds, seed), seconds * FRAMES_PER_SECOND)
-    lens = phone_lens(*size)
+    lens = chosen.lens(size)
     truth = take_photos(
         folder / "frames", lambda: chosen.build(seed, seconds), lens, poses, seed, report
     )
     video = folder / "video.mp4"
     if not video.exists():
-        with video_writer(video, *size, FRAMES_PER_SECOND) as add:
+        with video_writer(video, lens.width, lens.height, FRAMES_PER_SECOND) as add:
             for name in truth.poses:
                 with Image.open(folder / "frames" / name) as frame:
                     add(np.asarray(frame.convert("RGB")))
@@ -410,4 +420,5 @@ KINDS = {
     "ahead": Kind(_street, ahead),
     "side": Kind(_street, to_the_side),
     "turns": Kind(_street, around_corners),
+    "panorama": Kind(_indoors(_room), level_loops, all_around=True),
 }

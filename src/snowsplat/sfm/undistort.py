@@ -29,7 +29,9 @@ from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
-from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.resample import PixelMap, undistort_image, undistort_mask
+from snowsplat.data.lens.views import lens_views
+from snowsplat.sfm.panorama_views import view_name, with_views
 from snowsplat.sfm.pinhole_model import write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -73,8 +75,13 @@ class _Job:
 
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
-    pinhole: Pinhole
+    views: dict[str, PixelMap]  # the path relative to images/ of each view of it
     mask: bool  # whether the photo has a mask
+
+    @property
+    def resampled(self) -> bool:
+        """Whether the images are not copies of the photo."""
+        return not all(isinstance(v, Pinhole) and v.nodes is None for v in self.views.values())
 
 
 def undistort(
@@ -87,7 +94,7 @@ def undistort(
 ) -> Undistorted:
     """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are known.
 
-    Photos without a pose are left out. Files keep their names and formats: JPEG is saved at quality
+    Photos without a pose are left out. A panorama becomes several images; see `panorama_views`. Files keep their names and formats: JPEG is saved at quality
     95 without chroma subsampling, all others without loss, with transparency. If a camera has no
     distortion, its photos are copied. A mask is written for each photo that has one, unless all
     masked pixels are transparent in the image. The model is written last.
@@ -105,19 +112,32 @@ def undistort(
     import pycolmap
 
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
-    pinholes = {number: _pinhole(camera) for number, camera in model.cameras.items()}
+    cameras = model.cameras.items()
+    pinholes = {i: _pinhole(camera) for i, camera in cameras if not camera.is_spherical()}
+    around = {i: lens_views(_lens(camera)) for i, camera in cameras if camera.is_spherical()}
     known = {photo.name: photo for photo in photos}
     jobs = []
     for number in model.reg_image_ids():
         image = model.images[number]
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
         masked = photo is not None and photo.mask
-        size = (camera.width, camera.height)
-        jobs.append(_Job(image.name, size, pinholes[image.camera_id], masked))
+        views: dict[str, PixelMap] = {
+            view_name(image.name, view): view for view in around.get(image.camera_id, ())
+        }
+        views = views or {image.name: pinholes[image.camera_id]}
+        jobs.append(_Job(image.name, (camera.width, camera.height), views, masked))
+    if around:
+        model = with_views(model, around)
+        made = model.cameras.items()
+        pinholes |= {i: _pinhole(camera) for i, camera in made if i not in pinholes}
     jobs.sort(key=lambda job: job.name)
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
-    pixels = max(p.width * p.height for p in pinholes.values())
+    pixels = max(
+        max(w * h, *(view.width * view.height for view in job.views.values()))
+        for job in jobs
+        for w, h in [job.camera_size]
+    )
     threads = min(
         threads or min(4, os.cpu_count() or 1),
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
@@ -126,21 +146,24 @@ def undistort(
         [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
     )
     write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
-    sizes = Counter((job.pinhole.width, job.pinhole.height) for job in jobs)
+    sizes = Counter((view.width, view.height) for job in jobs for view in job.views.values())
     return Undistorted(
-        images=len(jobs),
+        images=sizes.total(),
         masks=sum(masks),
         sizes=[(*size, count) for size, count in sizes.most_common()],
         folders=folders,
-        resampled=any(job.pinhole.nodes is not None for job in jobs),
+        resampled=any(job.resampled for job in jobs),
     )
 
 
+def _lens(camera: pycolmap.Camera) -> LensModel:
+    return LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+
+
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
-    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
     try:
-        pinhole = pinhole_of(lens)
+        pinhole = pinhole_of(_lens(camera))
     except ValueError as error:
         raise UserError(
             f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
@@ -155,7 +178,7 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
     return pinhole
 
 
-def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> list[bool]:
+def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
     """Run jobs in threads; returns their results in any order.
 
     After the first error or Ctrl-C, running jobs finish and the others are cancelled.
@@ -177,46 +200,53 @@ def _run(jobs: Sequence[Callable[[], bool]], report: Report, threads: int) -> li
 # One photo
 
 
-def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> bool:
-    """Write the image, its smaller copies and its mask; returns whether a mask was written."""
+def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> int:
+    """Write the images, their smaller copies and masks; returns the number of masks."""
     source, target = dataset / "input" / job.name, dataset / "images" / job.name
     opaque = None
     with _open_photo(source, job) as opened:
         form = "JPEG" if opened.format == "MPO" else str(opened.format)
-        if job.pinhole.nodes is None:
+        if not job.resampled:
             with _atomic_path_in_new_folder(target) as temporary:
                 shutil.copyfile(source, temporary)
-        if job.pinhole.nodes is not None or divisors or job.mask:
+        if job.resampled or divisors or job.mask:
             profile = opened.info.get("icc_profile")
             photo = _eight_bit(_decode(opened, source))
             opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
-        if job.pinhole.nodes is not None or divisors:
-            image = undistort_image(photo, job.pinhole)
-            if job.pinhole.nodes is not None:
-                _save(image, target, form, profile)
-            for divisor in divisors:
-                folder = dataset / f"images_{divisor}"
-                _save(_reduced(image, divisor), folder / job.name, form, profile)
-    return job.mask and _undistort_mask(dataset, job, opaque)
+        if job.resampled or divisors:
+            for name, view in job.views.items():
+                image = undistort_image(photo, view)
+                if job.resampled:
+                    _save(image, dataset / "images" / name, form, profile)
+                for divisor in divisors:
+                    folder = dataset / f"images_{divisor}"
+                    _save(_reduced(image, divisor), folder / name, form, profile)
+    return _undistort_mask(dataset, job, opaque) if job.mask else 0
 
 
-def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> bool:
-    """Write the mask, unless it masks only transparent pixels; returns whether it was written.
+def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int:
+    """Write the masks, unless they mask only transparent pixels; returns their number.
+
+    A view of several in which nothing is masked has no mask.
 
     ``opaque``: (H, W) bool, the pixels of the photo that are not transparent; None: all.
     """
-    name = f"{job.name}.png"
-    path = dataset / "distorted" / "masks" / name
+    path = dataset / "distorted" / "masks" / f"{job.name}.png"
     with _open_photo(path, job) as opened:
         mask = _decode(opened, path).convert("L")
     if opaque is not None:
         # SfM ignores transparent pixels; training uses them as empty space.
         used = (np.asarray(mask) >= 128) | ~opaque
         if used.all():
-            return False
+            return 0
         mask = Image.fromarray(used.astype(np.uint8) * 255)
-    _save(undistort_mask(mask, job.pinhole), dataset / "masks" / name, "PNG")
-    return True
+    count = 0
+    for name, view in job.views.items():
+        made = undistort_mask(mask, view)
+        if len(job.views) == 1 or made.getextrema()[0] == 0:
+            _save(made, dataset / "masks" / f"{name}.png", "PNG")
+            count += 1
+    return count
 
 
 def _open_photo(path: Path, job: _Job) -> Image.Image:

@@ -1,8 +1,10 @@
-"""A camera with lens distortion: COLMAP's OPENCV model with a single focal length."""
+"""A camera with lens distortion: COLMAP's OPENCV model with a single focal length; a panorama."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +23,7 @@ class Lens:
     height: int
     focal: float  # pixels
     distortion: tuple[float, float, float, float]  # k1, k2, p1, p2
+    model: ClassVar[str] = "OPENCV"  # the name in COLMAP
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel positions (2, P) of points (3, P) in the camera's frame, in front of it."""
@@ -65,3 +68,33 @@ class Lens:
             [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
         )
         return xy * (1 + k1 * r2 + k2 * r2 * r2) + bend
+
+
+@dataclass(frozen=True)
+class Equirectangular:
+    """The camera of a 360° panorama, in COLMAP's model EQUIRECTANGULAR.
+
+    A column is a longitude and a row is a latitude: the direction (0, 0, 1) is at the centre of the
+    image, (1, 0, 0) a quarter of the width to the right, and (0, 1, 0) in the last row.
+    """
+
+    width: int
+    height: int
+    model: ClassVar[str] = "EQUIRECTANGULAR"
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (3, P) in the camera's frame, of pixel positions (2, P)."""
+        longitude = (pixels[0] / self.width - 0.5) * 2 * math.pi
+        latitude = (pixels[1] / self.height - 0.5) * math.pi
+        level = np.cos(latitude)
+        return np.stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)])
+
+    @property
+    def focal(self) -> float:
+        """Pixels per radian at the equator."""
+        return self.width / (2 * math.pi)
+
+    @property
+    def params(self) -> tuple[float, ...]:
+        """Parameters of COLMAP's EQUIRECTANGULAR: the width and the height in pixels."""
+        return (float(self.width), float(self.height))

@@ -15,9 +15,10 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.panorama import panorama_xmp
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
-from snowsplat.synthetic.lens import Lens
+from snowsplat.synthetic.lens import Equirectangular, Lens
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
@@ -38,7 +39,7 @@ _JPEG_QUALITY = 92
 class Truth:
     """The true lens and poses of the photos."""
 
-    lens: Lens
+    lens: Lens | Equirectangular
     poses: dict[str, Tensor]  # photo name -> cam_from_world (3, 4) float64, metres, z up
 
     def write(self, folder: Path) -> None:
@@ -47,7 +48,7 @@ class Truth:
             ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
             for name, pose in self.poses.items()
         ]
-        camera = ColmapCamera("OPENCV", self.lens.width, self.lens.height, self.lens.params)
+        camera = ColmapCamera(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
         nothing = np.zeros((0, 3))
         write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
 
@@ -87,7 +88,7 @@ def phone_lens(
 def take_photos(
     folder: Path | str,
     build: Callable[[], Scene],
-    lens: Lens,
+    lens: Lens | Equirectangular,
     poses: Sequence[Tensor],
     seed: int = 0,
     report: Report = silent,
@@ -117,7 +118,7 @@ def take_photos(
         random = np.random.default_rng([seed, i])
         pixels = photograph(scene, lens, poses[i], random, passing.get(i))
         with atomic_path(folder / names[i]) as temporary:
-            _save(temporary, pixels)
+            _save(temporary, pixels, isinstance(lens, Equirectangular))
 
     # numpy releases the GIL, so threads run in parallel.
     with ThreadPoolExecutor(2) as pool:
@@ -157,7 +158,7 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 
 def photograph(
     scene: Scene,
-    lens: Lens,
+    lens: Lens | Equirectangular,
     cam_from_world: Tensor,
     random: np.random.Generator,
     passing: Scene | None = None,
@@ -200,7 +201,7 @@ def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
 
 
 @functools.lru_cache(1)
-def _tiles(lens: Lens) -> list[tuple[slice, slice, np.ndarray]]:
+def _tiles(lens: Lens | Equirectangular) -> list[tuple[slice, slice, np.ndarray]]:
     """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""
     tiles = []
     for top in range(0, lens.height, _TILE):
@@ -219,10 +220,14 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
     return np.rint(255 * srgb).astype(np.uint8)
 
 
-def _save(path: Path, pixels: np.ndarray) -> None:
+def _save(path: Path, pixels: np.ndarray, panorama: bool) -> None:
     image = Image.fromarray(pixels)
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "snowsplat", "ray tracer"  # Make, Model
     exif[0x0112] = 1  # Orientation: as stored
-    exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
-    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif)
+    options = {}
+    if panorama:
+        options["xmp"] = panorama_xmp(*image.size)
+    else:
+        exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
+    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif, **options)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
 
-# The camera models of COLMAP that can be undistorted to a pinhole camera.
+# The camera models of COLMAP that can be undistorted to pinhole cameras.
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -23,7 +23,10 @@ CAMERA_MODELS = (
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
+    "EQUIRECTANGULAR",
 )
+#: The camera model of 360° panoramas, twice as wide as high.
+PANORAMA_MODEL = "EQUIRECTANGULAR"
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class SfmOptions:
     """Options of the pose estimation."""
 
     # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
-    # eight parameters, else SIMPLE_RADIAL.
+    # eight parameters, else SIMPLE_RADIAL. It does not apply to panoramas (`Photo.panorama`).
     camera_model: str = "auto"
     mapper: Mapper = "incremental"
     effort: EffortName = "normal"
@@ -91,6 +94,21 @@ class Effort:
             image_size=self.image_size * 2 // 3,
             features=self.features // 2,
         )
+
+
+# Features of a panorama, and its width for their detection, divided by those of a photo. A panorama
+# has about five times the field of view.
+_PANORAMA_FEATURES, _PANORAMA_SIZE = 2, 2.5
+
+
+def detection_size(image_size: int, panorama: bool) -> int:
+    """The longest side, in pixels, at which features are detected; larger photos are resized."""
+    return round(_PANORAMA_SIZE * image_size) if panorama else image_size
+
+
+def feature_count(features: int, panorama: bool) -> int:
+    """The approximate number of features of a photo."""
+    return _PANORAMA_FEATURES * features if panorama else features
 
 
 EFFORTS: dict[EffortName, Effort] = {

@@ -19,7 +19,7 @@ from PIL import Image, ImageOps
 from snowsplat.data import image_file
 from snowsplat.data.image_file import reason_of
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
-from snowsplat.sfm.ingest.panorama import panorama_in_xmp
+from snowsplat.sfm.ingest.panorama import STITCHED, Panorama, panorama_in_xmp
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM")
 # Formats that COLMAP reads, by file extension.
@@ -48,7 +48,7 @@ class Header:
     plain: bool  # 8 bits per channel; grey, RGB, or RGBA in a PNG
     transparent: bool  # has an alpha channel
     exif: ExifInfo
-    panorama: str | None = None  # `PANORAMA` or `STITCHED`, if the metadata say so
+    panorama: Panorama | None = None  # if the metadata say so
 
     @property
     def sideways(self) -> bool:
@@ -63,7 +63,9 @@ class Header:
     def is_ready(self, longest: int | None) -> bool:
         """Whether COLMAP can read the file unchanged, and its pixels are upright."""
         as_stored = self.size(longest) == (self.width, self.height)
-        return self.format in _SUFFIXES and self.plain and self.exif.orientation == 1 and as_stored
+        whole = self.panorama is None or not self.panorama.cropped
+        upright = self.exif.orientation == 1
+        return self.format in _SUFFIXES and self.plain and upright and as_stored and whole
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
@@ -88,7 +90,7 @@ def read_header(path: Path) -> Header:
     """Read the header of a photo, without decoding it.
 
     Raises:
-        Unusable: the format is unknown, or the photo is damaged or too small.
+        Unusable: the format is unknown, or the photo is damaged, too small, or stitched.
     """
     try:
         with open_image(path, header_only=True) as image:
@@ -100,6 +102,7 @@ def read_header(path: Path) -> Header:
             plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
             xmp = _xmp(image)
+            panorama = panorama_in_xmp(xmp, width, height)
             header = Header(
                 format=image.format or "",
                 width=width,
@@ -109,12 +112,14 @@ def read_header(path: Path) -> Header:
                 and _bits(path, image) == 8,
                 transparent=transparent,
                 exif=read_exif(exif, width, height, xmp, image.info.get("original_orientation")),
-                panorama=panorama_in_xmp(xmp),
+                panorama=panorama if isinstance(panorama, Panorama) else None,
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
+    if panorama == STITCHED:
+        raise Unusable(STITCHED)
     return header
 
 
