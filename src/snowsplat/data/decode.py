@@ -15,6 +15,8 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from snowsplat.data.image_file import open_image, reason_of
+from snowsplat.data.lens.resample import resampled
+from snowsplat.data.lens.views import LensView
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
@@ -23,6 +25,8 @@ from snowsplat.util.safe_json import is_file
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 # Pixels are converted in bands of this size, to limit the memory for temporary arrays.
 _BAND_PIXELS = 1 << 20
+# Samples per pixel along each axis when a view of a larger photo is scaled down.
+_SAMPLES = 2
 #: Suffixes that are tried if a dataset names its images without a suffix.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
 _EXIF_ORIENTATION = 0x0112
@@ -41,6 +45,8 @@ class ImageSource:
     height: int  # pixels, after scaling
     apply_orientation: bool = False  # apply the EXIF orientation
     stored: int = 0  # number of pixels in the file; 0: unknown, then it is width × height
+    view: LensView | None = None  # the photo has distortion; the image is this view of it
+    blank: bool = False  # a mask without a file: white; ``path`` is that of the photo
 
 
 @dataclass(frozen=True)
@@ -127,7 +133,7 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
         raise _unreadable(source.path, error) from None
     if planes.shape[0] == 4:
         planes = _with_alpha(planes, background)
-    return torch.from_numpy(resize_area(planes, source.width, source.height))
+    return torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
 
 
 def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
@@ -145,24 +151,31 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
         with open_image(source.path, _FORMATS) as opened:
             opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
             image = ImageOps.exif_transpose(opened) if source.apply_orientation else opened
-            planes = [Image.fromarray(plane) for plane in _planes(image)]
+            planes = _planes(image)
     except Exception as error:  # as above
         raise _unreadable(source.path, error) from None
-    small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in planes]
-    opaque = np.full((size[1], size[0]), 255, np.uint8)
-    return np.stack(small if len(small) == 4 else [*small, opaque])
+    if source.view is None:
+        pictures = map(Image.fromarray, planes)
+        small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in pictures]
+    else:
+        small = list(_scaled(planes, source.view, *size))
+    shown = np.uint8(255) * _covered(source.view, *size)
+    return np.stack([*small[:3], np.minimum(small[3], shown) if len(small) == 4 else shown])
 
 
 def load_mask(source: ImageSource) -> Tensor:
     """Decode a mask to (H, W) bool: True where its largest channel is 128 or more.
 
-    Transparent pixels count as black.
+    Transparent pixels count as black, and so do those of a view that the lens does not show.
 
     Raises:
         UserError: see `load_image`.
     """
+    covered = torch.from_numpy(_covered(source.view, source.width, source.height))
+    if source.blank:
+        return covered
     planes = load_image(source, background=(0.0, 0.0, 0.0))
-    return planes.amax(0) >= 128
+    return (planes.amax(0) >= 128) & covered
 
 
 def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
@@ -199,6 +212,36 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
         rows = _mean_over_columns(plane, width)
         out[...] = np.rint(_mean_over_columns(rows.T, height).T)
     return resized
+
+
+def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) -> np.ndarray:
+    """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down.
+
+    A view has several samples per pixel if the photo has more detail than the result.
+    """
+    if view is None:
+        return resize_area(planes, width, height)
+    ratio = view.width * planes.shape[2] / (view.lens.width * width)  # pixels of the photo, per one
+    reduced = max(1, int(ratio / _SAMPLES))
+    scale = planes.shape[2] / view.lens.width, planes.shape[1] / view.lens.height
+    if reduced > 1:
+        planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduced)) for plane in planes])
+        scale = scale[0] / reduced, scale[1] / reduced
+    samples = max(1, round(ratio / reduced))
+    made = resampled(planes, view, samples * width, samples * height, scale)
+    if len(made) == 4:  # premultiplied colours
+        made[:3] = np.minimum(made[:3], made[3])
+    return resize_area(made, width, height)
+
+
+def _covered(view: LensView | None, width: int, height: int) -> np.ndarray:
+    """(height, width) bool: the pixels of a view that lie completely in the photo."""
+    if view is None or not view.partial:
+        return np.ones((height, width), bool)
+    fine: np.ndarray = np.empty((_SAMPLES * height, _SAMPLES * width), bool)
+    for rows, position in view.strips(_SAMPLES * width, _SAMPLES * height):
+        fine[rows] = view.covered(position)
+    return np.logical_and.reduce(fine.reshape(height, _SAMPLES, width, _SAMPLES), axis=(1, 3))
 
 
 def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:

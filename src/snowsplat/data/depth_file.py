@@ -72,6 +72,7 @@ def to_z(
     camera: Camera,
     near: float | None = None,
     far: float | None = None,
+    photo_z: np.ndarray | None = None,
 ) -> Tensor:
     """Camera z (H, W) float32 in world units; NaN where it is unknown.
 
@@ -86,6 +87,8 @@ def to_z(
             distance or z is in world units, and z = max(disparity) / disparity, but at most
             `FARTHEST`.
         far: depth of the farthest pixel.
+        photo_z: (H, W); the values are of a photo whose optical axis has another direction, and
+            this is z in the frame of the photo of the points at z = 1 of the camera.
 
     Raises:
         UserError: no value is known, or only one of ``near`` and ``far`` is given, or they are not
@@ -114,6 +117,10 @@ def to_z(
         depth = 1.0 / depth
     elif kind == "distance":
         depth = depth / _ray_lengths(depth.shape[1], depth.shape[0], camera)
+    elif photo_z is not None:
+        turned = torch.from_numpy(photo_z)
+        known &= turned > 0
+        depth = depth / turned
     return torch.where(known, depth, torch.nan).float()
 
 

@@ -5,14 +5,20 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+import torch
 
 from snowsplat.data.colmap import find_models, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
-from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, read_header
+from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.lens.circle import image_circle
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.transforms_json import find_transforms, read_transforms
+from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
 
@@ -24,6 +30,8 @@ _DIVISORS = (1, 2, 4, 8)
 _SMALLEST_SIDE = 16
 # The largest ratio between the size of a camera and the size of its image file.
 _LARGEST_FACTOR = 16
+# To find the image circle of a lens: the number of photos, and their longer side in pixels.
+_CIRCLE_PHOTOS, _CIRCLE_SIDE = 12, 400
 
 
 class NoPosesError(UserError):
@@ -79,11 +87,13 @@ class DatasetFiles:
 
     Attributes:
         images: each image, the header of its file, and the result of `_file_sizes`.
-        test_names: names of the views to hold out.
+        circles: the radius of the image circle of each wide lens that has one in the photos.
+        test_names: names of the images to hold out.
     """
 
     root: Path
     images: list[tuple[PosedImage, Header, tuple[int, int, bool]]]
+    circles: Mapping[LensModel, float]
     points: Points | None
     description: str
     test_names: set[str]
@@ -95,18 +105,19 @@ class DatasetFiles:
             SettingError: ``resolution`` is invalid.
             UserError: all images are held out, or cameras are not finite.
         """
-        views = sorted(
-            (_view(*image, resolution) for image in self.images), key=lambda view: view.name
-        )
-        train = [view for view in views if view.name not in self.test_names]
+        train: list[View] = []
+        test: list[View] = []
+        for image, header, size in self.images:
+            views = _views(image, header, size, resolution, self.circles)
+            (test if image.name in self.test_names else train).extend(views)
         if not train:
             raise UserError(
-                f"{self.root}: all {len(views)} images are held out for testing, so no image is "
-                "left for training; hold out fewer or none"
+                f"{self.root}: all {len(self.images)} images are held out for testing, so no image "
+                "is left for training; hold out fewer or none"
             )
         return Dataset(
-            train=train,
-            test=[view for view in views if view.name in self.test_names],
+            train=sorted(train, key=lambda view: view.name),
+            test=sorted(test, key=lambda view: view.name),
             points=self.points,
             extent=scene_extent([view.camera for view in train]),
             description=self.description,
@@ -135,16 +146,18 @@ def read_files(
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
     sizes = _file_sizes(posed, headers)
-    for image, header in zip(posed, headers, strict=True):
+    for image, size in zip(posed, sizes, strict=True):
         if image.mask is not None:
-            _check_mask(image, header, read_header(image.mask))
+            _check_mask(image.mask, size)
     count = Counter(image.name for image in posed)
     if len(count) < len(posed):
         repeated = next(name for name, n in sorted(count.items()) if n > 1)
         raise UserError(f"{root}: has two images named {repeated}; remove one")
+    found = list(zip(posed, headers, sizes, strict=True))
     return DatasetFiles(
         root,
-        list(zip(posed, headers, sizes, strict=True)),
+        found,
+        _circles(found),
         points,
         description,
         _test_names(posed, hold_out, first_held_out, test_list),
@@ -200,7 +213,7 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
         stem = str(Path(image.file).with_suffix(""))
         names = (image.file, *(stem + s for s in IMAGE_SUFFIXES), stem + ".JPG", stem + ".PNG")
         found = next((name for name in names if is_file(folder / name)), None)
-        if found is None or not _is_divided(image.path, folder / found, resolution):
+        if found is None or not _is_copy(image.path, folder / found, resolution):
             if folder.is_dir():
                 logger.warning(
                     "%s: not used, because %s %s; the large images are scaled instead",
@@ -213,52 +226,53 @@ def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> lis
     return smaller
 
 
-def _is_divided(large: Path, small: Path, factor: int) -> bool:
-    a, b = read_header(large), read_header(small)
-    return _is_close(a.width, b.width, factor) and _is_close(a.height, b.height, factor)
+def _is_copy(large: Path, small: Path, factor: int) -> bool:
+    header = read_header(small)
+    return _is_divided(read_header(large), (header.width, header.height), factor)
 
 
-def _is_close(large: int, small: int, factor: int) -> bool:
+def _is_divided(large: Header | Camera, size: tuple[int, int], factor: float) -> bool:
+    """Whether ``size`` is the size of ``large``, divided by ``factor``."""
     # Sizes that are not divisible are rounded up by some tools and down by others.
-    return abs(small - large / factor) < 1
+    return abs(size[0] - large.width / factor) < 1 and abs(size[1] - large.height / factor) < 1
 
 
 def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[int, int, bool]]:
     """Width and height of each file, and whether to apply its EXIF orientation.
 
-    The sizes are checked against the cameras. The images of a folder may be smaller than the images
-    that the poses were estimated from (for example ``images_4``, or a dataset that is distributed
-    without the large images). The ratio of the sizes must be an integer and the same for all images
-    of a folder. `_view` scales the intrinsics.
+    The sizes are checked against the cameras. The images of a folder may be smaller or larger than
+    the images that the poses were estimated from (for example ``images_4``, or a dataset that is
+    distributed without the large images). The ratio of the sizes must be the same for all images of
+    a folder. `_views` scales the intrinsics.
     """
     found = [_shrink_factor(image, header) for image, header in zip(posed, headers, strict=True)]
-    usual: dict[Path, int] = {}  # the most frequent factor in each folder
+    usual: dict[Path, float] = {}  # the most frequent factor in each folder
     for folder in {image.folder for image in posed}:
         factors = [f for i, (f, _) in zip(posed, found, strict=True) if i.folder == folder and f]
         if factors:
             usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]
     sizes = []
     for image, header, (factor, sideways) in zip(posed, headers, found, strict=True):
-        if factor is None or factor != usual[image.folder]:
-            camera = image.camera
+        size = (header.height, header.width) if sideways else (header.width, header.height)
+        camera = image.camera
+        if factor is None or not _is_divided(camera, size, usual[image.folder]):
             raise UserError(
                 f"{image.path}: is {header.width}x{header.height}, but its camera is "
                 f"{camera.width}x{camera.height}; use the images that the poses were estimated "
-                "from, or all of them scaled by 1/2, 1/4 or 1/8"
+                "from, or scale all of them by one factor"
             )
-        size = (header.height, header.width) if sideways else (header.width, header.height)
         sizes.append((*size, sideways))
     for folder, factor in usual.items():
-        if factor > 1 and not folder.name.endswith(f"_{factor}"):
+        if factor != 1 and not folder.name.endswith(f"_{factor:g}"):
             logger.warning(
-                "%s: the images are 1/%d of the size of their cameras; the cameras are scaled",
+                "%s: the images are %s of the size of their cameras; the cameras are scaled",
                 folder,
-                factor,
+                f"1/{factor:g}" if factor == round(factor) else f"{1 / factor:.4g}",
             )
     return sizes
 
 
-def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]:
+def _shrink_factor(image: PosedImage, header: Header) -> tuple[float | None, bool]:
     """The image size of the camera divided by that of the file; whether to apply EXIF orientation.
 
     The factor is None if the size of the file does not match the camera. Like COLMAP, this ignores
@@ -267,24 +281,96 @@ def _shrink_factor(image: PosedImage, header: Header) -> tuple[int | None, bool]
     camera = image.camera
     for sideways in (False, True) if header.sideways else (False,):
         width, height = (header.height, header.width) if sideways else (header.width, header.height)
-        factor = max(1, round(camera.width / width))
-        exact = factor == 1 and (width, height) == (camera.width, camera.height)
-        close = _is_close(camera.width, width, factor) and _is_close(camera.height, height, factor)
-        if exact or (1 < factor <= _LARGEST_FACTOR and close):
-            return factor, sideways
+        if (width, height) == (camera.width, camera.height):
+            return 1.0, sideways
+        ratio = max(camera.width, camera.height) / max(width, height)
+        if not 1 < max(ratio, 1 / ratio) <= _LARGEST_FACTOR:
+            continue
+        for factor in (max(2, round(ratio)), ratio):
+            if _is_divided(camera, (width, height), factor):
+                return float(factor), sideways
     return None, False
 
 
-def _view(
-    image: PosedImage, header: Header, size: tuple[int, int, bool], resolution: int | None
+def _circles(
+    images: Sequence[tuple[PosedImage, Header, tuple[int, int, bool]]],
+) -> dict[LensModel, float]:
+    """The radius in pixels of the image circle of each wide lens that has one; see `image_circle`.
+
+    Decodes a few photos of each of these lenses.
+    """
+    # Photos may have a calibration each, of the same lens.
+    kinds: dict[tuple[str, int, int], dict[LensModel, list[ImageSource]]] = {}
+    for image, _, (width, height, sideways) in images:
+        if (lens := image.lens) is not None and is_wide(lens):
+            source = ImageSource(image.path, width, height, sideways)
+            kind = kinds.setdefault((lens.model, lens.width, lens.height), {})
+            kind.setdefault(lens, []).append(source)
+    circles: dict[LensModel, float] = {}
+    for lenses in kinds.values():
+        photos = [photo for sources in lenses.values() for photo in sources]
+        chosen = photos[:: -(-len(photos) // _CIRCLE_PHOTOS)]
+        small = [load_thumbnail(photo, _CIRCLE_SIDE) for photo in chosen]
+        radius = image_circle(next(iter(lenses)), small)
+        if radius is not None:
+            circles |= dict.fromkeys(lenses, radius)
+    return circles
+
+
+def _views(
+    image: PosedImage,
+    header: Header,
+    size: tuple[int, int, bool],
+    resolution: int | None,
+    circles: Mapping[LensModel, float],
+) -> Iterator[View]:
+    """The view of an image; of a wide lens, several views. All of them are without distortion."""
+    width, height, sideways = size
+    if image.lens is None:
+        width, height = _final_size(image, width, height, resolution)
+        mask = None
+        if image.mask is not None:
+            mask = ImageSource(image.mask, width, height, sideways)
+        source = ImageSource(image.path, width, height, sideways, header.width * header.height)
+        yield View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
+        return
+    try:
+        views = lens_views(image.lens, circles.get(image.lens))
+    except ValueError as error:
+        shown = ", ".join(f"{value:.5g}" for value in image.lens.params)
+        raise UserError(
+            f"{image.path}: the lens distortion ({image.lens.model} {shown}) is not possible: "
+            f"{error}; correct the calibration"
+        ) from None
+    for view in views:
+        yield _lens_view(image, view, header, size, resolution)
+
+
+def _lens_view(
+    image: PosedImage,
+    view: LensView,
+    header: Header,
+    size: tuple[int, int, bool],
+    resolution: int | None,
 ) -> View:
     width, height, sideways = size
+    lens = view.lens
+    width = max(1, round(view.width * width / lens.width))
+    height = max(1, round(view.height * height / lens.height))
     width, height = _final_size(image, width, height, resolution)
+    pose = image.camera.cam_from_world
+    if view.rotation is not None:
+        pose = torch.tensor(view.rotation, dtype=pose.dtype) @ pose
+    camera = Camera(view.width, view.height, *view.params, pose).scaled(width, height)
+    stored = header.width * header.height
+    source = ImageSource(image.path, width, height, sideways, stored, view)
     mask = None
     if image.mask is not None:
-        mask = ImageSource(image.mask, width, height, sideways)
-    source = ImageSource(image.path, width, height, sideways, header.width * header.height)
-    return View(image.name, image.camera.scaled(width, height), source, mask, image.depth)
+        mask = dataclasses.replace(source, path=image.mask)
+    elif view.partial:
+        mask = dataclasses.replace(source, blank=True)
+    name = f"{image.name}/{view.name}" if view.name else image.name
+    return View(name, camera, source, mask, image.depth)
 
 
 def _final_size(
@@ -308,12 +394,18 @@ def _final_size(
     return new_width, new_height
 
 
-def _check_mask(image: PosedImage, header: Header, mask: Header) -> None:
-    fits = (header.width, header.height), (image.camera.width, image.camera.height)
-    if (mask.width, mask.height) not in fits:
+def _check_mask(path: Path, size: tuple[int, int, bool]) -> None:
+    """Raise `UserError` if a mask has another aspect ratio than its image; it may be smaller."""
+    width, height, sideways = size
+    mask = read_header(path)
+    own = (mask.width, mask.height)
+    if sideways and mask.sideways:
+        own = (mask.height, mask.width)
+    # Sides are rounded to whole pixels of the mask, or of an image that is smaller.
+    if abs(own[0] * height - own[1] * width) > max(width, height, *own):
         raise UserError(
-            f"{image.mask}: the mask is {mask.width}x{mask.height}, but its image is "
-            f"{header.width}x{header.height}; resize the mask"
+            f"{path}: the mask is {own[0]}x{own[1]}, but its image is {width}x{height}; use a mask "
+            "of the whole image"
         )
 
 

@@ -28,7 +28,9 @@ import torch
 from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
+from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.points_ply import read_points as read_points_ply
+from snowsplat.data.transforms_lens import is_panorama, lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
@@ -36,8 +38,6 @@ from snowsplat.util.safe_json import inside, is_file, quoted, read_json
 
 logger = logging.getLogger(__name__)
 
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 # Converts OpenGL's camera axes to OpenCV's; it is its own inverse.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -71,8 +71,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
         images: a folder to use instead of ``images``, for example ``images_4``.
 
     Raises:
-        UserError: a file is damaged or of another kind, a camera is distorted, or no image is
-            there.
+        UserError: a file is damaged or of another kind, or no image is there.
     """
     posed: dict[str, PosedImage] = {}
     missing: list[str] = []
@@ -124,8 +123,9 @@ def _posed_image(
     where: str, root: Path, file: str, values: ChainMap[str, Any], split: _Split | None
 ) -> PosedImage:
     """The image ``root / file`` of a frame; ``values`` as in `_camera`."""
-    _check_model(where, values)
     camera = _camera(where, values, root / file)
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    lens = lens_of(where, values, camera.width, camera.height, intrinsics)
     first, slash, _ = file.partition("/")
     folder = root / first if first and slash else (root / file).parent
     return PosedImage(
@@ -136,6 +136,7 @@ def _posed_image(
         _mask(where, root, values.maps[0]),  # masks belong to frames, not to files
         split,
         depth=_depth_map(root, values.maps[0]),
+        lens=None if is_pinhole(lens) else lens,
     )
 
 
@@ -151,16 +152,6 @@ def _read_json(path: Path) -> _Json:
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
         raise UserError(f"{path}: has no list of frames, so it does not describe a dataset")
     return scene
-
-
-def _check_model(where: str, values: Mapping[str, Any]) -> None:
-    model = str(values.get("camera_model", "PINHOLE")).upper()
-    if model not in _PINHOLE_MODELS or values.get("is_fisheye"):
-        kind = model if model not in _PINHOLE_MODELS else "fisheye"
-        raise UserError(
-            f"{where}: the camera model is {kind[:40]}, but Gaussians need pinhole cameras; "
-            "make a new dataset from the photos: snowsplat sfm PHOTOS -o DATASET"
-        )
 
 
 def _named_splits(scene: _Json) -> dict[str, _Split]:
@@ -227,21 +218,13 @@ def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:
 
 
 def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
-    """The camera of a frame.
+    """The camera of a frame, without the distortion of its lens.
 
     Args:
         where: the start of error messages.
         values: the entries of the frame and, for those that it does not have, of the file.
         image: the image file, which provides the size if ``values`` has none.
     """
-    distortion = {key: _number(where, values, key) for key in _DISTORTION}
-    if any(distortion.values()):
-        shown = ", ".join(f"{key} = {value:g}" for key, value in distortion.items() if value)
-        raise UserError(
-            f"{where}: the camera has lens distortion ({shown}), but Gaussians are rendered "
-            "without distortion; make a new dataset from the photos: snowsplat sfm PHOTOS -o "
-            "DATASET"
-        )
     width, height = _number(where, values, "w"), _number(where, values, "h")
     if width is None or height is None:
         header = read_header(image)
@@ -252,6 +235,8 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
     fx, fy = _focal(where, values, "x", width), _focal(where, values, "y", height)
     # Pixels are square if there is only one focal length.
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    if is_panorama(values):
+        fx = fy = width / (2 * math.pi)  # pixels per radian at the centre
     if fx is None or fy is None:
         raise UserError(f"{where}: no focal length (fl_x or camera_angle_x); export it again")
     if fx <= 0 or fy <= 0:

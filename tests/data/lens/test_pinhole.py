@@ -69,16 +69,20 @@ def test_a_fisheye_without_coefficients_is_no_pinhole():
 
 
 @pytest.mark.parametrize(
-    ("model", "params"),
+    ("model", "params", "cropped"),
     [
-        # Polynomials that turn back inside the image.
-        ("SIMPLE_RADIAL", [250.0, 160.0, 120.0, -0.6]),
-        ("FULL_OPENCV", [250.0, 250.0, 160.0, 120.0, 0.1, 0.1, 0.0, 0.0, 0.1, -2.0, 0.0, 0.0]),
+        # Polynomials that turn back inside the image, and one that has a pole outside.
+        ("SIMPLE_RADIAL", [250.0, 160.0, 120.0, -0.6], True),
+        (
+            "FULL_OPENCV",
+            [250.0, 250.0, 160.0, 120.0, 0.1, 0.1, 0.0, 0.0, 0.1, -2.0, 0.0, 0.0],
+            False,
+        ),
     ],
 )
-def test_a_folded_image_is_cropped(model, params):
+def test_a_folded_image_is_cropped(model, params, cropped):
     pinhole = pinhole_of(lens(model, params))
-    assert pinhole.cropped
+    assert pinhole.cropped == cropped
     assert pinhole.width >= 64
     # The map is monotonic in both directions.
     assert (np.diff(pinhole.nodes[..., 0], axis=1) > 0).all()

@@ -7,7 +7,6 @@ No conversion is needed.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +15,9 @@ import torch
 from snowsplat.data.colmap.model import count_images, model_is_text, read_model, read_points
 from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.pinhole import is_pinhole
+from snowsplat.data.lens.project import intrinsics
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
@@ -23,17 +25,6 @@ from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
-
-# The supported camera models. They are pinhole cameras if all parameters after the principal point
-# are 0. The value is the number of focal lengths: 1 (f, cx, cy) or 2 (fx, fy, cx, cy).
-_FOCAL_LENGTHS = {
-    "SIMPLE_PINHOLE": 1,
-    "PINHOLE": 2,
-    "SIMPLE_RADIAL": 1,
-    "RADIAL": 1,
-    "OPENCV": 2,
-    "FULL_OPENCV": 2,
-}
 
 
 def find_models(parent: Path) -> list[Path]:
@@ -59,7 +50,7 @@ def read_colmap(
         images: name of the folder of images inside ``root``.
 
     Raises:
-        UserError: damaged files, distorted cameras, or no images.
+        UserError: damaged files, or no images.
     """
     folder = models[0]
     name = folder.relative_to(root).as_posix()
@@ -107,7 +98,17 @@ def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedI
             continue
         camera = posed_camera(model, image)
         mask = _find_mask(root / "masks", image.name)
-        posed.append(PosedImage(safe_name(image.name), camera, folder, image.name, mask))
+        lens = _lens(model.cameras[image.camera_id])
+        posed.append(
+            PosedImage(
+                safe_name(image.name),
+                camera,
+                folder,
+                image.name,
+                mask,
+                lens=None if is_pinhole(lens) else lens,
+            )
+        )
     if not posed:
         raise SettingError(
             "images",
@@ -126,10 +127,10 @@ def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedI
 
 
 def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
-    """The camera of an image, with its pose in float64.
+    """The camera of an image, with its pose in float64. A distortion of its lens is left out.
 
     Raises:
-        UserError: the camera is missing, distorted, or damaged.
+        UserError: the camera is missing or damaged.
     """
     colmap = model.cameras.get(image.camera_id)
     if colmap is None:
@@ -137,7 +138,13 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
             f"{model.folder}: image {image.name[:80]} has camera {image.camera_id}, which the "
             "model does not contain; copy the model again"
         )
-    fx, fy, cx, cy = _pinhole(model.folder, colmap)
+    fx, fy, cx, cy, _ = intrinsics(_lens(colmap))
+    numbers = (fx, fy, cx, cy, *colmap.params)
+    if min(fx, fy) <= 0 or not all(abs(number) < 1e9 for number in numbers):
+        raise UserError(
+            f"{model.folder}: the intrinsics of a camera are damaged ({colmap.model} "
+            f"{' '.join(map(str, colmap.params))}); copy the model again"
+        )
     quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
     if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
         raise UserError(
@@ -147,20 +154,8 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
     return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)
 
 
-def _pinhole(folder: Path, camera: ColmapCamera) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels."""
-    focal_lengths = _FOCAL_LENGTHS.get(camera.model)
-    if focal_lengths is None or any(camera.params[focal_lengths + 2 :]):
-        raise UserError(
-            f"{folder}: its cameras have lens distortion (model {camera.model[:40]}), but "
-            "Gaussians are rendered without distortion; undistort the images first: create a "
-            "folder NEW, put the images into NEW/input and the model into NEW/distorted/sparse/0, "
-            "run snowsplat sfm -s NEW --skip-matching, then use NEW"
-        )
-    f, (cx, cy) = camera.params[:focal_lengths], camera.params[focal_lengths : focal_lengths + 2]
-    if not all(map(math.isfinite, (*f, cx, cy))) or min(f) <= 0 or max(*f, abs(cx), abs(cy)) > 1e9:
-        raise UserError(f"{folder}: the intrinsics of a camera are damaged; copy the model again")
-    return f[0], f[-1], cx, cy
+def _lens(camera: ColmapCamera) -> LensModel:
+    return LensModel(camera.model, camera.width, camera.height, camera.params)
 
 
 def _find_mask(folder: Path, name: str) -> Path | None:

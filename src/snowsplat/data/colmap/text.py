@@ -20,6 +20,7 @@ from snowsplat.data.colmap.types import (
     damaged,
     unreadable,
 )
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
@@ -84,7 +85,12 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             raise damaged(path, f"not a camera: line {shown(line[:60])!r}") from None
-        if len(params) != counts.get(model, len(params)):
+        if model not in counts:
+            raise UserError(
+                f"{path}: unknown camera model {shown(model[:40])!r}; undistort the images with "
+                "the program that made it"
+            )
+        if len(params) != counts[model]:
             raise damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
         cameras[camera_id] = checked_camera(path, model, width, height, params)
         check_count(path, "cameras", len(cameras))

@@ -21,9 +21,17 @@ _CROPPED = 0.95  # of width and height; without blank borders, an image shows mo
 _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle
 _STRIP_PIXELS = 1 << 18  # processed at a time: limits the memory and fits the caches
 # Models that are pinhole cameras if their coefficients are 0.
-_PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV") + (
-    "SIMPLE_DIVISION",
-    "DIVISION",
+_PINHOLES = frozenset(
+    {
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "FULL_OPENCV",
+        "SIMPLE_DIVISION",
+        "DIVISION",
+    }
 )
 _MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the calibration is wrong
 
@@ -52,14 +60,19 @@ class Pinhole:
         return interpolated(self.nodes, width, height)
 
 
+def is_pinhole(lens: LensModel) -> bool:
+    """Whether a lens has no distortion. A fisheye without coefficients has: it is no pinhole."""
+    return lens.model in _PINHOLES and not any(intrinsics(lens)[4])
+
+
 def pinhole_of(lens: LensModel) -> Pinhole:
     """The pinhole camera for a distorted one: the same focal lengths, no blank borders.
 
     Raises:
         ValueError: the calibration is valid only for a small part of the photo.
     """
-    fx, fy, cx, cy, coefficients = intrinsics(lens)
-    if lens.model in _PINHOLES and not any(coefficients):
+    fx, fy, cx, cy, _ = intrinsics(lens)
+    if is_pinhole(lens):
         return Pinhole(lens.width, lens.height, (fx, fy, cx, cy))
     made = _without_blank_borders(lens)
     if not _is_valid(lens, made):

@@ -12,10 +12,17 @@ import numpy as np
 
 from snowsplat.data.lens.model import LensModel
 
-#: Models with one focal length; the others, except EQUIRECTANGULAR, start with fx, fy.
-ONE_FOCAL_LENGTH = frozenset(
-    ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-    + ("SIMPLE_DIVISION", "SIMPLE_FISHEYE")
+# Models with one focal length; the others, except EQUIRECTANGULAR, start with fx, fy.
+_ONE_FOCAL_LENGTH = frozenset(
+    {
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "SIMPLE_DIVISION",
+        "SIMPLE_FISHEYE",
+    }
 )
 _TINY = 1e-12
 _NEWTON_STEPS = 30
@@ -26,16 +33,10 @@ def intrinsics(lens: LensModel) -> tuple[float, float, float, float, tuple[float
 
     For EQUIRECTANGULAR the focal lengths are those of the centre, in pixels per radian.
     """
-    p = lens.params
+    p, width, height = lens.params, lens.width, lens.height
     if lens.model == "EQUIRECTANGULAR":
-        return (
-            lens.width / (2 * math.pi),
-            lens.height / math.pi,
-            lens.width / 2,
-            lens.height / 2,
-            (),
-        )
-    if lens.model in ONE_FOCAL_LENGTH:
+        return width / (2 * math.pi), height / math.pi, width / 2, height / 2, ()
+    if lens.model in _ONE_FOCAL_LENGTH:
         return p[0], p[0], p[1], p[2], p[3:]
     return p[0], p[1], p[2], p[3], p[4:]
 

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.lens.pinhole import Pinhole
+from snowsplat.data.lens.views import LensView
 
 _MARGIN = 3  # pixels beside a pixel that its spline may need
 
@@ -65,9 +66,24 @@ def resampled(
     if margin:
         planes = np.pad(planes, ((0, 0), (0, 0), (margin, margin)), mode="wrap")
     for rows, position in view.strips(width, height):
-        position = np.nan_to_num(position * np.float32(scale), copy=False, nan=-1.0)
+        position = np.nan_to_num(position * np.array(scale, np.float32), copy=False, nan=-1.0)
         position[..., 0] += margin
         _sample(planes, position, made[:, rows])
+    return made
+
+
+def nearest(values: np.ndarray, view: LensView, width: int, height: int) -> np.ndarray:
+    """(height, width) float32: a map (H, W) of a photo, such as its depth, seen by a view.
+
+    Nearest values, because a mean of two surfaces is on neither. NaN where the photo shows nothing.
+    """
+    scale = np.array([values.shape[1] / view.lens.width, values.shape[0] / view.lens.height])
+    made = np.full((height, width), np.nan, np.float32)
+    for rows, position in view.strips(width, height):
+        shown = view.covered(position) & np.isfinite(position).all(-1)
+        column, row = np.floor(position[shown] * scale).astype(np.int64).T
+        column, row = column.clip(0, values.shape[1] - 1), row.clip(0, values.shape[0] - 1)
+        made[rows][shown] = values[row, column]
     return made
 
 
@@ -84,16 +100,22 @@ def _sample(planes: np.ndarray, position: np.ndarray, out: np.ndarray) -> None:
     top, bottom = _needed(position[..., 1], height)
     left, right = _needed(position[..., 0], width)
     part = np.ascontiguousarray(planes[:, top:bottom, left:right].transpose(1, 2, 0))
-    position = position - np.float32([left + 0.5, top + 0.5])
-    border = cv2.BORDER_REPLICATE
-    cubic = cv2.remap(part, position, None, cv2.INTER_CUBIC, borderMode=border)
+    position = position - np.array([left + 0.5, top + 0.5], np.float32)
+    cubic = _remap(part, position, cv2.INTER_CUBIC)
     whole = np.floor(position)
     position -= whole
     position *= position * (3 - 2 * position)
     position += whole
-    bent = cv2.remap(part, position, None, cv2.INTER_LINEAR, borderMode=border)
+    bent = _remap(part, position, cv2.INTER_LINEAR)
     made = cv2.addWeighted(cubic, 2 / 3, bent, 1 / 3, 0).reshape(*position.shape[:2], -1)
     out[...] = made.transpose(2, 0, 1)
+
+
+def _remap(part: np.ndarray, position: np.ndarray, how: int) -> np.ndarray:
+    made: np.ndarray = cv2.remap(  # type: ignore[call-overload]
+        part, position, None, how, borderMode=cv2.BORDER_REPLICATE
+    )
+    return made
 
 
 def _needed(position: np.ndarray, size: int) -> tuple[int, int]:

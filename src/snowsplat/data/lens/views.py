@@ -90,6 +90,11 @@ class LensView:
         rays = np.stack([across, down, np.ones_like(across)], -1)
         return rays if self.rotation is None else rays @ np.array(self.rotation, rays.dtype)
 
+    def photo_z(self, width: int, height: int) -> np.ndarray:
+        """(height, width): z in the frame of the photo of the points at z = 1 of the view."""
+        x, y = (np.arange(size) + 0.5 for size in (width, height))
+        return self.rays(x * (self.width / width), y * (self.height / height))[..., 2]
+
     def covered(self, position: np.ndarray) -> np.ndarray:
         """(H, W) bool: whether positions from `strips` are in the photo and in its circle."""
         if not self.partial:
@@ -146,6 +151,16 @@ def rotated_view(
     return dataclasses.replace(view, partial=not view.covered(_positions(view, x, y)).all())
 
 
+def is_wide(lens: LensModel) -> bool:
+    """Whether a lens may have an image circle within the photo: it is a fisheye.
+
+    Also a lens of another model whose field of view is more than 120°.
+    """
+    if lens.model == "EQUIRECTANGULAR" or not all(map(math.isfinite, lens.params)):
+        return False
+    return "FISHEYE" in lens.model or 2 * float(_field(lens, None).reach.max()) > _WIDEST
+
+
 @lru_cache(256)
 def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, ...]:
     """The pinhole views that show what a lens shows: one, or several of a wide lens.
@@ -195,7 +210,7 @@ class _Field:
 
 
 def _directions(angle: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """(D, N, 3) unit directions at ``angle`` (D, N) to the axis, in the directions ``turn`` (D,)."""
+    """(D, N, 3) unit directions at ``angle`` (D, N) to the axis, on the sides ``turn`` (D,)."""
     sine = np.sin(angle)
     return np.stack(
         [sine * np.cos(turn)[:, None], sine * np.sin(turn)[:, None], np.cos(angle)], axis=-1
@@ -216,9 +231,10 @@ def _field(lens: LensModel, circle: float | None) -> _Field:
     # has folded may return into the photo.
     ends = np.where(growing.all(1), _ANGLES, growing.argmin(1))
     limit = int(ends.min())
-    inside = ((pixel >= 0) & (pixel <= [lens.width, lens.height])).all(-1)
+    x, y = pixel[..., 0], pixel[..., 1]
+    inside = (x >= 0) & (x <= lens.width) & (y >= 0) & (y <= lens.height)
     if circle is not None:
-        inside &= np.hypot(pixel[..., 0] - cx, pixel[..., 1] - cy) <= circle
+        inside &= np.hypot(x - cx, y - cy) <= circle
     last = np.where(inside.all(1), _ANGLES, inside.argmin(1) - 1)
     return _Field(float(angle[limit]), angle[np.clip(last, 0, limit)])
 

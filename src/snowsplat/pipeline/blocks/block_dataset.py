@@ -12,6 +12,7 @@ import numpy as np
 
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.data.dataset import Points, PosedImage
+from snowsplat.data.lens.model import LensModel
 from snowsplat.scene.geometry import quat_from_rotation
 
 
@@ -39,9 +40,11 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         if image.divided > 1:
             _link(image.path, folder / f"images_{image.divided}" / name)
             continue
-        camera = image.camera
-        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-        colmap = ColmapCamera("PINHOLE", camera.width, camera.height, intrinsics)
+        camera, lens = image.camera, image.lens
+        if lens is None:
+            intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+            lens = LensModel("PINHOLE", camera.width, camera.height, intrinsics)
+        colmap = ColmapCamera(lens.model, lens.width, lens.height, lens.params)
         number = cameras.setdefault(colmap, len(cameras) + 1)
         pose = camera.cam_from_world.double()
         quat = quat_from_rotation(pose[:, :3]).tolist()

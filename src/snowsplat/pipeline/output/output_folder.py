@@ -177,7 +177,12 @@ class OutputFolder:
         """Write `cameras.json`."""
         from snowsplat.scene.camera_json import write_cameras
 
-        cameras = ((Path(view.name).stem, view.camera) for view in views)
+        # Several views of one photo are named by the photo and the view.
+        cameras = (
+            (view.name if part and part.name else Path(view.name).stem, view.camera)
+            for view in views
+            for part in [view.image.view]
+        )
         write_cameras(self.path / "cameras.json", cameras)
 
     def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:

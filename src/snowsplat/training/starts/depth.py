@@ -14,6 +14,7 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.depth_alignment import align
 from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
 from snowsplat.data.image_loader import Photos
+from snowsplat.data.lens.resample import nearest
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import DepthMap, map_size, photo_for_map
 from snowsplat.training.starts.fusion import fused_points
@@ -74,16 +75,22 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
         return None
     values = read_depth_file(view.depth)
     height, width = values.shape
-    camera = view.camera
-    if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
+    camera, part = view.camera, view.image.view
+    photo = camera if part is None else part.lens
+    if abs(width * photo.height / (height * photo.width) - 1.0) > _ASPECT_TOLERANCE:
         raise UserError(
-            f"{view.depth}: has {width}x{height} pixels, but its photo has {camera.width}x"
-            f"{camera.height}; use a depth map of the whole photo"
+            f"{view.depth}: has {width}x{height} pixels, but its photo has {photo.width}x"
+            f"{photo.height}; use a depth map of the whole photo"
         )
     width, height = map_size(camera.width, camera.height)
     camera = camera.scaled(width, height)
-    small = interpolate(torch.from_numpy(values)[None, None], (height, width), mode="nearest-exact")
-    z = _world_z(small[0, 0].numpy(), camera, points)
+    if part is None:
+        whole = torch.from_numpy(values)[None, None]
+        small = interpolate(whole, (height, width), mode="nearest-exact")[0, 0].numpy()
+        z = _world_z(small, camera, points, None)
+    else:
+        small = nearest(values, part, width, height)
+        z = _world_z(small, camera, points, part.photo_z(width, height))
     if z is None:
         return None
     known = z.isfinite()
@@ -93,14 +100,18 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     return DepthMap(camera, torch.where(known, 1.0 / z, 0.0))
 
 
-def _world_z(values: np.ndarray, camera: Camera, points: Tensor | None) -> Tensor | None:
+def _world_z(
+    values: np.ndarray, camera: Camera, points: Tensor | None, photo_z: np.ndarray | None
+) -> Tensor | None:
     """(H, W): the kind of values and the scale with which they agree best with the points."""
+    if photo_z is not None and not np.isfinite(values).any():  # the photo has depths elsewhere
+        return None
     if points is None:
-        return to_z(values, "z", camera)
+        return to_z(values, "z", camera, photo_z=photo_z)
     best, least = None, math.inf
     for kind in _KINDS:
         try:
-            z = to_z(values, kind, camera)
+            z = to_z(values, kind, camera, photo_z=photo_z)
             alignment = align(z, points, camera, with_shift=kind == "disparity")
         except UserError:  # not this kind, or the photo shows too few points
             continue

@@ -1,0 +1,152 @@
+"""The lens of a frame of a transforms.json -> `LensModel`.
+
+instant-ngp and nerfstudio write the coefficients of OpenCV's models, ``k1`` … ``k6``, ``p1`` and
+``p2``. In a fisheye, ``k1`` … ``k4`` are the coefficients of the angle. nerfstudio's ``k4`` of
+other lenses is that of the eighth power of the radius, where OpenCV has a rational function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from snowsplat.data.lens.model import LensModel
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import quoted
+
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_PERSPECTIVE = frozenset(
+    {
+        "PINHOLE",
+        "SIMPLE_PINHOLE",
+        "PERSPECTIVE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "FULL_OPENCV",
+        "BROWN",
+    }
+)
+_FISHEYE = frozenset(
+    {
+        "FISHEYE",
+        "OPENCV_FISHEYE",
+        "SIMPLE_FISHEYE",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "THIN_PRISM_FISHEYE",
+    }
+)
+#: Project Aria's model, in nerfstudio's and in COLMAP's name; it has a list of coefficients.
+_ARIA = ("FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE")
+_ARIA_COEFFICIENTS = 12
+# The largest relative error of the rational function that replaces a polynomial.
+_FIT_ERROR = 1e-5
+
+
+def is_panorama(values: Mapping[str, Any]) -> bool:
+    """Whether a frame is an equirectangular panorama, which needs no focal length."""
+    flags = ("equirectangular", "is_equirectangular", "latlong")
+    return _model(values) == "EQUIRECTANGULAR" or any(values.get(flag) for flag in flags)
+
+
+def lens_of(
+    where: str,
+    values: Mapping[str, Any],
+    width: int,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+) -> LensModel:
+    """The lens of a frame.
+
+    Args:
+        where: the start of error messages.
+        values: the entries of the frame and, for those that it does not have, of the file.
+        width, height: of the photo that the intrinsics are for.
+        intrinsics: fx, fy, cx, cy in pixels.
+
+    Raises:
+        UserError: the model is not known, or a coefficient is not a number.
+    """
+    if is_panorama(values):
+        return LensModel("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+    model = _model(values)
+    if any(key.startswith("ftheta_p") for key in values):
+        model = "F-Theta"
+    if model in _ARIA:
+        numbers = _listed(where, values, _ARIA_COEFFICIENTS)
+        return LensModel("RAD_TAN_THIN_PRISM_FISHEYE", width, height, (*intrinsics, *numbers))
+    if model not in _PERSPECTIVE | _FISHEYE:
+        raise UserError(
+            f"{where}: the camera model {model[:40]} is not known; undistort the photos with the "
+            "program that made the file, or make a new dataset: snowsplat sfm PHOTOS -o DATASET"
+        )
+    if isinstance(values.get("distortion_params"), list):
+        k1, k2, k3, k4, p1, p2 = _listed(where, values, 6)
+        k5 = k6 = 0.0
+    else:
+        k1, k2, k3, k4, k5, k6, p1, p2 = (_number(where, values, key) for key in _COEFFICIENTS)
+    if model in _FISHEYE or values.get("is_fisheye") or values.get("fisheye"):
+        if p1 or p2:
+            numbers = (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
+            return LensModel("THIN_PRISM_FISHEYE", width, height, (*intrinsics, *numbers))
+        return LensModel("OPENCV_FISHEYE", width, height, (*intrinsics, k1, k2, k3, k4))
+    if k4 and not (k5 or k6) and model != "FULL_OPENCV":
+        fx, fy, cx, cy = intrinsics
+        corner = max(cx, width - cx) / fx, max(cy, height - cy) / fy
+        k1, k2, k3, k4, k5, k6 = _rational(where, (k1, k2, k3, k4), corner[0] ** 2 + corner[1] ** 2)
+    if k3 or k4 or k5 or k6:
+        numbers = (k1, k2, p1, p2, k3, k4, k5, k6)
+        return LensModel("FULL_OPENCV", width, height, (*intrinsics, *numbers))
+    return LensModel("OPENCV", width, height, (*intrinsics, k1, k2, p1, p2))
+
+
+def _model(values: Mapping[str, Any]) -> str:
+    return str(values.get("camera_model") or "OPENCV").upper()
+
+
+def _number(where: str, values: Mapping[str, Any], key: str) -> float:
+    value = values.get(key)
+    if value is None:
+        return 0.0
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
+        raise UserError(f"{where}: {key} should be a number, not {quoted(value)}; correct it")
+    return float(value)
+
+
+def _listed(where: str, values: Mapping[str, Any], count: int) -> tuple[float, ...]:
+    listed = values.get("distortion_params")
+    numbers = [*listed] if isinstance(listed, list) else []
+    if len(numbers) != count:
+        raise UserError(
+            f"{where}: distortion_params should be {count} numbers for the camera model "
+            f"{_model(values)[:40]}; export the file again"
+        )
+    key = "distortion_params"
+    return tuple(_number(where, {key: value}, key) for value in numbers)
+
+
+def _rational(
+    where: str, polynomial: tuple[float, ...], largest: float
+) -> tuple[float, float, float, float, float, float]:
+    """k1 … k6 of OpenCV's rational function that equals 1 + k1·s + k2·s² + k3·s³ + k4·s⁴.
+
+    ``largest``: of s, the squared distance from the optical axis at z = 1.
+    """
+    s = np.linspace(0.0, 1.5 * largest, 200)[1:]
+    wanted = np.polynomial.polynomial.polyval(s, (1.0, *polynomial))
+    powers = s[:, None] ** [1, 2, 3]
+    matrix = np.hstack([powers, -wanted[:, None] * powers])
+    scale = np.linalg.norm(matrix, axis=0)
+    found = np.linalg.lstsq(matrix / scale, wanted - 1.0, rcond=None)[0] / scale
+    divisor = 1.0 + powers @ found[3:]
+    made = (1.0 + powers @ found[:3]) / divisor
+    if divisor.min() <= 0 or np.abs(made - wanted).max() > _FIT_ERROR:
+        raise UserError(
+            f"{where}: the lens distortion k4 = {polynomial[3]:g} cannot be undone; undistort the "
+            "photos with the program that made the file"
+        )
+    k1, k2, k3, k4, k5, k6 = found.tolist()
+    return k1, k2, k3, k4, k5, k6
