@@ -129,6 +129,7 @@ class PosedImage:
     split: Literal["train", "test"] | None = None  # from the dataset's own files
     divided: int = 1  # 2, 4 or 8 if ``folder`` is images_2, images_4 or images_8
     depth: Path | None = None  # as `View.depth`
+    frame: str | None = None  # images of one frame of a rig, taken at one time, share this name
     lens: LensModel | None = None  # of a distorted photo; ``camera`` then has its pose and size
 
     @property

@@ -99,6 +99,7 @@ def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedI
         camera = posed_camera(model, image)
         mask = _find_mask(root / "masks", image.name)
         lens = _lens(model.cameras[image.camera_id])
+        frame = model.frames.get(image.number)
         posed.append(
             PosedImage(
                 safe_name(image.name),
@@ -106,6 +107,7 @@ def _images_on_disk(root: Path, folder: Path, model: ColmapModel) -> list[PosedI
                 folder,
                 image.name,
                 mask,
+                frame=None if frame is None else str(frame),
                 lens=None if is_pinhole(lens) else lens,
             )
         )
