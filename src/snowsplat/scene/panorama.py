@@ -91,9 +91,7 @@ class PanoramaRenderer:
         middle = self._size / 2
         for side, (rows, columns, weight, grid) in zip(_SIDES, self._sides, strict=True):
             pose = torch.tensor(side).to(cam_from_world) @ cam_from_world
-            camera = Camera(
-                self._size, self._size, self._focal, self._focal, middle, middle, pose
-            )
+            camera = Camera(self._size, self._size, self._focal, self._focal, middle, middle, pose)
             seen = render(gaussians, camera, background).image.permute(2, 0, 1)[None]
             part = F.grid_sample(seen, grid, "bicubic", "border", align_corners=False)[0]
             image[rows, columns] += weight[..., None] * part.permute(1, 2, 0)

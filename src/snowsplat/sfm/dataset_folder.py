@@ -204,7 +204,7 @@ def _run(
 
     def write(report: Report) -> dict[str, Any]:
         sfm, coverage = outcomes["poses"].result, measure_coverage(folder / "sparse" / "0")
-        bad = problems(folder / "images", coverage.names)
+        bad = problems(folder / "input", coverage.names)
         verdict = capture_verdict(coverage, sfm, bad)
         facts = {
             "inputs": stages.about["inputs"],

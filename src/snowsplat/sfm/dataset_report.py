@@ -16,7 +16,9 @@ from PIL import Image
 from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.placement import Placement, placement_of
 from snowsplat.evaluation import verdict
+from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.more_photos import Advice, advice
+from snowsplat.sfm.panorama_views import panorama_of
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -79,12 +81,17 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
 def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
     sequences = {photo["name"]: photo["sequence"] for photo in facts["gathered"]["photos"]}
     model = read_model(dataset / "sparse" / "0")
-    photos = []
+    photos, drawn = [], set[str]()
     for image in model.images:
         camera = posed_camera(model, image)
         half = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
         pose = camera.cam_from_world.numpy()
-        photos.append(PlacedPhoto(printable(image.name), sequences.get(image.name), pose, *half))
+        # One of the views of a panorama stands for the others in the line of a video.
+        panorama = panorama_of(image.name)
+        first = panorama not in drawn
+        drawn.add(panorama or image.name)
+        sequence = sequences.get(panorama or image.name) if first else None
+        photos.append(PlacedPhoto(printable(image.name), sequence, pose, *half))
     return photos
 
 
@@ -152,7 +159,7 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
 
 def _bad_photos(dataset: Path, bad: dict[str, str]) -> str:
     rows = [
-        [picture(_thumbnail(dataset / "images" / name), name), text(name), text(problem)]
+        [picture(_thumbnail(dataset / "input" / name), name), text(name), text(problem)]
         for name, problem in list(bad.items())[:_MAX_THUMBNAILS]
     ]
     rest = "" if len(bad) <= _MAX_THUMBNAILS else f", and {len(bad) - _MAX_THUMBNAILS:,} more"
@@ -246,6 +253,10 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     rows = []
     for camera in sfm["cameras"]:
         width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
+        if camera["model"] == PANORAMA_MODEL:
+            size = f"{width} × {height}"
+            rows.append([str(camera["images"]), size, "all directions", camera["model"]])
+            continue
         # The angle of view of a pinhole camera; that of the distorted lens differs a little.
         angle = math.degrees(2 * math.atan(max(width, height) / 2 / focal)) if focal > 0 else 0.0
         parameters = ", ".join(f"{value:.5g}" for value in camera["params"])

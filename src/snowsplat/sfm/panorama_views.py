@@ -20,9 +20,18 @@ if TYPE_CHECKING:
     _Element = tuple[int, int]  # image id and index of the feature
 
 
+_FOLDER = "panorama_"  # the beginning of the name of the folder of a sensor
+
+
 def view_name(panorama: str, view: LensView) -> str:
     """The name of a view's image. Each sensor of the rig has a folder, as COLMAP recommends."""
-    return str(PurePosixPath(f"panorama_{view.name}") / panorama)
+    return str(PurePosixPath(f"{_FOLDER}{view.name}") / panorama)
+
+
+def panorama_of(name: str) -> str | None:
+    """The name of the panorama of which ``name`` is a view; None: it is no view of one."""
+    folder, _, panorama = name.partition("/")
+    return panorama if folder.startswith(_FOLDER) and panorama else None
 
 
 def with_views(

@@ -94,7 +94,8 @@ def undistort(
 ) -> Undistorted:
     """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are known.
 
-    Photos without a pose are left out. A panorama becomes several images; see `panorama_views`. Files keep their names and formats: JPEG is saved at quality
+    Photos without a pose are left out. A panorama becomes several images; see `panorama_views`.
+    Files keep their names and formats: JPEG is saved at quality
     95 without chroma subsampling, all others without loss, with transparency. If a camera has no
     distortion, its photos are copied. A mask is written for each photo that has one, unless all
     masked pixels are transparent in the image. The model is written last.

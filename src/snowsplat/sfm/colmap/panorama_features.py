@@ -32,7 +32,8 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
     cv2.setNumThreads(1)  # other photos are processed in parallel
     grey, (width, height) = read_grey(photo, image_size)
     allowed = None if mask is None else read_mask(mask, grey)
-    lens = LensModel(PANORAMA_MODEL, *grey.shape[::-1], tuple(map(float, grey.shape[::-1])))
+    rows, columns = grey.shape
+    lens = LensModel(PANORAMA_MODEL, columns, rows, (float(columns), float(rows)))
     parts = []
     for view in lens_views(lens):
         seen = _seen(grey, view)

@@ -167,7 +167,11 @@ def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
     """
     found = spherical_video(clip.path)
     problem = found.problem if found else ""
-    if not problem and (found or options.panoramas) and not is_twice_as_wide(clip.width, clip.height):
+    if (
+        not problem
+        and (found or options.panoramas)
+        and not is_twice_as_wide(clip.width, clip.height)
+    ):
         problem = f"has frames of {clip.width}x{clip.height} pixels"
     if problem:
         raise UserError(

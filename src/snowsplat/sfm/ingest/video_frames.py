@@ -30,7 +30,6 @@ from snowsplat.sfm.ingest.clip import (
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     Crop,
-    FixedParts,
     box_of,
     describe_bars,
     find_fixed_parts,
