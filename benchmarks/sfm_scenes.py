@@ -9,7 +9,7 @@
     ahead    a street; the camera walks and looks ahead
     side     a street; the camera looks at the façades of the other side
     turns    a street; the camera walks ahead and turns from side to side
-    panorama the room; 360° panoramas, twice as wide as high, on the loops of "room"
+    panorama the room; 360° panoramas, twice as wide as high, on the loops of "room"; of twice the width
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
@@ -80,13 +80,7 @@ class Kind:
 
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
-    all_around: bool = False  # 360° panoramas
-
-    def lens(self, size: tuple[int, int]) -> Lens | Equirectangular:
-        """The camera of photos of this width and height; panoramas have twice this width."""
-        if self.all_around:
-            return Equirectangular(2 * size[0], size[0])
-        return phone_lens(*size)
+    lens: Callable[[int, int], Lens | Equirectangular] = phone_lens  # arguments: width, height
 
 
 def cache_folder() -> Path:
@@ -112,7 +106,7 @@ def photos_of(
     """
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{count}-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
-    lens = chosen.lens(size)
+    lens = chosen.lens(*size)
     poses = chosen.path(count, seed)
     return folder, take_photos(folder, lambda: chosen.build(seed, count), lens, poses, seed, report)
 
@@ -133,7 +127,7 @@ def video_of(
     chosen = KINDS[kind]
     folder = cache / f"{kind}-{seconds}s-{size[0]}x{size[1]}-seed{seed}-v{VERSION}"
     poses = in_between(chosen.path(seconds, seed), seconds * FRAMES_PER_SECOND)
-    lens = chosen.lens(size)
+    lens = chosen.lens(*size)
     truth = take_photos(
         folder / "frames", lambda: chosen.build(seed, seconds), lens, poses, seed, report
     )
@@ -420,5 +414,7 @@ KINDS = {
     "ahead": Kind(_street, ahead),
     "side": Kind(_street, to_the_side),
     "turns": Kind(_street, around_corners),
-    "panorama": Kind(_indoors(_room), level_loops, all_around=True),
+    "panorama": Kind(
+        _indoors(_room), level_loops, lambda width, _: Equirectangular(2 * width, width)
+    ),
 }

@@ -42,6 +42,8 @@ def _poses(sfm: dict[str, Any]) -> list[str]:
         )
     if sfm.get("zooms"):
         details.append(f"the photos have {sfm['zooms']}: each group of them has its own lens")
+    if sfm.get("fisheye"):
+        details.append(sfm["fisheye"])
     if len(sfm["attempts"]) > 1:
         details.append("attempts: " + "; ".join(sfm["attempts"]))
     return [line, *details, *_listed([f"{name}: {why}" for name, why in lost.items()])]

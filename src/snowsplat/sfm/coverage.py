@@ -1,7 +1,7 @@
 """How well photos cover a scene: steps from photo to photo, and points that several photos show.
 
 Everything is measured on the points of a COLMAP model and the photos that observe them. The views
-of a panorama are one photo.
+of a panorama or of a wide lens are one photo.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.sfm.panorama_views import panorama_of
+from snowsplat.sfm.pinhole_model import photo_of
 
 #: At most about this number of points is measured.
 _POINTS = 20_000
@@ -53,8 +53,9 @@ def measure_coverage(model: Path) -> Coverage:
 
     reconstruction = pycolmap.Reconstruction(model)
     photos: dict[str, list[pycolmap.Image]] = {}
-    for image in reconstruction.images.values():
-        photos.setdefault(panorama_of(image.name) or image.name, []).append(image)
+    for frame in reconstruction.frames.values():
+        images = [reconstruction.image(data.id) for data in frame.image_ids]
+        photos[photo_of(images[0].name) if len(images) > 1 else images[0].name] = images
     names = sorted(photos)
     row = {image.image_id: i for i, name in enumerate(names) for image in photos[name]}
     ids = sorted(reconstruction.point3D_ids())

@@ -18,7 +18,7 @@ from snowsplat.data.placement import Placement, placement_of
 from snowsplat.evaluation import verdict
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.more_photos import Advice, advice
-from snowsplat.sfm.panorama_views import panorama_of
+from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -86,11 +86,10 @@ def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto
         camera = posed_camera(model, image)
         half = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
         pose = camera.cam_from_world.numpy()
-        # One of the views of a panorama stands for the others in the line of a video.
-        panorama = panorama_of(image.name)
-        first = panorama not in drawn
-        drawn.add(panorama or image.name)
-        sequence = sequences.get(panorama or image.name) if first else None
+        # One of several views of a photo stands for the others in the line of a video.
+        photo = photo_of(image.name) if image.number in model.frames else image.name
+        sequence = None if photo in drawn else sequences.get(photo)
+        drawn.add(photo)
         photos.append(PlacedPhoto(printable(image.name), sequence, pose, *half))
     return photos
 

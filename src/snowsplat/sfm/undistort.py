@@ -3,7 +3,8 @@
     distorted/sparse/0, input/, distorted/masks/  ->  sparse/0, images/, masks/, images_2/ …
 
 The new model has pinhole cameras and is in the frame of the scene (see `orient`). The files have
-the layout that training reads.
+the layout that training reads. A photo of a lens with a field of view of more than 120° becomes
+several images, "NAME_front.jpg", "NAME_left.jpg" …
 """
 
 from __future__ import annotations
@@ -29,10 +30,9 @@ from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
-from snowsplat.data.lens.resample import PixelMap, undistort_image, undistort_mask
-from snowsplat.data.lens.views import lens_views
-from snowsplat.sfm.panorama_views import view_name, with_views
-from snowsplat.sfm.pinhole_model import write_model
+from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.views import LensView, lens_views
+from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _DIVISORS = (2, 4, 8)
+_MASKS = 8  # of a camera that are examined for an image circle
+_CIRCLE = 0.95  # radius of an image circle / distance of the corner of a photo, at most
 _BYTES_PER_PIXEL = 50  # peak memory per photo, reached while it is resized
 # Options for saving each format, without a loss that affects training.
 _SAVING: dict[str, dict[str, Any]] = {
@@ -75,13 +77,13 @@ class _Job:
 
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
-    views: dict[str, PixelMap]  # the path relative to images/ of each view of it
+    views: Sequence[tuple[str, Pinhole | LensView]]  # the images of the photo, and their names
     mask: bool  # whether the photo has a mask
 
     @property
     def resampled(self) -> bool:
-        """Whether the images are not copies of the photo."""
-        return not all(isinstance(v, Pinhole) and v.nodes is None for v in self.views.values())
+        """Whether the image differs from the photo."""
+        return not all(isinstance(v, Pinhole) and v.nodes is None for _, v in self.views)
 
 
 def undistort(
@@ -94,8 +96,8 @@ def undistort(
 ) -> Undistorted:
     """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are known.
 
-    Photos without a pose are left out. A panorama becomes several images; see `panorama_views`.
-    Files keep their names and formats: JPEG is saved at quality
+    Photos without a pose are left out. Those of a wide lens and panoramas become several images;
+    see `in_views`. Files keep their names and formats: JPEG is saved at quality
     95 without chroma subsampling, all others without loss, with transparency. If a camera has no
     distortion, its photos are copied. A mask is written for each photo that has one, unless all
     masked pixels are transparent in the image. The model is written last.
@@ -113,32 +115,42 @@ def undistort(
     import pycolmap
 
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
-    cameras = model.cameras.items()
-    pinholes = {i: _pinhole(camera) for i, camera in cameras if not camera.is_spherical()}
-    around = {i: lens_views(_lens(camera)) for i, camera in cameras if camera.is_spherical()}
     known = {photo.name: photo for photo in photos}
+    wide, pinholes = dict[int, Sequence[LensView]](), dict[int, Pinhole]()
+    for number, camera in model.cameras.items():
+        masked = [
+            dataset / "distorted" / "masks" / f"{image.name}.png"
+            for image in (model.images[i] for i in sorted(model.reg_image_ids()))
+            if image.camera_id == number and image.name in known and known[image.name].mask
+        ]
+        several = _views_of_wide(camera, masked)
+        if several:
+            wide[number] = several
+        else:
+            pinholes[number] = _pinhole(camera)
     jobs = []
     for number in model.reg_image_ids():
         image = model.images[number]
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
-        masked = photo is not None and photo.mask
-        views: dict[str, PixelMap] = {
-            view_name(image.name, view): view for view in around.get(image.camera_id, ())
-        }
-        views = views or {image.name: pinholes[image.camera_id]}
-        jobs.append(_Job(image.name, (camera.width, camera.height), views, masked))
-    if around:
-        model = with_views(model, around)
-        made = model.cameras.items()
-        pinholes |= {i: _pinhole(camera) for i, camera in made if i not in pinholes}
+        has_mask = photo is not None and photo.mask
+        size = (camera.width, camera.height)
+        views: list[tuple[str, Pinhole | LensView]]
+        if image.camera_id in wide:
+            views = [(view_name(image.name, view), view) for view in wide[image.camera_id]]
+        else:
+            views = [(image.name, pinholes[image.camera_id])]
+        jobs.append(_Job(image.name, size, views, has_mask))
     jobs.sort(key=lambda job: job.name)
+    count = Counter(name for job in jobs for name, _ in job.views)
+    for name in (name for name, times in count.items() if times > 1):
+        raise UserError(
+            f"{dataset / 'images' / name}: is the name of a photo and of a part of one; "
+            "rename this photo"
+        )
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
-    pixels = max(
-        max(w * h, *(view.width * view.height for view in job.views.values()))
-        for job in jobs
-        for w, h in [job.camera_size]
-    )
+    pixels = max(w * h for w, h in (job.camera_size for job in jobs))
+    pixels = max(pixels, *(view.width * view.height for job in jobs for _, view in job.views))
     threads = min(
         threads or min(4, os.cpu_count() or 1),
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
@@ -146,10 +158,12 @@ def undistort(
     masks = _run(
         [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
     )
+    if wide:
+        model = in_views(model, wide)
     write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
-    sizes = Counter((view.width, view.height) for job in jobs for view in job.views.values())
+    sizes = Counter((view.width, view.height) for job in jobs for _, view in job.views)
     return Undistorted(
-        images=sizes.total(),
+        images=sum(sizes.values()),
         masks=sum(masks),
         sizes=[(*size, count) for size, count in sizes.most_common()],
         folders=folders,
@@ -157,14 +171,41 @@ def undistort(
     )
 
 
-def _lens(camera: pycolmap.Camera) -> LensModel:
-    return LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
+    """The pinhole views of a lens with a field of view of more than 120°; empty: it is not wide.
+
+    A panorama has six, the sides of a cube with a margin.
+
+    ``masks``: of photos of the camera. If they mask what is outside of an image circle, the views
+    show only the circle.
+    """
+    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+    try:
+        views = lens_views(lens, None if camera.is_spherical() else _circle(camera, masks))
+    except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
+        return ()
+    return () if views[0].rotation is None else views
+
+
+def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
+    """The radius in pixels, around the principal point, outside of which all is masked; or None."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    radius = np.hypot(x - camera.principal_point_x, y - camera.principal_point_y)
+    reach = 0.0
+    for path in masks[:: max(1, len(masks) // _MASKS)]:
+        with open_image(path, ["PNG"]) as mask:
+            used = np.asarray(mask.convert("L")) >= 128
+        if used.shape != radius.shape or not used.any():
+            return None
+        reach = max(reach, float(radius[used].max()))
+    return reach if 0 < reach < _CIRCLE * radius.max() else None
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
     try:
-        pinhole = pinhole_of(_lens(camera))
+        pinhole = pinhole_of(lens)
     except ValueError as error:
         raise UserError(
             f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
@@ -202,52 +243,61 @@ def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> lis
 
 
 def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> int:
-    """Write the images, their smaller copies and masks; returns the number of masks."""
-    source, target = dataset / "input" / job.name, dataset / "images" / job.name
+    """Write the images, their smaller copies and their masks; returns the number of masks."""
+    source = dataset / "input" / job.name
     opaque = None
     with _open_photo(source, job) as opened:
         form = "JPEG" if opened.format == "MPO" else str(opened.format)
         if not job.resampled:
-            with _atomic_path_in_new_folder(target) as temporary:
+            with _atomic_path_in_new_folder(dataset / "images" / job.name) as temporary:
                 shutil.copyfile(source, temporary)
         if job.resampled or divisors or job.mask:
             profile = opened.info.get("icc_profile")
             photo = _eight_bit(_decode(opened, source))
             opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
-        if job.resampled or divisors:
-            for name, view in job.views.items():
-                image = undistort_image(photo, view)
-                if job.resampled:
-                    _save(image, dataset / "images" / name, form, profile)
-                for divisor in divisors:
-                    folder = dataset / f"images_{divisor}"
-                    _save(_reduced(image, divisor), folder / name, form, profile)
-    return _undistort_mask(dataset, job, opaque) if job.mask else 0
+        for name, view in job.views if job.resampled or divisors else ():
+            image = undistort_image(photo, view)
+            if job.resampled:
+                _save(image, dataset / "images" / name, form, profile)
+            for divisor in divisors:
+                folder = dataset / f"images_{divisor}"
+                _save(_reduced(image, divisor), folder / name, form, profile)
+    return _undistort_masks(dataset, job, opaque)
 
 
-def _undistort_mask(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int:
-    """Write the masks, unless they mask only transparent pixels; returns their number.
+def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int:
+    """Write the masks of the images of a photo; returns their number.
 
-    A view of several in which nothing is masked has no mask.
-
-    ``opaque``: (H, W) bool, the pixels of the photo that are not transparent; None: all.
+    A mask of transparent pixels only, and one of no pixels of a view, is not written. ``opaque``:
+    (H, W) bool, the pixels of the photo that are not transparent; None: all.
     """
-    path = dataset / "distorted" / "masks" / f"{job.name}.png"
-    with _open_photo(path, job) as opened:
-        mask = _decode(opened, path).convert("L")
-    if opaque is not None:
-        # SfM ignores transparent pixels; training uses them as empty space.
-        used = (np.asarray(mask) >= 128) | ~opaque
-        if used.all():
-            return 0
-        mask = Image.fromarray(used.astype(np.uint8) * 255)
-    count = 0
-    for name, view in job.views.items():
-        made = undistort_mask(mask, view)
-        if len(job.views) == 1 or made.getextrema()[0] == 0:
+    mask = None
+    if job.mask:
+        path = dataset / "distorted" / "masks" / f"{job.name}.png"
+        with _open_photo(path, job) as opened:
+            mask = _decode(opened, path).convert("L")
+        if opaque is not None:
+            # SfM ignores transparent pixels; training uses them as empty space.
+            used = (np.asarray(mask) >= 128) | ~opaque
+            mask = None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
+    written = 0
+    for name, view in job.views:
+        made = None if mask is None else undistort_mask(mask, view)
+        if isinstance(view, LensView):
+            made = _with_blank(made, view)
+        if made is not None:
             _save(made, dataset / "masks" / f"{name}.png", "PNG")
-            count += 1
-    return count
+            written += 1
+    return written
+
+
+def _with_blank(mask: Image.Image | None, view: LensView) -> Image.Image | None:
+    """``mask`` of a view, with the pixels masked that show nothing of the photo; None: nothing."""
+    used = np.ones((view.height, view.width), bool) if mask is None else np.asarray(mask) >= 128
+    if view.partial:
+        for rows, position in view.strips(view.width, view.height):
+            used[rows] &= view.covered(position)
+    return None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
 
 
 def _open_photo(path: Path, job: _Job) -> Image.Image:

@@ -155,3 +155,40 @@ def _tangential(
     u: np.ndarray, v: np.ndarray, r2: np.ndarray, p1: float, p2: float
 ) -> tuple[np.ndarray, np.ndarray]:
     return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def directions(lens: LensModel, pixels: np.ndarray) -> np.ndarray:
+    """Unit directions (N, 3) of pixels (N, 2), also at 90° or more to the axis; NaN: none.
+
+    By Newton's method in the plane of the angles to the axis, from the lens without coefficients.
+    """
+    fx, fy, cx, cy, _ = intrinsics(lens)
+    pixels = np.asarray(pixels, np.float64)
+    angles = (pixels - (cx, cy)) / (fx, fy)
+    if lens.model == "EQUIRECTANGULAR":  # longitude and latitude
+        (x, y), (level, down) = np.sin(angles).T, np.cos(angles).T
+        return np.column_stack([down * x, y, down * level])
+    if not lens.model.endswith("FISHEYE"):  # these are tangents
+        tangent = np.maximum(np.linalg.norm(angles, axis=1, keepdims=True), _TINY)
+        angles = angles * np.arctan(tangent) / tangent
+    step = 1e-6
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            at, right, down = (
+                project(lens, _turned(angles + offset)) for offset in ((0, 0), (step, 0), (0, step))
+            )
+            (a, b), (c, d) = ((right - at) / step).T, ((down - at) / step).T
+            x, y = (at - pixels).T
+            angles = (
+                angles - np.column_stack([d * x - c * y, a * y - b * x]) / (a * d - b * c)[:, None]
+            )
+            wrong = np.hypot(x, y)
+            if not (wrong > 1e-6).any():
+                break
+    return np.where((wrong < 1e-3)[:, None], _turned(angles), np.nan)
+
+
+def _turned(angles: np.ndarray) -> np.ndarray:
+    """The axis (0, 0, 1), turned by angles (N, 2) in radians towards x and y."""
+    angle = np.linalg.norm(angles, axis=1, keepdims=True)
+    return np.concatenate([angles * np.sinc(angle / math.pi), np.cos(angle)], 1)

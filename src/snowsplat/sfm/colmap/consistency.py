@@ -31,53 +31,22 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.lens import pixels_per_radian
+from snowsplat.sfm.colmap.lens import is_fisheye, lens_of, pixels_per_radian
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
 # One photo of a pair: the image, the id of the point that each matched feature observes, and the
 # positions (M, 2) of these features in the normalised image plane.
-
-
-class Rays(NamedTuple):
-    """The directions of N features in the frame of their camera.
-
-    Distances between features are measured on the normalised image plane z = 1; those of a
-    panorama, on a plane that touches the unit sphere at the feature.
-    """
-
-    directions: Floats  # (N, 3), their ends are on the plane
-    normals: Floats  # (N, 3) unit vectors, of the planes
-
-    @staticmethod
-    def of(camera: pycolmap.Camera, pixels: Floats) -> Rays:
-        """Of features at ``pixels`` (N, 2)."""
-        if camera.is_spherical():
-            directions = np.asarray(camera.cam_ray_from_img(pixels))
-            return Rays(directions, directions)
-        return Rays.through_plane(np.asarray(camera.cam_from_img(pixels)))
-
-    @staticmethod
-    def through_plane(positions: Floats) -> Rays:
-        """Of features at ``positions`` (N, 2) in the normalised image plane."""
-        ones = np.ones((len(positions), 1))
-        return Rays(np.hstack([positions, ones]), np.hstack([np.zeros_like(positions), ones]))
-
-    def squared_slope(self, gradients: Floats) -> Floats:
-        """(N,) of functions with ``gradients`` (N, 3), along the planes."""
-        upright = (gradients * self.normals).sum(1)
-        return np.asarray((gradients**2).sum(1) - upright**2)
-
-
-_Side = tuple[pycolmap.Image, NDArray[np.uint64], Rays]
+_Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
 
 # A match is a hit if its two features observe the same point of the model. It is a miss if one of
 # its features observes a point whose projection into the other photo is far from the matched
@@ -168,18 +137,18 @@ def check_pairs(
     placed = set(model.reg_image_ids())
     points = {image_id: _point_ids(model.image(image_id)) for image_id in placed}
     positions = _Positions.from_model(model)
-    rays: dict[int, Rays] = {}
+    rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
         names = database_names(source)
         follow = following_pairs(names)
 
-        def rays_of(image_id: int, features: Ints) -> Rays:
+        def rays_of(image_id: int, features: Ints) -> Floats:
             if image_id not in rays:
                 camera = model.camera(model.image(image_id).camera_id)
                 pixels = source.read_keypoints(image_id)[:, :2].astype(np.float64)
-                rays[image_id] = Rays.of(camera, pixels)
-            return Rays(*(values[features] for values in rays[image_id]))
+                rays[image_id] = _rays(camera, pixels)
+            return rays[image_id][features]
 
         for found in sorted(verified_pairs(database), key=lambda p: (p.first, p.second)):
             first, second = found.first + 1, found.second + 1
@@ -247,6 +216,17 @@ def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
     return {photo for photo, count in tears.items() if count >= _MIN_TEARS} - confirmed
 
 
+def _rays(camera: pycolmap.Camera, pixels: Floats) -> Floats:
+    """The positions (N, 2) of ``pixels`` (N, 2) in the normalised image plane of a camera.
+
+    For a fisheye lens or a panorama, unit vectors (N, 3): its pixels are angles, up to 90° or more
+    to its axis, where COLMAP's are wrong. NaN where the model is not defined.
+    """
+    if not (is_fisheye(camera.model_name) or camera.is_spherical()):
+        return np.asarray(camera.cam_from_img(pixels))
+    return directions(lens_of(camera), pixels)
+
+
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
     """(features,) the id of the point that each feature observes, or ``INVALID_POINT3D_ID``."""
     points = image.points2D
@@ -277,8 +257,9 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
     """(M,) whether each match is a miss because of the point that its feature in ``one`` observes.
 
     The point is projected into the photo ``other``. The match is a miss if the distance between the
-    projection and its feature in ``other`` is larger than ``max_error``, in the unit of `Rays`, or
-    if the point is behind the camera of ``other``.
+    projection and its feature in ``other`` is larger than ``max_error``, in the normalised image
+    plane, or if the point is behind the camera of ``other``. For a fisheye lens or a
+    panorama, the distance is that of unit vectors.
     """
     _, ids, _ = one
     image, _, rays = other
@@ -288,16 +269,18 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
         points = positions[ids[rows]]
         camera = image.cam_from_world().matrix()
         seen = points @ camera[:, :3].T + camera[:, 3]
-        directions, normals = (values[rows] for values in rays)
-        depth = (seen * normals).sum(1, keepdims=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = np.linalg.norm(seen / depth - directions, axis=1)
-        missed[rows] = (depth[:, 0] <= 0) | (distance > max_error)
+        if rays.shape[1] == 3:
+            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+            missed[rows] = np.linalg.norm(seen - rays[rows], axis=1) > max_error
+        else:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                distance = np.linalg.norm(seen[:, :2] / seen[:, 2:] - rays[rows], axis=1)
+            missed[rows] = (seen[:, 2] <= 0) | (distance > max_error)
     return missed
 
 
 def agreement(
-    cam2_from_cam1: pycolmap.Rigid3d, rays1: Rays, rays2: Rays, max_error: float
+    cam2_from_cam1: pycolmap.Rigid3d, rays1: Floats, rays2: Floats, max_error: float
 ) -> float:
     """Share of the matches that agree with a relative pose, whether or not they were triangulated.
 
@@ -305,25 +288,33 @@ def agreement(
     front of both cameras or are nearly parallel.
 
     Args:
-        rays1, rays2: of the M matched features in the two cameras.
-        max_error: in the unit of `Rays`.
+        rays1, rays2: (M, 2) positions of the matched features in the normalised image planes of the
+            two cameras, or (M, 3) unit vectors.
+        max_error: in the unit of the normalised image plane or of the unit sphere.
     """
     rotation, translation = cam2_from_cam1.rotation.matrix(), cam2_from_cam1.translation
     x, y, z = translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    one, two = rays1.directions, rays2.directions
+    one, two = (_homogeneous(rays) for rays in (rays1, rays2))
     lines1, lines2 = two @ essential, one @ essential.T
-    length = rays1.squared_slope(lines1) + rays2.squared_slope(lines2)
+    # The squared gradient of the product below, along the image plane or the sphere. There, the
+    # part across the sphere is zero on the epipolar line, and small near it.
+    length = (lines1[:, : rays1.shape[1]] ** 2).sum(1) + (lines2[:, : rays2.shape[1]] ** 2).sum(1)
     distance = np.abs((two * lines2).sum(1)) / np.sqrt(np.maximum(length, 1e-300))
     # depth1 · one + translation ≈ depth2 · two, with both rays in the frame of the second camera.
     one = one @ rotation.T
     one /= np.linalg.norm(one, axis=1, keepdims=True)
-    two = two / np.linalg.norm(two, axis=1, keepdims=True)
+    two /= np.linalg.norm(two, axis=1, keepdims=True)
     cosine = (one * two).sum(1)
     along1, along2 = one @ translation, two @ translation
     is_in_front = (cosine * along2 > along1) & (along2 > cosine * along1)
     is_parallel = cosine > np.cos(np.radians(_MIN_ANGLE))
     return float(np.mean((distance <= max_error) & (is_in_front | is_parallel)))
+
+
+def _homogeneous(rays: Floats) -> Floats:
+    """(M, 3): ``rays``, with z = 1 if they are in an image plane."""
+    return rays.copy() if rays.shape[1] == 3 else np.pad(rays, ((0, 0), (0, 1)), constant_values=1)
 
 
 def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
+from snowsplat.data.lens.model import LensModel
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
 
@@ -31,6 +32,18 @@ _MIN_PHOTOS_FOR_OPENCV = 8
 #: Focal length of photos without EXIF, divided by the longest side: that of a 29 mm lens on 35 mm
 #: film. It is between the values for the photos of a phone and for its videos, which are cropped.
 GUESSED_FOCAL = 0.8
+# The same for a fisheye lens: its longest side spans 115°.
+_GUESSED_FISHEYE = 0.5
+# Models without coefficients; a fisheye lens then begins without one, too.
+_EQUIDISTANT = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_PINHOLE")
+# A fisheye lens sees behind itself by this angle at most. Degrees from the axis.
+_WIDEST_HALF = 140.0
+# Directions in which the distortion of a fisheye lens is examined. In COLMAP, directions at 90° or
+# more from the axis have no pixels.
+_MAX_ANGLE = 89.0
+_POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+# A lens that is no fisheye moves pixels inwards by at most this share.
+_MAX_BARREL = 0.25
 # An ordinary lens changes the distance of a pixel from the centre by at most this share, in
 # addition to the difference between a pinhole camera and a fisheye lens (r = f θ).
 _MAX_DISPLACEMENT = 0.1
@@ -65,6 +78,11 @@ class Lens:
     held: bool = False
     exif: bool = True
     focals: Mapping[int, float] = field(default_factory=dict)
+    fisheyes: frozenset[int] = frozenset()
+
+    @property
+    def any_fisheye(self) -> bool:
+        return bool(self.fisheyes) or is_fisheye(self.model)
 
     @property
     def fixed(self) -> Lens:
@@ -79,8 +97,19 @@ class Lens:
     @property
     def description(self) -> str:
         """As text for users; empty for the first choice."""
-        parts = ["a fixed focal length"] if self.held else []
+        parts = ["as a fisheye lens"] if self.fisheyes else []
+        parts += ["a fixed focal length"] if self.held else []
         return " and ".join(parts if self.exif else [*parts, "without the focal length in EXIF"])
+
+
+def is_fisheye(model: str) -> bool:
+    """Whether a camera model of COLMAP measures angles: its pixels may be at 90° to the axis."""
+    return model.endswith("FISHEYE")
+
+
+def lens_of(camera: pycolmap.Camera) -> LensModel:
+    """The lens of a camera of COLMAP."""
+    return LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
 
 
 def camera_ids(photos: Sequence[Photo]) -> list[int]:
@@ -91,7 +120,11 @@ def camera_ids(photos: Sequence[Photo]) -> list[int]:
 
 
 def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
-    """The camera of each group of photos, in the order of `camera_ids`."""
+    """The camera of each group of photos, in the order of `camera_ids`.
+
+    A fisheye lens begins with at most one coefficient (see `with_all_parameters`). COLMAP verifies
+    pairs of its photos only if a focal length is given, which may be inexact.
+    """
     cameras = []
     known = exif_focals(photos) if lens.exif else {}
     for number, key in enumerate(sorted({_key(photo) for photo in photos}), start=1):
@@ -103,17 +136,54 @@ def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
             cameras.append(camera)
             continue
         count = sum(_key(photo) == key for photo in photos)
-        model = lens.model
-        if model == "auto" and lens.held:
+        model, guess = lens.model, GUESSED_FOCAL
+        if number in lens.fisheyes or is_fisheye(model):
+            model = "SIMPLE_FISHEYE" if model in _EQUIDISTANT else "SIMPLE_RADIAL_FISHEYE"
+            guess = _GUESSED_FISHEYE
+        elif model == "auto" and lens.held:
             model = "SIMPLE_RADIAL"
         elif model == "auto":
             model = "OPENCV" if count >= _MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
-        guess = lens.focals.get(number, GUESSED_FOCAL * max(width, height))
-        focal = known.get(number, guess)
+        focal = known.get(number, lens.focals.get(number, guess * max(width, height)))
         camera = pycolmap.Camera.create_from_model_name(number, model, focal, width, height)
-        camera.has_prior_focal_length = number in known
+        camera.has_prior_focal_length = number in known or lens.any_fisheye
         cameras.append(camera)
     return cameras
+
+
+def with_all_parameters(
+    model: pycolmap.Reconstruction, photos: Sequence[Photo], lens: Lens, refine: Refine, held: bool
+) -> pycolmap.Reconstruction:
+    """``model`` with all parameters of its fisheye lenses; without fisheye lenses, ``model``.
+
+    The parameters of OPENCV_FISHEYE are undetermined in a model of a few photos, and bundle
+    adjustment would bend it. So they are estimated at the end. If the lens is only a guess, they
+    are not used where they would be impossible.
+    """
+    cameras, chosen = camera_ids(photos), []
+    for number in _used(model):
+        camera, name = model.cameras[number], lens.model
+        if name == "auto":
+            enough = cameras.count(number) >= _MIN_PHOTOS_FOR_OPENCV
+            name = "OPENCV_FISHEYE" if enough else camera.model_name
+        if is_fisheye(camera.model_name) and name != camera.model_name:
+            chosen.append(_converted(camera, name))
+    if not chosen:
+        return model
+    made = refine(copy.deepcopy(model), chosen, held)
+    return model if lens.model == "auto" and _impossible(made) else made
+
+
+def _converted(camera: pycolmap.Camera, model: str) -> pycolmap.Camera:
+    """A camera with a fisheye lens in another ``model``, which is the same or more detailed."""
+    size, focal = (camera.width, camera.height), camera.mean_focal_length()
+    made = pycolmap.Camera.create_from_model_name(camera.camera_id, model, focal, *size)
+    params = made.params.copy()
+    params[list(made.principal_point_idxs())] = camera.principal_point_x, camera.principal_point_y
+    for target, source in zip(made.extra_params_idxs(), camera.extra_params_idxs(), strict=False):
+        params[target] = camera.params[source]  # the first coefficient is that of θ³ in all models
+    made.params = params
+    return made
 
 
 def exif_focals(photos: Sequence[Photo]) -> dict[int, float]:
@@ -144,8 +214,56 @@ def findings_of(camera: pycolmap.Camera, exif: float | None) -> list[Finding]:
     fx, fy = camera.focal_length_x, camera.focal_length_y
     cx, cy = camera.principal_point_x, camera.principal_point_y
     found = lens_findings(camera.width, camera.height, fx, fy, cx, cy, known_focal=exif)
+    if is_fisheye(camera.model_name):
+        found = [finding for finding in found if finding.about != "field of view"]
+        reason = _implausible_fisheye(camera)
+        return [*found, Finding("distortion", reason, True)] if reason else found
     reason = _implausible_distortion(camera)
-    return [*found, Finding("distortion", reason, True)] if reason else found
+    if reason:
+        return [*found, Finding("distortion", reason, True)]
+    barrel = _barrel(camera)
+    if barrel < -_MAX_BARREL:
+        found.append(
+            Finding(
+                "distortion",
+                f"the lens distortion moves pixels at the border by {barrel:.0%}, as a fisheye "
+                "lens does; if it is one, state the camera model OPENCV_FISHEYE",
+            )
+        )
+    return found
+
+
+def _implausible_fisheye(camera: pycolmap.Camera) -> str:
+    """Why a fisheye lens is not that of a camera, as text; empty: it is plausible."""
+    half = 0.5 * min(camera.width, camera.height) / camera.mean_focal_length()
+    if half > np.radians(_WIDEST_HALF):
+        return (
+            f"a focal length of {camera.mean_focal_length():.5g} pixels for photos of "
+            f"{camera.width}x{camera.height} is a field of view of {np.degrees(2 * half):.0f}°"
+        )
+    angle, turn = np.radians(np.arange(0.5, _MAX_ANGLE, 0.5)), np.arange(16) * (2 * np.pi / 16)
+    sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
+    rays = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine + 0 * turn], -1)
+    pixels = np.asarray(camera.img_from_cam(rays.reshape(-1, 3))).reshape(*rays.shape[:2], 2)
+    inside = np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=-1)
+    centre = camera.principal_point_x, camera.principal_point_y
+    radius = np.linalg.norm(pixels - centre, axis=-1)
+    # A distortion that folds moves pixels back into the photo.
+    if np.any(inside[:-1] & ~(radius[1:] > radius[:-1])):
+        return "the lens distortion is not one-to-one over the whole photo"
+    return ""
+
+
+def _barrel(camera: pycolmap.Camera) -> float:
+    """The share by which a polynomial distortion moves pixels at the border; negative: inwards."""
+    if camera.model_name not in _POLYNOMIAL:
+        return 0.0
+    ideal = _border(camera)
+    fx, fy = camera.focal_length_x, camera.focal_length_y
+    corner = np.array([[0.0, 0.0], [camera.width, camera.height]])
+    centre = np.array([camera.principal_point_x, camera.principal_point_y])
+    distorted = np.linalg.norm((corner - centre) / (fx, fy), axis=1).max()
+    return float(distorted / np.linalg.norm(ideal, axis=1).max() - 1)
 
 
 def _implausible_distortion(camera: pycolmap.Camera) -> str:

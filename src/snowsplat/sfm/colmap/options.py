@@ -23,6 +23,9 @@ CAMERA_MODELS = (
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
     "EQUIRECTANGULAR",
 )
 #: The camera model of 360° panoramas, twice as wide as high.
@@ -34,7 +37,8 @@ class SfmOptions:
     """Options of the pose estimation."""
 
     # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
-    # eight parameters, else SIMPLE_RADIAL. It does not apply to panoramas (`Photo.panorama`).
+    # eight parameters, else SIMPLE_RADIAL; of a fisheye lens, OPENCV_FISHEYE or
+    # SIMPLE_RADIAL_FISHEYE. Panoramas (`Photo.panorama`) have their own model.
     camera_model: str = "auto"
     mapper: Mapper = "incremental"
     effort: EffortName = "normal"
@@ -64,6 +68,8 @@ class SfmResult:
     doubts: list[str] = field(default_factory=list)
     # The focal lengths, as text for users, if those of photos of one group differ (`Photo.group`).
     zooms: str = ""
+    # Which photos are from a fisheye lens, as text for users, if this was found from their matches.
+    fisheye: str = ""
 
 
 @dataclass(frozen=True)

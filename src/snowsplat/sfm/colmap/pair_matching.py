@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from snowsplat.sfm.colmap.database import closing_database, count_rows, match_co
 from snowsplat.sfm.colmap.features import SEED, WorkerProgress
 from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.progress import Report
 from snowsplat.util import native_library
 
 # Number of pairs that are matched or verified before the results are written to the database. If
@@ -43,20 +42,42 @@ _MAX_TRIALS = 3000
 
 
 def match_pairs(
+    database: Path, pairs: list[tuple[int, int]], threads: int, progress: WorkerProgress
+) -> None:
+    """Match those ``pairs`` (two indices of photos each) that have no matches in the database."""
+    native_library.set_num_threads(threads)
+    with closing_database(database) as opened:
+
+        @functools.lru_cache(_CACHED_PHOTOS)
+        def descriptors(index: int) -> NDArray[np.uint8]:
+            if not opened.exists_descriptors(index + 1):
+                return np.zeros((0, LENGTH), np.uint8)
+            return np.asarray(opened.read_descriptors(index + 1).data).reshape(-1, LENGTH)
+
+        remaining = [(i, j) for i, j in pairs if not opened.exists_matches(i + 1, j + 1)]
+        for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
+            done = len(pairs) - len(remaining) + start
+            progress.report(done, len(pairs), "matched pairs")
+            transaction = pycolmap.DatabaseTransaction(opened)
+            for i, j in remaining[start : start + _PAIRS_PER_BLOCK]:
+                matches = match_descriptors(descriptors(i), descriptors(j))
+                opened.write_matches(i + 1, j + 1, matches)
+            del transaction  # the destructor ends the transaction
+
+
+def verify_pairs(
     database: Path,
-    photos: list[Photo],
+    photos: Sequence[Photo],
     pairs: list[tuple[int, int]],
     max_error: float,
     threads: int,
     progress: WorkerProgress,
 ) -> None:
-    """Match and verify those ``pairs`` that are not in the database yet.
+    """Let COLMAP verify the matches of those ``pairs`` that are not verified yet.
 
-    A pair consists of two indices of photos. The matches are written to the database first, and
-    COLMAP then only verifies them. ``max_error`` is the largest distance of a verified match from
-    its epipolar line, in pixels of the photos in ``input/``.
+    ``max_error`` is the largest distance of a verified match from its epipolar line, in pixels of
+    the photos in ``input/``. The lenses are those in the database.
     """
-    _write_matches(database, pairs, threads, progress.report)
     # COLMAP reads the pairs from a file in which spaces separate the names, and the name of a photo
     # may contain spaces. Therefore the images temporarily have numbers as names.
     set_names(database, [str(i) for i in range(len(photos))])
@@ -118,27 +139,6 @@ def _verify(
         )
     finally:
         os.remove(pairing.match_list_path)
-
-
-def _write_matches(path: Path, pairs: list[tuple[int, int]], threads: int, report: Report) -> None:
-    """Write the matches of those ``pairs`` that have none in the database ``path``."""
-    native_library.set_num_threads(threads)
-    with closing_database(path) as database:
-
-        @functools.lru_cache(_CACHED_PHOTOS)
-        def descriptors(index: int) -> NDArray[np.uint8]:
-            if not database.exists_descriptors(index + 1):
-                return np.zeros((0, LENGTH), np.uint8)
-            return np.asarray(database.read_descriptors(index + 1).data).reshape(-1, LENGTH)
-
-        remaining = [(i, j) for i, j in pairs if not database.exists_matches(i + 1, j + 1)]
-        for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
-            report(len(pairs) - len(remaining) + start, len(pairs), "matched pairs")
-            transaction = pycolmap.DatabaseTransaction(database)
-            for i, j in remaining[start : start + _PAIRS_PER_BLOCK]:
-                matches = match_descriptors(descriptors(i), descriptors(j))
-                database.write_matches(i + 1, j + 1, matches)
-            del transaction  # the destructor ends the transaction
 
 
 @contextmanager

@@ -14,6 +14,9 @@ With further matches:
 After the first four, bundle adjustment shows whether one focal length fits all photos of a camera.
 If not, the attempt is made with several, which remain for the others (`camera_groups`).
 
+Before the first attempt, the matches tell whether a camera has a fisheye lens (`fisheye`). If this
+attempt is not good, it is also made with an ordinary lens, and the better model decides.
+
 The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
 are verified again without it.
 
@@ -50,7 +53,15 @@ from snowsplat.sfm.colmap.database import (
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
-from snowsplat.sfm.colmap.lens import Lens, Refine, camera_ids, exif_focals, settled
+from snowsplat.sfm.colmap.fisheye import LensEvidence, lens_evidence
+from snowsplat.sfm.colmap.lens import (
+    Lens,
+    Refine,
+    camera_ids,
+    exif_focals,
+    settled,
+    with_all_parameters,
+)
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import (
     Effort,
@@ -59,7 +70,7 @@ from snowsplat.sfm.colmap.options import (
     SfmResult,
     detection_size,
 )
-from snowsplat.sfm.colmap.pair_matching import match_pairs
+from snowsplat.sfm.colmap.pair_matching import match_pairs, verify_pairs
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.repair import repair
 from snowsplat.sfm.colmap.result import names_in, result_of
@@ -76,6 +87,8 @@ _NEXT_ATTEMPT = 3.0
 # Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
 # which the features were detected.
 _MAX_ERROR = 4.0
+# A model of the wrong kind of lens has larger errors than one of the right kind, by this factor.
+_OTHER_LENS = 1.25
 # Each attempt with several focal lengths has better estimates of them than the one before.
 _ZOOM_ATTEMPTS = 3
 
@@ -101,6 +114,7 @@ class Attempt:
     """The result of an attempt."""
 
     matched: Matched
+    lens: Lens  # with which the attempt began
     mapping: Mapping  # for further work on the models
     models: list[pycolmap.Reconstruction]
     agreement: float  # of the first model with its matches; see `agreement_of`
@@ -110,6 +124,11 @@ class Attempt:
     @property
     def registered(self) -> int:
         return self.models[0].num_reg_images() if self.models else 0
+
+    @property
+    def error(self) -> float:
+        """The mean reprojection error of the first model, in pixels of the photos."""
+        return self.models[0].compute_mean_reprojection_error() if self.models else float("inf")
 
 
 class PoseEstimation:
@@ -128,7 +147,7 @@ class PoseEstimation:
         self.options = options
         self.threads = threads
         self.progress = progress
-        self.lens = Lens(options.camera_model)
+        self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
         self.log: list[str] = []  # a description of each attempt, as text for users
@@ -171,15 +190,21 @@ class PoseEstimation:
                 f"the poses may be bent: {best.agreement:.0%} of the matches between neighbouring "
                 "photos agree with them"
             )
-        return dataclasses.replace(result, doubts=doubts, zooms=zooms)
+        doubts = doubts or self._other_lens(best)
+        return dataclasses.replace(
+            result, doubts=doubts, zooms=zooms, fisheye=self._found_fisheye(best)
+        )
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
         """Make as many attempts as needed; returns the evidence of the last matching.
 
         ``second`` is the path of the database for the attempts that have more features.
         """
-        first, mapper, lens = self.folders.database, self.options.mapper, self.lens
-        matched = self._match(first, effort, effort, lens)
+        first, mapper = self.folders.database, self.options.mapper
+        matched = self._match(first, effort, effort)
+        self.lens_evidence = lens_evidence(first, self.photos, matched.scale)
+        lens = self._first_lens()
+        self._verify(matched, lens)
         evidence = self._evidence(matched)
         if evidence.flat:
             mapper = "incremental"  # the global mapper returns a wrong depth for flat scenes
@@ -187,9 +212,13 @@ class PoseEstimation:
         if not self._found and evidence.flat and exif_focals(self.photos):
             lens = dataclasses.replace(lens, exif=False)
             forget_verification(first)
-            matched = self._match(first, effort, effort, lens)
+            self._verify(matched, lens)
             evidence = self._evidence(matched)
             self._try("as configured", matched, mapper, lens)
+        if lens.fisheyes and not self._good(evidence):
+            ordinary = dataclasses.replace(lens, fisheyes=frozenset(), focals={})
+            self._try("as configured", matched, mapper, ordinary)
+            lens = self._best().lens
         if not self._found and evidence.more_effort_is_useless:
             return evidence
         other: Mapper = "incremental" if mapper == "global" else "global"
@@ -199,16 +228,19 @@ class PoseEstimation:
             self._try("as configured", matched, "incremental", lens.fixed)
         if not self._enough(evidence):
             self._try("as configured", matched, "plain", lens)
-        lens = self._try_zooms(matched, mapper, lens, evidence)
+        if not lens.any_fisheye:  # fisheye lenses with a zoom are rare
+            lens = self._try_zooms(matched, mapper, lens, evidence)
         if self._enough(evidence):
             return evidence
         if not (self._found and evidence.matched_all):
-            matched = self._match(first, effort, effort.stronger(), lens)
+            matched = self._match(first, effort, effort.stronger())
+            self._verify(matched, lens)
             self._try("with more pairs and weaker matches", matched, "incremental", lens, True)
         if self._enough(evidence):
             return self._evidence(matched)
         strong = effort.stronger()
-        matched = self._match(second, strong, strong, lens)
+        matched = self._match(second, strong, strong)
+        self._verify(matched, lens)
         how = "with more features, from larger photos"
         self._try(how, matched, mapper, lens, True)
         if not self._enough(evidence):
@@ -221,19 +253,63 @@ class PoseEstimation:
         """The attempt with the most registered photos, weighted by the share of correct matches.
 
         A model that is bent, because photos were registered with too few points, may have all
-        photos.
+        photos. So may a model of the wrong kind of lens, but it has larger errors.
         """
-        return max(self.attempts, key=lambda attempt: attempt.registered * attempt.agreement)
+        least = min(attempt.error for attempt in self.attempts)
+        lenses = {attempt.lens.any_fisheye for attempt in self.attempts}
+
+        def score(attempt: Attempt) -> float:
+            wrong_lens = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
+            return attempt.registered * attempt.agreement * (0.5 if wrong_lens else 1.0)
+
+        return max(self.attempts, key=score)
+
+    def _first_lens(self) -> Lens:
+        """The lens of the first attempt, with the focal lengths that the matches propose."""
+        lens, found = Lens(self.options.camera_model), self.lens_evidence
+        if lens.model == "auto":
+            found = {number: evidence for number, evidence in found.items() if evidence.fisheye}
+            lens = dataclasses.replace(lens, fisheyes=frozenset(found))
+        elif not lens.any_fisheye:
+            return lens
+        focals = {number: evidence.focal for number, evidence in found.items()}
+        return dataclasses.replace(lens, focals=focals)
+
+    def _found_fisheye(self, best: Attempt) -> str:
+        """`SfmResult.fisheye` of the attempt ``best``."""
+        if not best.lens.fisheyes:
+            return ""
+        count = sum(number in best.lens.fisheyes for number in camera_ids(self.photos))
+        gain = min(self.lens_evidence[number].gain for number in best.lens.fisheyes) - 1
+        which = "the photos are" if count == len(self.photos) else f"{count} photos are"
+        return (
+            f"{which} from a fisheye lens: {gain:.0%} more matches agree with one than with any "
+            "ordinary lens"
+        )
+
+    def _other_lens(self, best: Attempt) -> list[str]:
+        """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
+
+        The model FOV describes fisheye lenses, too.
+        """
+        if best.lens.any_fisheye or best.lens.model == "FOV":
+            return []
+        if not any(evidence.fisheye for evidence in self.lens_evidence.values()):
+            return []
+        return [
+            "the photos seem to be from a fisheye lens, but their poses were estimated with an "
+            "ordinary one; state the camera model OPENCV_FISHEYE"
+        ]
 
     @property
     def _found(self) -> bool:
         """Whether an attempt has found poses."""
         return any(attempt.models for attempt in self.attempts)
 
-    def _match(self, database: Path, effort: Effort, pairing: Effort, lens: Lens) -> Matched:
+    def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
         """Detect the features of ``effort``, and match the pairs of the effort ``pairing``."""
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
-        open_database(database, self.photos, lens, fingerprint)
+        open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
         choice = choose_pairs(self.photos, pairing, self._similarity(database))
         scales = [
@@ -241,10 +317,17 @@ class PoseEstimation:
             for photo in self.photos
         ]
         scale = max(1.0, float(np.median(scales)))
-        match_pairs(
-            database, self.photos, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress
-        )
+        match_pairs(database, choice.pairs, self.threads, self.progress)
         return Matched(database, effort, choice, scale)
+
+    def _verify(self, matched: Matched, lens: Lens) -> None:
+        """Verify those matches of ``matched`` that are not verified yet.
+
+        The cameras of ``lens`` replace those in the database.
+        """
+        set_cameras(matched.database, self.photos, lens)
+        error, pairs = _MAX_ERROR * matched.scale, matched.choice.pairs
+        verify_pairs(matched.database, self.photos, pairs, error, self.threads, self.progress)
 
     def _similarity(self, database: Path) -> Callable[[], NDArray[np.floating]]:
         indices = range(len(self.photos))
@@ -273,16 +356,20 @@ class PoseEstimation:
             repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
             left_out = repaired.left_out
             check = f"; {repaired.description}" if repaired.description else ""
-            found = settled(repaired.model, self.photos, lens, self._refine(mapping))
+            refine = self._refine(mapping)
+            found = settled(repaired.model, self.photos, lens, refine)
             mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
-            models = usable_models([found.model, *models[1:]]) if found.model else []
-            if not found.model:
+            if found.model:
+                model = with_all_parameters(found.model, self.photos, lens, refine, found.held)
+                models = usable_models([model, *models[1:]])
+            else:
+                models = []
                 check = f"; impossible: {', '.join(doubts)}"
         agreement = 0.0
         if models:
             error = _MAX_ERROR * matched.scale
             agreement = agreement_of(check_pairs(models[0], matched.database, error))
-        attempt = Attempt(matched, mapping, models, agreement, left_out, doubts)
+        attempt = Attempt(matched, lens, mapping, models, agreement, left_out, doubts)
         self.attempts.append(attempt)
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
         self.log.append(

@@ -11,6 +11,8 @@ Two measures are taken for each pixel of small grey copies of the photos.
   similar strength in nearly all photos; one that is *slow* has so in more than half of them. The
   edges of a scene that moves little are slow around those that are fixed: a far tower, the point to
   which a street leads. Those of an overlay are fixed or move with the scene, nothing in between.
+
+The black outside of an image circle is found first (`image_circle`).
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from snowsplat.sfm.ingest.image_circle import find_image_circle
 from snowsplat.sfm.ingest.still_background import Backdrop, find_backdrop
 
 #: Longest side in pixels of the copies.
@@ -89,11 +92,13 @@ class FixedParts:
         bars: widths of the bars at the left, top, right and bottom, in pixels of the copy.
         fixed: (H, W) bool, whether a pixel of the copy shows no scene; includes the bars.
         backdrop: the background, if it stands still and only an object in front of it moves.
+        circle: ``fixed`` is what is outside of an image circle (`image_circle`).
     """
 
     bars: tuple[int, int, int, int]
     fixed: NDArray[np.bool_]
     backdrop: Backdrop | None
+    circle: bool = False
 
     @property
     def crop(self) -> Crop | None:
@@ -135,6 +140,9 @@ def find_fixed_parts(copies: NDArray[np.uint8]) -> FixedParts | None:
     """
     if len(copies) < MIN_PHOTOS or min(copies.shape[1:]) < _LEAST_SIDE:
         return None
+    circle = find_image_circle(copies)
+    if circle is not None:
+        return FixedParts((0, 0, 0, 0), circle.outside(copies.shape[1:]), None, circle=True)
     bars = _bars(copies)
     inner = _inner(copies.shape[1:], bars)
     fixed = np.ones(copies.shape[1:], bool)
@@ -312,7 +320,9 @@ def describe_bars(parts: FixedParts, cropped: bool, where: str) -> str:
 def describe(parts: FixedParts, cropped: bool, where: str) -> list[str]:
     """What is fixed to the frame, and what was done about it; ``where``: e.g. "all 14 photos"."""
     lines = [describe_bars(parts, cropped, where)] if any(parts.bars) else []
-    if parts.backdrop is not None:
+    if parts.circle:
+        lines.append(f"the picture is a disc, as of a fisheye lens: its outside masked in {where}")
+    elif parts.backdrop is not None:
         lines.append(
             f"the background ({100 * parts.fixed.mean():.0f}% of the picture) stands still while "
             f"something in front of it moves, as on a turntable: masked in {where}; if nothing "
