@@ -9,7 +9,7 @@
     ahead    a street; the camera walks and looks ahead
     side     a street; the camera looks at the façades of the other side
     turns    a street; the camera walks ahead and turns from side to side
-    panorama the room; 360° panoramas, twice as wide as high, on the loops of "room"; of twice the width
+    panorama the room; 360° panoramas on the loops of "room", of twice the width
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
