@@ -69,8 +69,8 @@ def render_panoramas(
     """Render all directions from the places of the photos into OUT/SPLIT/ours_N/panoramas.
 
     The files 00000.jpg … are equirectangular, and their metadata say so (GPano). Their horizon is
-    level and their centre is in the direction of the photo. Photos from one place, such as the
-    views of a panorama, have one picture, that of the first by name.
+    level and their centre is in the direction of the photo. Photos from one place have one picture;
+    for the views of a panorama, its centre is that of the panorama.
 
     Args:
         size: the width, twice the height, in pixels, e.g. "3840"; default: 3840.
@@ -92,9 +92,11 @@ def render_panoramas(
         folder = scene.folder.path / split / f"ours_{scene.iteration}" / "panoramas"
         folder.mkdir(parents=True, exist_ok=True)
         places: list[Camera] = []
-        for camera in level_cameras([view.camera for view in views]):
-            if not any(torch.allclose(camera.position, place.position) for place in places):
-                places.append(camera)
+        for view, camera in zip(views, level_cameras([v.camera for v in views]), strict=True):
+            same = (i for i, p in enumerate(places) if torch.allclose(camera.position, p.position))
+            i = next(same, len(places))
+            if i == len(places) or Path(view.name).stem.endswith("_front"):  # see `lens_views`
+                places[i : i + 1] = [camera]
         for i, camera in enumerate(places):
             with torch.no_grad():
                 image = renderer.render(scene.gaussians, camera.cam_from_world, color)

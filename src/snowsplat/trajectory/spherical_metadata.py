@@ -46,10 +46,10 @@ def mark_as_spherical(path: Path) -> None:
                         size = int.from_bytes(large, "big") - 8
                     _copy(source, target, size - 8)
                     continue
-                moov = head + source.read(size - 8)
+                moov, start = head + source.read(size - 8), target.tell()
                 # What follows moves by the size of the metadata.
-                grown = len(_marked(moov, 0)) - len(moov)
-                target.write(_marked(moov, grown))
+                grown = len(_marked(moov, start, 0)) - len(moov)
+                target.write(_marked(moov, start, grown))
                 shutil.copyfileobj(source, target)
                 break
             else:
@@ -65,32 +65,33 @@ def _copy(source: BinaryIO, target: BinaryIO, count: int) -> None:
         count -= len(block)
 
 
-def _marked(box: bytes, shift: int) -> bytes:
-    """The box with the metadata in it, and with file positions that are larger by ``shift``."""
+def _marked(box: bytes, start: int, shift: int) -> bytes:
+    """The box with the metadata in it; file positions from ``start`` on are larger by ``shift``."""
     name = box[4:8]
     if name in _OFFSETS:
-        return _shifted(box, _OFFSETS[name], shift)
+        return _shifted(box, _OFFSETS[name], start, shift)
     if name in _ENTRIES:
         return _box(name, box[8:] + _projection())
     if name not in _CONTAINERS:
         return box
     head = _CONTAINERS[name]
-    made, start = box[8:head], head
-    while start + 8 <= len(box):
-        size = int.from_bytes(box[start : start + 4], "big")
+    made, at = box[8:head], head
+    while at + 8 <= len(box):
+        size = int.from_bytes(box[at : at + 4], "big")
         if size < 8:
             break
-        made += _marked(box[start : start + size], shift)
-        start += size
+        made += _marked(box[at : at + size], start, shift)
+        at += size
     if name == b"trak":
         made += _box(b"uuid", _UUID + _XML)
     return _box(name, made)
 
 
-def _shifted(box: bytes, size: int, shift: int) -> bytes:
+def _shifted(box: bytes, size: int, start: int, shift: int) -> bytes:
     """A box of positions in the file, each of ``size`` bytes."""
     positions = (int.from_bytes(box[i : i + size], "big") for i in range(16, len(box), size))
-    return box[:16] + b"".join((value + shift).to_bytes(size, "big") for value in positions)
+    moved = (value + shift if value >= start else value for value in positions)
+    return box[:16] + b"".join(value.to_bytes(size, "big") for value in moved)
 
 
 def _projection() -> bytes:
