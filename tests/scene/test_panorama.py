@@ -1,4 +1,4 @@
-"""Panoramas: every direction shows what is there, without steps where the sides of the cube meet."""
+"""Panoramas: each direction shows what is there, without steps between the sides of the cube."""
 
 import math
 

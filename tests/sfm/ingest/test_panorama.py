@@ -167,12 +167,15 @@ def test_missing_rows_are_black_and_masked(tmp_path):
         part = panorama(i)[20:220]
         Image.fromarray(part).save(tmp_path / "p" / f"{i}.png", pnginfo=_as_png(_CROPPED))
     made = gathered(tmp_path / "p", tmp_path / "out")
-    assert all((p.width, p.height, p.panorama, p.mask) == (512, 256, True, True) for p in made.photos)
+    assert all(
+        (p.width, p.height, p.panorama, p.mask) == (512, 256, True, True) for p in made.photos
+    )
     pixels = np.asarray(Image.open(tmp_path / "out" / "input" / "1.png"))
     assert np.array_equal(pixels[20:220], panorama(1)[20:220])
-    assert not pixels[:20].any() and not pixels[220:].any()
+    assert not np.delete(pixels, np.s_[20:220], axis=0).any()
     used = np.asarray(Image.open(tmp_path / "out" / "distorted" / "masks" / "1.png.png")) > 0
-    assert used[20:220].all() and not used[:20].any() and not used[220:].any()
+    assert used[20:220].all()
+    assert not np.delete(used, np.s_[20:220], axis=0).any()
 
 
 def test_a_panorama_among_photos_has_a_camera_of_its_own(tmp_path):
