@@ -158,7 +158,7 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
 
 def _bad_photos(dataset: Path, bad: dict[str, str]) -> str:
     rows = [
-        [picture(_thumbnail(dataset / "input" / name), name), text(name), text(problem)]
+        [picture(_thumbnail(_file_of(dataset, name)), name), text(name), text(problem)]
         for name, problem in list(bad.items())[:_MAX_THUMBNAILS]
     ]
     rest = "" if len(bad) <= _MAX_THUMBNAILS else f", and {len(bad) - _MAX_THUMBNAILS:,} more"
@@ -234,6 +234,12 @@ def _strip(dataset: Path, names: Sequence[str]) -> str:
         if (dataset / "images" / name).is_file()
     )
     return f'<h2>Images</h2>\n<div class="strip">{images}</div>'
+
+
+def _file_of(dataset: Path, photo: str) -> Path:
+    """The undistorted photo, or the photo itself if it became several views."""
+    path = dataset / "images" / photo
+    return path if path.is_file() else dataset / "input" / photo
 
 
 def _thumbnail(path: Path) -> Image.Image:
