@@ -9,6 +9,7 @@
     ahead    a street; the camera walks and looks ahead
     side     a street; the camera looks at the façades of the other side
     turns    a street; the camera walks ahead and turns from side to side
+    fisheye  the photos of "room" at the same places, with a fisheye lens of 150°
     panorama the room; 360° panoramas on the loops of "room", of twice the width
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
@@ -44,9 +45,9 @@ from torch import Tensor
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.lens import Equirectangular, Lens
+from snowsplat.synthetic.lens import AnyLens, Equirectangular
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import fisheye_lens, phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
@@ -80,7 +81,7 @@ class Kind:
 
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
-    lens: Callable[[int, int], Lens | Equirectangular] = phone_lens  # arguments: width, height
+    lens: Callable[[int, int], AnyLens] = phone_lens  # arguments: width, height
 
 
 def cache_folder() -> Path:
@@ -416,5 +417,8 @@ KINDS = {
     "turns": Kind(_street, around_corners),
     "panorama": Kind(
         _indoors(_room), level_loops, lambda width, _: Equirectangular(2 * width, width)
+    ),
+    "fisheye": Kind(
+        _indoors(_room), loops, lambda width, height: fisheye_lens(width, height, 150.0)
     ),
 }

@@ -1,4 +1,7 @@
-"""A camera with lens distortion: COLMAP's OPENCV model with a single focal length; a panorama."""
+"""Cameras with lens distortion: COLMAP's OPENCV and OPENCV_FISHEYE with a single focal length.
+
+And the camera of a 360° panorama.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Lens:
     height: int
     focal: float  # pixels
     distortion: tuple[float, float, float, float]  # k1, k2, p1, p2
-    model: ClassVar[str] = "OPENCV"  # the name in COLMAP
+    model: ClassVar[str] = "OPENCV"
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel positions (2, P) of points (3, P) in the camera's frame, in front of it."""
@@ -71,6 +74,59 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class FisheyeLens:
+    """As `Lens`, for a fisheye lens, which may see directions at 90° to its axis or more.
+
+    A point at the angle θ to the axis is at focal · θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) pixels
+    from the image centre.
+    """
+
+    width: int
+    height: int
+    focal: float  # pixels per radian at the centre
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # k1, k2, k3, k4
+    model: ClassVar[str] = "OPENCV_FISHEYE"
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixel positions (2, P) of points (3, P) in the camera's frame."""
+        flat = np.hypot(points[0], points[1])
+        radius = self.focal * self._distorted(np.arctan2(flat, points[2]))
+        return radius * points[:2] / np.maximum(flat, 1e-300) + self._middle
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (3, P) in the camera's frame, of pixel positions (2, P).
+
+        The inverse of `project`, by Newton's method.
+        """
+        x, y = (pixels - self._middle) / self.focal
+        goal = np.hypot(x, y)
+        angle = goal.copy()
+        powers = 1 + 2 * np.arange(5)
+        for _ in range(_NEWTON_STEPS):
+            slope = sum(
+                power * k * angle ** (power - 1)
+                for power, k in zip(powers, (1.0, *self.distortion), strict=True)
+            )
+            angle = angle - (self._distorted(angle) - goal) / slope
+        sine = np.sin(angle) / np.maximum(goal, 1e-300)
+        return np.stack([sine * x, sine * y, np.cos(angle)])
+
+    @property
+    def params(self) -> tuple[float, ...]:
+        """Parameters of COLMAP's OPENCV_FISHEYE: fx, fy, cx, cy, k1, k2, k3, k4."""
+        return (self.focal, self.focal, self.width / 2, self.height / 2, *self.distortion)
+
+    @property
+    def _middle(self) -> np.ndarray:
+        return np.array([[self.width / 2], [self.height / 2]])
+
+    def _distorted(self, angle: np.ndarray) -> np.ndarray:
+        k1, k2, k3, k4 = self.distortion
+        squared = angle * angle
+        return angle * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4))))
+
+
+@dataclass(frozen=True)
 class Equirectangular:
     """The camera of a 360° panorama, in COLMAP's model EQUIRECTANGULAR.
 
@@ -98,3 +154,7 @@ class Equirectangular:
     def params(self) -> tuple[float, ...]:
         """Parameters of COLMAP's EQUIRECTANGULAR: the width and the height in pixels."""
         return (float(self.width), float(self.height))
+
+
+#: The camera of a photo.
+AnyLens = Lens | FisheyeLens | Equirectangular

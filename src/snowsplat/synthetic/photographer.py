@@ -18,7 +18,7 @@ from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.data.panorama import panorama_xmp
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
-from snowsplat.synthetic.lens import Equirectangular, Lens
+from snowsplat.synthetic.lens import AnyLens, Equirectangular, FisheyeLens, Lens
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
@@ -28,6 +28,7 @@ _TILE = 64  # pixels along each side; the rays of a tile hit few shapes
 _FOCAL_35MM = 28  # in EXIF, mm; typical of a phone
 _FOCAL_TRUE = 1.013  # the true focal length divided by the one in EXIF, which is inexact
 _DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
+_FISHEYE_DISTORTION = (0.03, -0.008, 0.001, 0.0)  # OPENCV_FISHEYE: k1 … k4; of an action camera
 _WALK_RADIUS = 1.42  # metres, around the centre of the table
 _WALK_HEIGHTS = (0.46, 0.92)  # metres above the table, first and second round
 _FULL_WELL = 15000.0  # electrons of a white pixel; the shot noise is their square root
@@ -39,7 +40,7 @@ _JPEG_QUALITY = 92
 class Truth:
     """The true lens and poses of the photos."""
 
-    lens: Lens | Equirectangular
+    lens: AnyLens
     poses: dict[str, Tensor]  # photo name -> cam_from_world (3, 4) float64, metres, z up
 
     def write(self, folder: Path) -> None:
@@ -85,10 +86,24 @@ def phone_lens(
     return Lens(width, height, focal, distortion)
 
 
+def fisheye_lens(
+    width: int,
+    height: int,
+    angle: float,
+    distortion: tuple[float, float, float, float] = _FISHEYE_DISTORTION,
+) -> FisheyeLens:
+    """A fisheye lens that fills the frame.
+
+    ``angle``: the field of view in degrees from corner to corner; without distortion.
+    """
+    focal = math.hypot(width, height) / 2 / math.radians(angle / 2)
+    return FisheyeLens(width, height, focal, distortion)
+
+
 def take_photos(
     folder: Path | str,
     build: Callable[[], Scene],
-    lens: Lens | Equirectangular,
+    lens: AnyLens,
     poses: Sequence[Tensor],
     seed: int = 0,
     report: Report = silent,
@@ -118,7 +133,7 @@ def take_photos(
         random = np.random.default_rng([seed, i])
         pixels = photograph(scene, lens, poses[i], random, passing.get(i))
         with atomic_path(folder / names[i]) as temporary:
-            _save(temporary, pixels, isinstance(lens, Equirectangular))
+            _save(temporary, pixels, lens)
 
     # numpy releases the GIL, so threads run in parallel.
     with ThreadPoolExecutor(2) as pool:
@@ -158,7 +173,7 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 
 def photograph(
     scene: Scene,
-    lens: Lens | Equirectangular,
+    lens: AnyLens,
     cam_from_world: Tensor,
     random: np.random.Generator,
     passing: Scene | None = None,
@@ -201,7 +216,7 @@ def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
 
 
 @functools.lru_cache(1)
-def _tiles(lens: Lens | Equirectangular) -> list[tuple[slice, slice, np.ndarray]]:
+def _tiles(lens: AnyLens) -> list[tuple[slice, slice, np.ndarray]]:
     """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""
     tiles = []
     for top in range(0, lens.height, _TILE):
@@ -220,14 +235,14 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
     return np.rint(255 * srgb).astype(np.uint8)
 
 
-def _save(path: Path, pixels: np.ndarray, panorama: bool) -> None:
+def _save(path: Path, pixels: np.ndarray, lens: AnyLens) -> None:
+    """Save a JPEG. Frames of an action camera, which has a fisheye lens, have no focal length."""
     image = Image.fromarray(pixels)
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "snowsplat", "ray tracer"  # Make, Model
     exif[0x0112] = 1  # Orientation: as stored
-    options = {}
-    if panorama:
-        options["xmp"] = panorama_xmp(*image.size)
-    else:
+    if isinstance(lens, Lens):
         exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
-    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif, **options)
+    around = isinstance(lens, Equirectangular)
+    xmp = {"xmp": panorama_xmp(*image.size)} if around else {}
+    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif, **xmp)

@@ -12,8 +12,11 @@ import pycolmap
 from snowsplat.sfm.colmap.database import closing_database, open_database
 from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.synthetic.lens import FisheyeLens
+from snowsplat.synthetic.lens import Lens as PhoneLens
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+ORDINARY = PhoneLens(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -69,14 +72,14 @@ def forward(count: int = 12, step: float = 1.5) -> Walk:
     return _walk(xyz, centres + 2 * sway, 0.5 * sway, random, reach=25.0)
 
 
-def sideways(count: int = 12, points: int = 1500) -> Walk:
+def sideways(count: int = 12, points: int = 1500, lens: PhoneLens | FisheyeLens = ORDINARY) -> Walk:
     """Past a room, with turns: the photos determine the focal length."""
     random = np.random.default_rng(0)
     xyz = random.uniform([-6, -2.5, 4], [6, 2.5, 9], (points, 3))
     angle = np.linspace(-0.5, 0.5, count)
     centres = np.stack([6 * np.sin(angle), 0.3 * np.cos(5 * angle), 6 - 6 * np.cos(angle)], 1)
     turns = np.stack([0.1 * np.sin(9 * angle), angle, 0 * angle], 1)
-    return _walk(xyz, centres, turns, random, reach=100.0)
+    return _walk(xyz, centres, turns, random, reach=100.0, lens=lens)
 
 
 def zoomed(walk: Walk, zooms: np.ndarray) -> Walk:
@@ -97,12 +100,13 @@ def _walk(
     turns: np.ndarray,
     random: np.random.Generator,
     reach: float,
+    lens: PhoneLens | FisheyeLens = ORDINARY,
 ) -> Walk:
     """``turns``: (N, 3) rotation vectors of the cameras; ``reach``: depth up to which they see."""
     seen, pixels = [], []
     for centre, turn in zip(centres, turns, strict=True):
         local = (xyz - centre) @ pycolmap.Rotation3d(turn).matrix().T
-        pixel = FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        pixel = lens.project(local.T).T
         inside = (local[:, 2] > 1) & ((pixel > 0) & (pixel < [WIDTH, HEIGHT])).all(1)
         inside &= local[:, 2] < reach
         seen.append(np.flatnonzero(inside))

@@ -29,6 +29,9 @@ _FOCALS = (0.2, 0.27, 0.37, 0.5, 0.67, 0.9, 1.2)
 # Matches that agree with a fisheye lens / with pinhole cameras. Measured: 1.04 or more for fisheye
 # lenses from 110° to 190°, 0.97 or less for ordinary photos.
 _MIN_GAIN = 1.02
+# A lens whose longest side spans less (75°) is no fisheye, but may have a barrel distortion, which
+# the models of ordinary lenses describe.
+_LONGEST_FOCAL = 0.75
 _PAIRS = 10  # of each camera
 _MIN_MATCHES = 60  # of a pair
 _MIN_AGREEING = 300  # matches of all pairs of a camera
@@ -47,14 +50,12 @@ class LensEvidence:
     Attributes:
         focal: in pixels, of the equidistant fisheye lens with which the most matches agree.
         gain: the number of these matches, divided by that of pinhole cameras.
+        fisheye: whether it is a fisheye lens.
     """
 
     focal: float
     gain: float
-
-    @property
-    def fisheye(self) -> bool:
-        return self.gain >= _MIN_GAIN
+    fisheye: bool
 
 
 def lens_evidence(database: Path, photos: Sequence[Photo], scale: float) -> dict[int, LensEvidence]:
@@ -124,7 +125,9 @@ def _compared(matches: Sequence[_Matches], photo: Photo, max_error: float) -> Le
             for one, two in matches
         )
     best = max(counts, key=lambda focal: counts[focal])
-    return LensEvidence(best, counts[best] / pinhole)
+    gain = counts[best] / pinhole
+    wide = best <= _LONGEST_FOCAL * max(photo.width, photo.height)
+    return LensEvidence(best, gain, wide and gain >= _MIN_GAIN)
 
 
 def _ransac(max_error: float) -> pycolmap.RANSACOptions:
