@@ -56,18 +56,19 @@ def capture_verdict(
             the cameras, as clauses for users.
         problems: photos that are blurred, too dark or too bright, and what is wrong.
     """
+    photos = len(sfm["registered"])  # a photo of a wide lens becomes several images
     reasons = [
         *_lost(sfm),
         *_distances(coverage),
         *(Reason("usable", doubt) for doubt in sfm.get("doubts", ())),
-        *_count(coverage),
+        *_count(coverage, photos),
         *_ends(coverage),
         *_errors(sfm),
         *_bad_photos(problems, len(coverage.names)),
         *_one_side(coverage),
     ]
     verdict = Verdict.of(reasons)
-    return Verdict.of([_praise(coverage), *reasons]) if verdict.grade == "good" else verdict
+    return Verdict.of([_praise(coverage, photos), *reasons]) if verdict.grade == "good" else verdict
 
 
 def recorded_verdict(dataset: Path) -> Verdict | None:
@@ -120,8 +121,7 @@ def _distances(coverage: Coverage) -> list[Reason]:
     return reasons
 
 
-def _count(coverage: Coverage) -> list[Reason]:
-    count = len(coverage.names)
+def _count(coverage: Coverage, count: int) -> list[Reason]:
     advice = "take 30 to 100 photos of an object or a room, and more of a larger place"
     if count < _TOO_FEW:
         return [Reason("poor", f"{count} photos are too few", advice)]
@@ -186,8 +186,8 @@ def _looks_one_way(coverage: Coverage) -> bool:
     return float(np.quantile(coverage.directions, 0.9)) < _ONE_SIDE
 
 
-def _praise(coverage: Coverage) -> Reason:
-    text = f"{len(coverage.names)} photos"
+def _praise(coverage: Coverage, photos: int) -> Reason:
+    text = f"{photos} photos"
     if (confirmed := _median(coverage.confirmed)) > 0.0:
         share = f"{100 * confirmed:.0f}%"
         text += f"; in a typical one, {share} of the points are in at least two others"

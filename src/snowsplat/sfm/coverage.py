@@ -86,8 +86,8 @@ def _steps(seen: np.ndarray, poses: np.ndarray, around: np.ndarray, xyz: np.ndar
     as_floats = seen.astype(np.float32)
     shared = as_floats @ as_floats.T
     neighbours = shared >= np.maximum(1.0, _NEIGHBOURS * seen.sum(1)[:, None])
-    np.fill_diagonal(neighbours, False)
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    neighbours &= apart > 1e-9 * apart.max()  # not itself, nor another view of a wide photo
     nearest = np.where(neighbours, apart, np.inf).min(1)
     depths = np.full(len(poses), np.nan)
     for i, (pose, visible) in enumerate(zip(poses, seen, strict=True)):

@@ -262,8 +262,10 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
             size = f"{width} × {height}"
             rows.append([str(camera["images"]), size, "all directions", camera["model"]])
             continue
-        # The angle of view of a pinhole camera; that of the distorted lens differs a little.
-        angle = math.degrees(2 * math.atan(max(width, height) / 2 / focal)) if focal > 0 else 0.0
+        # The angle of view without distortion; that of the distorted lens differs a little.
+        half = max(width, height) / 2 / focal if focal > 0 else 0.0
+        fisheye = str(camera["model"]).endswith("FISHEYE")
+        angle = math.degrees(2 * (half if fisheye else math.atan(half)))
         parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
         rows.append(
             [
@@ -277,10 +279,13 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     how = "undistorted" if undistorted["resampled"] else "copied, as there is no distortion"
     lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
     zooms = sfm.get("zooms", "")
-    said = f"<p>The photos have {text(zooms)}, so each group of them has its own lens.</p>\n"
+    said = ""
+    if zooms:
+        said = f"<p>The photos have {text(zooms)}, so each group of them has its own lens.</p>\n"
+    if sfm.get("fisheye"):
+        said += f"<p>{text(sfm['fisheye'][0].upper() + sfm['fisheye'][1:])}.</p>\n"
     return (
-        f"<h2>Lenses</h2>\n{said if zooms else ''}{lenses}\n"
-        f'<p class="soft">Images for training: {sizes}, {how}.</p>'
+        f'<h2>Lenses</h2>\n{said}{lenses}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
     )
 
 

@@ -43,7 +43,7 @@ _WIDEST_HALF = 140.0
 _MAX_ANGLE = 89.0
 _POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 # A lens that is no fisheye moves pixels inwards by at most this share.
-_MAX_BARREL = 0.25
+_MAX_BARREL = 0.28
 # An ordinary lens changes the distance of a pixel from the centre by at most this share, in
 # addition to the difference between a pinhole camera and a fisheye lens (r = f θ).
 _MAX_DISPLACEMENT = 0.1
