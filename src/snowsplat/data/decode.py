@@ -222,7 +222,7 @@ def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) 
     if view is None:
         return resize_area(planes, width, height)
     ratio = view.width * planes.shape[2] / (view.lens.width * width)  # pixels of the photo, per one
-    reduced = max(1, int(ratio / _SAMPLES))
+    reduced = max(1, round(ratio / _SAMPLES))
     scale = planes.shape[2] / view.lens.width, planes.shape[1] / view.lens.height
     if reduced > 1:
         planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduced)) for plane in planes])

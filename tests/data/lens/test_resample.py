@@ -55,7 +55,8 @@ def test_a_photo_becomes_that_of_the_pinhole_camera(name):
     assert made.shape == true.shape
     inner = (slice(3, -3), slice(3, -3))
     difference = (made - true)[inner]
-    assert np.sqrt((difference**2).mean()) < 0.5  # bilinear sampling: 1.0 to 1.5
+    # With 0.29 of rounding to 8 bits. Bilinear sampling: 1.0 to 1.5.
+    assert np.sqrt((difference**2).mean()) < 0.6
     assert abs(difference.mean()) < 0.02
     # Displacement by least squares from the gradient, in 3 × 3 parts: none is shifted.
     gradient_y, gradient_x = np.gradient(true, axis=(0, 1))

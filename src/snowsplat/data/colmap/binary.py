@@ -27,7 +27,7 @@ from snowsplat.util.errors import UserError
 _COUNT = struct.Struct("<Q")
 # Id, index into CAMERA_MODELS, width, height. The parameters (doubles) follow.
 _CAMERA_HEAD = struct.Struct("<IiQQ")
-_SMALLEST_CAMERA = _CAMERA_HEAD.size + 2 * 8  # EQUIRECTANGULAR has two parameters
+_SMALLEST_CAMERA = _CAMERA_HEAD.size + 2 * 8
 # Id, quaternion (w, x, y, z), translation, camera id. The name, ended by a zero byte, and the
 # observations follow.
 _IMAGE_HEAD = struct.Struct("<I4d3dI")

@@ -186,15 +186,18 @@ def interpolated(nodes: np.ndarray, width: int, height: int) -> Iterator[tuple[s
     """Rows of an image, and the positions (H, W, 2) float32 of their pixels between the nodes."""
     column, across = _cells(width, nodes.shape[1] - 1)
     row, down = _cells(height, nodes.shape[0] - 1)
-    across, down = across[:, None], down[:, None, None]
     lines = nodes[:, column]
-    lines += (nodes[:, column + 1] - lines) * across
+    lines += (nodes[:, column + 1] - lines) * across[:, None]
     step = max(1, _STRIP_PIXELS // width)
     for first in range(0, height, step):
-        rows = slice(first, min(first + step, height))
-        position = lines[row[rows]]
-        position += (lines[row[rows] + 1] - position) * down[rows]
-        yield rows, position
+        last = min(first + step, height)
+        position = np.empty((last - first, width, 2), np.float32)
+        for cell in range(row[first], row[last - 1] + 1):
+            start, end = np.searchsorted(row, (cell, cell + 1)).clip(first, last)
+            part = position[start - first : end - first]
+            np.multiply(lines[cell + 1] - lines[cell], down[start:end, None, None], out=part)
+            part += lines[cell]
+        yield slice(first, last), position
 
 
 def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from PIL import Image
 from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.views import LensView
 
+_STEPS = 32  # OpenCV divides a pixel into so many positions along each axis
 _MARGIN = 3  # pixels beside a pixel that its spline may need
 
 
@@ -63,12 +64,12 @@ def resampled(
     """
     made: np.ndarray = np.empty((len(planes), height, width), np.uint8)
     margin = _MARGIN if view.wraps else 0
-    if margin:
-        planes = np.pad(planes, ((0, 0), (0, 0), (margin, margin)), mode="wrap")
+    pixels = np.pad(planes.transpose(1, 2, 0), ((0, 0), (margin, margin), (0, 0)), mode="wrap")
     for rows, position in view.strips(width, height):
-        position = np.nan_to_num(position * np.array(scale, np.float32), copy=False, nan=-1.0)
+        position *= np.array(scale, np.float32)
         position[..., 0] += margin
-        _sample(planes, position, made[:, rows])
+        np.nan_to_num(position, copy=False, nan=-1.0)
+        made[:, rows] = _catmull_rom(pixels, position).transpose(2, 0, 1)
     return made
 
 
@@ -87,38 +88,40 @@ def nearest(values: np.ndarray, view: LensView, width: int, height: int) -> np.n
     return made
 
 
-def _sample(planes: np.ndarray, position: np.ndarray, out: np.ndarray) -> None:
-    """Catmull-Rom splines at positions (H, W, 2) of a photo (C, h, w), to ``out`` (C, H, W).
+def _catmull_rom(pixels: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """(H, W, C): a photo (h, w, C) uint8 at positions (H, W, 2) float32, to 1/32 of a pixel.
 
     Kernels of cubic convolution have a free parameter a: the kernel is K₀ + a·G. OpenCV uses
     a = −0.75, which sharpens. Catmull-Rom uses a = −0.5, which is exact for quadratics (Keys 1981).
     So the kernel of Catmull-Rom is 1/3 of K₀ plus 2/3 of OpenCV's. K₀ uses two pixels: it is
     bilinear interpolation with each fraction f replaced by 3f² − 2f³. (Here the results of the 2D
     interpolations are added instead of the 1D kernels. This leaves an error of the fourth order.)
+
+    Changes ``position``.
     """
-    height, width = planes.shape[1:]
-    top, bottom = _needed(position[..., 1], height)
-    left, right = _needed(position[..., 0], width)
-    part = np.ascontiguousarray(planes[:, top:bottom, left:right].transpose(1, 2, 0))
-    position = position - np.array([left + 0.5, top + 0.5], np.float32)
-    cubic = _remap(part, position, cv2.INTER_CUBIC)
-    whole = np.floor(position)
-    position -= whole
-    position *= position * (3 - 2 * position)
-    position += whole
-    bent = _remap(part, position, cv2.INTER_LINEAR)
-    made = cv2.addWeighted(cubic, 2 / 3, bent, 1 / 3, 0).reshape(*position.shape[:2], -1)
-    out[...] = made.transpose(2, 0, 1)
-
-
-def _remap(part: np.ndarray, position: np.ndarray, how: int) -> np.ndarray:
-    made: np.ndarray = cv2.remap(  # type: ignore[call-overload]
-        part, position, None, how, borderMode=cv2.BORDER_REPLICATE
-    )
-    return made
+    top, bottom = _needed(position[..., 1], pixels.shape[0])
+    left, right = _needed(position[..., 0], pixels.shape[1])
+    part = pixels[top:bottom, left:right]
+    position -= np.array([left + 0.5, top + 0.5], np.float32)
+    whole, fraction = cv2.convertMaps(position, None, cv2.CV_16SC2)  # type: ignore[call-overload]
+    border = cv2.BORDER_REPLICATE
+    cubic = cv2.remap(part, whole, fraction, cv2.INTER_CUBIC, borderMode=border)
+    bent = cv2.remap(part, whole, _BENT[fraction], cv2.INTER_LINEAR, borderMode=border)
+    made: np.ndarray = cv2.addWeighted(cubic, 2 / 3, bent, 1 / 3, 0)
+    return made.reshape(*position.shape[:2], -1)
 
 
 def _needed(position: np.ndarray, size: int) -> tuple[int, int]:
     """The pixels of an axis that positions need: the first, and one beyond the last."""
     first = int(np.clip(position.min() - _MARGIN, 0, size - 1))
     return first, int(np.clip(position.max() + _MARGIN, first + 1, size))
+
+
+def _bent_fractions() -> np.ndarray:
+    """For each of OpenCV's fractions, 32·y + x in 1/32 pixels, that of 3f² − 2f³ of both axes."""
+    f = np.arange(_STEPS) / _STEPS
+    bent = np.minimum(np.rint(_STEPS * f * f * (3 - 2 * f)), _STEPS - 1)
+    return (_STEPS * bent[:, None] + bent).ravel().astype(np.uint16)
+
+
+_BENT = _bent_fractions()
