@@ -3,6 +3,7 @@
     python benchmarks/sfm.py                                  real datasets, scenes of 60 photos
     python benchmarks/sfm.py room twins --photos 60 150       scenes of 60 and of 150 photos
     python benchmarks/sfm.py fern rooms-300 --json sfm.json
+    python benchmarks/sfm.py panorama --photos 40             360° panoramas, 1600×800
     python benchmarks/sfm.py room-120s                        a video of two minutes
     python benchmarks/sfm.py room --versus ../before/src      compare another build with this one
     python benchmarks/sfm.py ahead-30 --plain                 beside COLMAP at its defaults

@@ -64,6 +64,18 @@ def loops(
     return _hand_held(positions, targets, random)
 
 
+def level_loops(count: int, seed: int) -> list[Tensor]:
+    """`loops` with a 360° camera on a stick: it turns with the walk, and is level within 1°."""
+    poses = []
+    random = np.random.default_rng([seed, count])
+    for pose in loops(count, seed):
+        view = invert_rigid(pose)
+        ahead = view[:, 2] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        level = look_at(view[:, 3], view[:, 3] + ahead, _UP)
+        poses.append(rolled(level, random.normal(0, 0.017)))
+    return poses
+
+
 def in_between(poses: list[Tensor], count: int) -> list[Tensor]:
     """``count`` poses on a smooth path through ``poses``, from the first to the last."""
     views = invert_rigid(torch.stack(poses))

@@ -10,6 +10,7 @@
     side     a street; the camera looks at the façades of the other side
     turns    a street; the camera walks ahead and turns from side to side
     fisheye  the photos of "room" at the same places, with a fisheye lens of 150°
+    panorama the room; 360° panoramas on the loops of "room", of twice the width
 
 Lengths are in metres, and z is up. The floor is at z = 0, except in "around". Textures depend on
 the seed.
@@ -31,6 +32,7 @@ from sfm_paths import (
     around_corners,
     around_two,
     in_between,
+    level_loops,
     looking_across,
     looking_down,
     loops,
@@ -43,7 +45,7 @@ from torch import Tensor
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.lens import FisheyeLens, Lens
+from snowsplat.synthetic.lens import AnyLens, Equirectangular
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import fisheye_lens, phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
@@ -79,7 +81,7 @@ class Kind:
 
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
-    lens: Callable[[int, int], Lens | FisheyeLens] = phone_lens  # arguments: width, height
+    lens: Callable[[int, int], AnyLens] = phone_lens  # arguments: width, height
 
 
 def cache_folder() -> Path:
@@ -132,7 +134,7 @@ def video_of(
     )
     video = folder / "video.mp4"
     if not video.exists():
-        with video_writer(video, *size, FRAMES_PER_SECOND) as add:
+        with video_writer(video, lens.width, lens.height, FRAMES_PER_SECOND) as add:
             for name in truth.poses:
                 with Image.open(folder / "frames" / name) as frame:
                     add(np.asarray(frame.convert("RGB")))
@@ -413,6 +415,9 @@ KINDS = {
     "ahead": Kind(_street, ahead),
     "side": Kind(_street, to_the_side),
     "turns": Kind(_street, around_corners),
+    "panorama": Kind(
+        _indoors(_room), level_loops, lambda width, _: Equirectangular(2 * width, width)
+    ),
     "fisheye": Kind(
         _indoors(_room), loops, lambda width, height: fisheye_lens(width, height, 150.0)
     ),

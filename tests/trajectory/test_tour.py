@@ -80,3 +80,16 @@ def test_names_are_used_up_to_one_point_six_times_a_short_tour(detours, by_name)
     assert (order == list(range(12))) == by_name
     if not by_name:
         assert [places[i] for i in order] in (list(range(12)), list(range(11, -1, -1)))
+
+
+def test_of_the_views_of_a_panorama_one_is_visited():
+    """Panoramas along x; each has views in four directions, of which one looks along the way."""
+    ways = {"back": (-5, 0), "front": (5, 0), "left": (0, 5), "right": (0, -5)}
+    cameras, names = [], []
+    for i in range(5):
+        for name, (x, z) in ways.items():
+            target = torch.tensor([float(i + x), 0.0, float(z)], dtype=torch.float64)
+            cameras.append(camera_at((float(i), 0.0, 0.0), target))
+            names.append(f"pano_{i}_{name}.jpg")
+    order = in_order(cameras, names, 3.0)
+    assert [names[i] for i in order] == [f"pano_{i}_front.jpg" for i in range(5)]

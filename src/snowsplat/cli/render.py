@@ -26,6 +26,7 @@ class Render(SceneFlags):
       snowsplat render out/garden --path training --seconds 20 --size 1920x1080
       snowsplat render out/garden --path keys.json --side-by-side
       snowsplat render garden.ply --path ellipse --video garden.mp4
+      snowsplat render out/garden --path training --projection equirectangular
 
     Notes:
       Images are written to OUT/test/ours_N/renders (for held-out photos) and
@@ -56,6 +57,13 @@ class Render(SceneFlags):
     """Whether to render for the size of the pixels, as scenes trained with --antialias on are
     rendered. Use it if a scene file from another program lacks this mark."""
 
+    projection: Annotated[
+        Literal["pinhole", "equirectangular"],
+        flag("{pinhole,equirectangular}", default="pinhole"),
+    ] = "pinhole"
+    """equirectangular: 360° pictures of all directions, level, from the places of the photos or
+    along --path: images to OUT/SPLIT/ours_N/panoramas, or a 360° video; --size is their width."""
+
     path: Annotated[str | None, flag("{training,ellipse,spiral,FILE}", default="render images")] = (
         None
     )
@@ -79,19 +87,27 @@ class Render(SceneFlags):
         if self.path is not None:
             self._render_video(self.path)
             return 0
+        around = self.projection == "equirectangular"
         for name in ("seconds", "fps", "size", "side_by_side", "video"):
-            if getattr(self, name):
+            if getattr(self, name) and not (around and name == "size"):
                 raise UserError(f"`{name}` is for videos; add a camera path with --path")
         splits: list[Split] = []
         if self.split != "train" and not self.skip_test:
             splits.append("test")
         if self.split != "test" and not self.skip_train:
             splits.append("train")
-        from snowsplat.pipeline.render import render_images
+        from snowsplat.pipeline.render import render_images, render_panoramas
 
-        rendered = render_images(
-            self.load(), splits=splits, depth=self.depth, antialias=self._antialias()
-        )
+        if around:
+            if self.depth != "none":
+                raise UserError("--projection equirectangular has no depth; leave out --depth")
+            rendered = render_panoramas(
+                self.load(), splits=splits, size=self.size, antialias=self._antialias()
+            )
+        else:
+            rendered = render_images(
+                self.load(), splits=splits, depth=self.depth, antialias=self._antialias()
+            )
         for folder, count in rendered.items():
             print(f"{folder}: {count} images")
         return 0
@@ -119,6 +135,7 @@ class Render(SceneFlags):
             depth=self.depth == "color",
             side_by_side=self.side_by_side,
             antialias=self._antialias(),
+            projection=self.projection,
         )
         with TerminalObserver() as observer:
             render_video(

@@ -58,7 +58,8 @@ class Sfm:
     ] = "normal"
     """Effort to detect and match features. best takes several times as long as normal."""
     camera_model: Annotated[str | None, flag("MODEL", "--camera")] = None
-    """Camera model, by its name in COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE …"""
+    """Camera model, by its name in COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, PINHOLE …;
+    EQUIRECTANGULAR: 360° panoramas whose files do not say so."""
     mapper: Annotated[
         Literal["incremental", "global"], flag("{incremental,global}", default="incremental")
     ] = "incremental"
@@ -128,7 +129,8 @@ class Sfm:
         Compute(threads=self.threads)  # raises an error if there are fewer than 1
         lens: dict[str, Any] = {}
         if self.camera_model is not None:
-            lens["camera_model"] = self.camera_model
+            name = self.camera_model
+            lens["camera_model"] = name if name == "auto" else name.upper()
         return DatasetOptions(
             gather=GatherOptions(fps=self.fps, frames=self.frames, size=self.size),
             sfm=SfmOptions(mapper=self.mapper, effort=self.quality, threads=self.threads, **lens),

@@ -134,6 +134,7 @@ class PosedImage:
     depth: Path | None = None  # as `View.depth`
     depth_unit: float = 1.0  # as `View.depth_unit`
     depth_confidence: Path | None = None  # as `View.depth_confidence`
+    frame: str | None = None  # images of one frame of a rig, taken at one time, share this name
     lens: LensModel | None = None  # of a distorted photo; ``camera`` then has its pose and size
 
     @property

@@ -495,8 +495,9 @@ def _test_names(
     test_list: Path | str | Sequence[str] | None,
 ) -> set[str]:
     names = sorted((image.name for image in posed), key=natural_key)
+    together = _taken_together(posed)
     if test_list is not None:
-        return _listed(names, test_list)
+        return {name for one in _listed(names, test_list, together) for name in together[one]}
     if hold_out is None:
         return set()
     if hold_out < 1:
@@ -505,11 +506,31 @@ def _test_names(
         raise SettingError("first_held_out", f"{first} is not valid; use 0 or more")
     if any(image.split == "test" for image in posed):
         return {image.name for image in posed if image.split == "test"}
-    return set(names[first::hold_out]) or {names[len(names) // 2]}
+    frames = list(dict.fromkeys(together[name] for name in names))
+    chosen = frames[first::hold_out] or [frames[len(frames) // 2]]
+    return {name for frame in chosen for name in frame}
 
 
-def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]:
-    """The image names in a test list; folder and suffix may be omitted if the rest is unique."""
+def _taken_together(posed: list[PosedImage]) -> dict[str, tuple[str, ...]]:
+    """For each image name, those of its frame of a rig, sorted: the views of one panorama, …
+
+    They are held out together, as they show the same from the same place.
+    """
+    frames: dict[str | tuple[str], list[str]] = {}
+    for image in posed:
+        frames.setdefault(image.frame or (image.name,), []).append(image.name)
+    return {name: tuple(sorted(names)) for names in frames.values() for name in names}
+
+
+def _listed(
+    names: list[str],
+    test_list: Path | str | Sequence[str],
+    together: Mapping[str, tuple[str, ...]],
+) -> set[str]:
+    """The image names in a test list; folder and suffix may be omitted if the rest is unique.
+
+    ``together`` is that of `_taken_together`: what is left may also be the name of one frame.
+    """
     if isinstance(test_list, str | Path):
         try:
             if Path(test_list).exists() and not is_file(Path(test_list)):
@@ -529,7 +550,7 @@ def _listed(names: list[str], test_list: Path | str | Sequence[str]) -> set[str]
     listed = set()
     for line in filter(None, (line.strip() for line in lines)):
         matches = {line} if line in names else known.get(line, set())
-        if len(matches) != 1:
+        if len({together[name] for name in matches}) != 1:
             problem = (
                 "is the name of several images" if matches else "is not an image of the dataset"
             )

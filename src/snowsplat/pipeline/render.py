@@ -14,7 +14,9 @@ from snowsplat.data import ImageLoader, View
 from snowsplat.pipeline.evaluate import Split
 from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_source import TrainedScene
+from snowsplat.pipeline.videos import level_cameras, panorama_width
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.panorama import PanoramaRenderer
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
@@ -48,20 +50,74 @@ def render_images(
         UserError: there are no views in these splits, or a photo is damaged.
         OSError: an image cannot be written.
     """
-    views = {"test": scene.dataset.test, "train": scene.dataset.train}
-    chosen = {split: views[split] for split in splits if views[split]}
-    if not chosen:
-        raise UserError(
-            "no views to render: no photos were held out for testing; use the `split` train"
-        )
-    if antialias is not None:
-        scene = replace(scene, gaussians=replace(scene.gaussians, antialiased=antialias))
+    scene, chosen = _chosen(scene, splits, antialias)
     rendered = {}
     for split, of_split in chosen.items():
         target = scene.folder.path / split / f"ours_{scene.iteration}"
         _render(scene, of_split, target, depth)
         rendered[target / "renders"] = len(of_split)
     return rendered
+
+
+def render_panoramas(
+    scene: TrainedScene,
+    *,
+    splits: Sequence[Split] = ("test", "train"),
+    size: str | None = None,
+    antialias: bool | None = None,
+) -> dict[Path, int]:
+    """Render all directions from the places of the photos into OUT/SPLIT/ours_N/panoramas.
+
+    The files 00000.jpg … are equirectangular, and their metadata say so (GPano). Their horizon is
+    level and their centre is in the direction of the photo. Photos from one place have one picture;
+    for the views of a panorama, its centre is that of the panorama.
+
+    Args:
+        size: the width, twice the height, in pixels, e.g. "3840"; default: 3840.
+        antialias: as in `render_images`.
+
+    Returns:
+        The folders and the number of images in each.
+
+    Raises:
+        UserError: there are no views in these splits, or the size is not possible.
+        OSError: an image cannot be written.
+    """
+    scene, chosen = _chosen(scene, splits, antialias)
+    device = scene.gaussians.means.device
+    renderer = PanoramaRenderer(panorama_width(size), device)
+    color = torch.tensor(scene.background, device=device)
+    rendered = {}
+    for split, views in chosen.items():
+        folder = scene.folder.path / split / f"ours_{scene.iteration}" / "panoramas"
+        folder.mkdir(parents=True, exist_ok=True)
+        places: list[Camera] = []
+        for view, camera in zip(views, level_cameras([v.camera for v in views]), strict=True):
+            same = (i for i, p in enumerate(places) if torch.allclose(camera.position, p.position))
+            i = next(same, len(places))
+            if i == len(places) or Path(view.name).stem.endswith("_front"):  # see `lens_views`
+                places[i : i + 1] = [camera]
+        for i, camera in enumerate(places):
+            with torch.no_grad():
+                image = renderer.render(scene.gaussians, camera.cam_from_world, color)
+            image_files.write_panorama(folder / f"{i:05d}.jpg", image_files.to_8bit(image))
+        rendered[folder] = len(places)
+    return rendered
+
+
+def _chosen(
+    scene: TrainedScene, splits: Sequence[Split], antialias: bool | None
+) -> tuple[TrainedScene, dict[Split, Sequence[View]]]:
+    """The scene with the mark ``antialias`` if given, and the views of the splits that have any."""
+    views = {"test": scene.dataset.test, "train": scene.dataset.train}
+    chosen: dict[Split, Sequence[View]] = {s: views[s] for s in splits if views[s]}
+    if not chosen:
+        raise UserError(
+            "no views to render: no photos were held out for testing; use the `split` train"
+        )
+    if antialias is not None:
+        scene = replace(scene, gaussians=replace(scene.gaussians, antialiased=antialias))
+    return scene, chosen
 
 
 def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Depth) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,11 +23,15 @@ from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.orientation import scene_up
+from snowsplat.scene.panorama import PanoramaRenderer, level_pose
 from snowsplat.scene.render import render
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import remove_temporaries
 from snowsplat.util.stages import Outcome
+
+Projection = Literal["pinhole", "equirectangular"]
 
 #: The camera paths that are computed from the cameras of a training run.
 CAMERA_PATHS = ("training", "ellipse", "spiral")
@@ -33,6 +39,7 @@ CAMERA_PATHS = ("training", "ellipse", "spiral")
 _LONGEST_SIDE = 1920  # of a video without a requested size
 _SMALLEST, _LARGEST = 16, 8192  # pixels along a side
 _MAX_FRAMES = 100_000
+_PANORAMA_WIDTH = 3840  # of a 360° picture without a requested size
 _RANGE_FRAMES = 8  # number of frames that determine the range of the depth colours
 
 
@@ -81,6 +88,32 @@ class VideoSize:
         return width, height
 
 
+def panorama_width(size: str | None) -> int:
+    """The width of a panorama of the requested size, in pixels.
+
+    Raises:
+        UserError: ``size`` is no size of a panorama.
+    """
+    wanted = VideoSize.parse(size)
+    width = wanted.width or _PANORAMA_WIDTH
+    if width % 4 or wanted.height not in (None, width // 2):
+        raise SettingError(
+            "size",
+            f"{size} is no size of a 360° picture, which is twice as wide as high with a width "
+            "that is a multiple of 4; use e.g. 3840",
+        )
+    return width
+
+
+def level_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras turned so that their horizons are level, which players of 360° videos expect."""
+    up = scene_up(np.array([camera.cam_from_world[:, :3].cpu().numpy() for camera in cameras]))
+    return [
+        dataclasses.replace(camera, cam_from_world=level_pose(camera.cam_from_world, up))
+        for camera in cameras
+    ]
+
+
 @dataclass(frozen=True)
 class VideoOptions:
     """Options of a video: camera path, length, size, depth.
@@ -96,6 +129,7 @@ class VideoOptions:
         depth: render a second video that shows the depth in colours.
         side_by_side: render only one video, with colour on the left and depth on the right.
         antialias: whether to render with the 2D mip filter, see `Gaussians`; None: as trained.
+        projection: "equirectangular": a 360° video, level, with the heading of the cameras.
 
     Raises:
         UserError: an unusable length, rate or size.
@@ -108,6 +142,7 @@ class VideoOptions:
     depth: bool = False
     side_by_side: bool = False
     antialias: bool | None = None
+    projection: Projection = "pinhole"
 
     def __post_init__(self) -> None:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
@@ -119,6 +154,10 @@ class VideoOptions:
                 f"{self.seconds:g} with `fps` {self.fps:g} is more than {_MAX_FRAMES:,} frames; "
                 "make the video shorter",
             )
+        if self.projection == "equirectangular":
+            if self.depth or self.side_by_side:
+                raise SettingError("projection", "equirectangular has no depth; render it alone")
+            panorama_width(self.size)
         VideoSize.parse(self.size)
 
     @property
@@ -130,7 +169,8 @@ class VideoOptions:
     def name(self) -> str:
         """The name of the file, without its suffix."""
         name = self.path if Path(self.path).suffix == "" else Path(self.path).stem
-        return f"{name}_side_by_side" if self.side_by_side else name
+        around = self.projection == "equirectangular"
+        return name + "_side_by_side" * self.side_by_side + "_360" * around
 
 
 def render_video(
@@ -173,9 +213,14 @@ def render_video(
         options.frames,
         VideoSize.parse(options.size),
     )
+    around = None
+    if options.projection == "equirectangular":
+        around = PanoramaRenderer(panorama_width(options.size), device)
+        cameras = level_cameras(cameras)
     video = Video(
         gaussians=gaussians,
         cameras=cameras,
+        around=around,
         background=source.background,
         file=source.file if target is None else Path(target),
         fps=options.fps,
@@ -261,6 +306,7 @@ class Video:
 
     Attributes:
         cameras: one per frame. All have the same size, with even width and height.
+        around: renders all directions from the places of the cameras; None: what the cameras see.
         file: the file of the colour video; that of the depth has _depth in its name.
         depth: also render a video of the depth.
         side_by_side: one video instead, with colour on the left and depth on the right.
@@ -268,6 +314,7 @@ class Video:
 
     gaussians: Gaussians
     cameras: Sequence[Camera]
+    around: PanoramaRenderer | None
     background: tuple[float, float, float]
     file: Path
     fps: float
@@ -281,7 +328,7 @@ class Video:
             UserError: a file cannot be written.
             KeyboardInterrupt: Ctrl-C; no file is left.
         """
-        first = self.cameras[0]
+        first = self.around or self.cameras[0]
         width, height = first.width, first.height
         files = self._files()
         with torch.no_grad(), ExitStack() as stack:
@@ -291,7 +338,15 @@ class Video:
             remove_temporaries(self.file.parent, [file.name for file, _ in files])
             near, far = self._depth_range()
             adds = [
-                stack.enter_context(video_writer(file, factor * width, height, self.fps))
+                stack.enter_context(
+                    video_writer(
+                        file,
+                        factor * width,
+                        height,
+                        self.fps,
+                        panorama=self.around is not None,
+                    )
+                )
                 for file, factor in files
             ]
             for i, camera in enumerate(self.cameras):
@@ -331,6 +386,9 @@ class Video:
     def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
         with_depth = self.depth or self.side_by_side
         background = torch.tensor(self.background)
+        if self.around is not None:
+            pose = camera.cam_from_world
+            return image_files.to_8bit(self.around.render(self.gaussians, pose, background)), None
         output = render(self.gaussians, camera, background, with_depth=with_depth)
         depth = None if output.depth is None else image_files.mean_depth(output.depth, output.alpha)
         return image_files.to_8bit(output.image), depth

@@ -1,6 +1,7 @@
 """How well photos cover a scene: steps from photo to photo, and points that several photos show.
 
-Everything is measured on the points of a COLMAP model and the photos that observe them.
+Everything is measured on the points of a COLMAP model and the photos that observe them. The views
+of a panorama or of a wide lens are one photo.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.util.natural_order import natural_key
 
 #: At most about this number of points is measured.
@@ -29,7 +31,8 @@ class Coverage:
             points.
         step: (N,) distance to the nearest photo that shows the same, divided by the median depth
             of the points; infinite if no photo shows the same.
-        directions: (N,) angle in degrees between the optical axis and the mean of all axes.
+        directions: (N,) angle in degrees between the optical axis and the mean of all axes; 180
+            for a panorama.
     """
 
     names: list[str]
@@ -50,17 +53,22 @@ def measure_coverage(model: Path) -> Coverage:
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction(model)
-    images = sorted(reconstruction.images.values(), key=lambda image: natural_key(image.name))
-    row = {image.image_id: i for i, image in enumerate(images)}
+    photos: dict[str, list[pycolmap.Image]] = {}
+    for frame in reconstruction.frames.values():
+        images = [reconstruction.image(data.id) for data in frame.image_ids]
+        photos[photo_of(images[0].name) if len(images) > 1 else images[0].name] = images
+    names = sorted(photos, key=natural_key)
+    row = {image.image_id: i for i, name in enumerate(names) for image in photos[name]}
     ids = sorted(reconstruction.point3D_ids())
     points = [reconstruction.point3D(i) for i in ids[:: -(-len(ids) // _POINTS) or 1]]
     xyz = np.array([point.xyz for point in points]).reshape(-1, 3)
-    seen = np.zeros((len(images), len(points)), bool)
+    seen = np.zeros((len(names), len(points)), bool)
     for column, point in enumerate(points):
         seen[[row[element.image_id] for element in point.track.elements], column] = True
-    poses = np.array([image.cam_from_world().matrix() for image in images])
-    names = [image.name for image in images]
-    return Coverage(names, _confirmed(seen), _steps(seen, poses, xyz), _directions(poses))
+    poses = np.array([photos[name][0].cam_from_world().matrix() for name in names])
+    around = np.array([len(photos[name]) > 1 for name in names])
+    directions = np.where(around, 180.0, _directions(poses))
+    return Coverage(names, _confirmed(seen), _steps(seen, poses, around, xyz), directions)
 
 
 def _confirmed(seen: np.ndarray) -> np.ndarray:
@@ -70,8 +78,11 @@ def _confirmed(seen: np.ndarray) -> np.ndarray:
     return np.where(count > 0, (seen & enough).sum(1) / np.maximum(count, 1), np.nan)
 
 
-def _steps(seen: np.ndarray, poses: np.ndarray, xyz: np.ndarray) -> np.ndarray:
-    """`Coverage.step`; poses (N, 3, 4) are cam_from_world, points (P, 3) are in the world."""
+def _steps(seen: np.ndarray, poses: np.ndarray, around: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """`Coverage.step`; poses (N, 3, 4) are cam_from_world, points (P, 3) are in the world.
+
+    ``around`` (N,): it is a panorama; the depth of its points is their distance.
+    """
     centres = -(poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, 3:])[:, :, 0]
     as_floats = seen.astype(np.float32)
     shared = as_floats @ as_floats.T
@@ -82,7 +93,8 @@ def _steps(seen: np.ndarray, poses: np.ndarray, xyz: np.ndarray) -> np.ndarray:
     depths = np.full(len(poses), np.nan)
     for i, (pose, visible) in enumerate(zip(poses, seen, strict=True)):
         if visible.any():
-            depths[i] = np.median(xyz[visible] @ pose[2, :3] + pose[2, 3])
+            points = xyz[visible] @ pose[:, :3].T + pose[:, 3]
+            depths[i] = np.median(np.linalg.norm(points, axis=1) if around[i] else points[:, 2])
     steps: np.ndarray = np.where(depths > 0, nearest / np.where(depths > 0, depths, 1.0), np.inf)
     return steps
 

@@ -21,7 +21,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,7 +29,7 @@ from typing import Any, Protocol
 from snowsplat.data.placement import PLACEMENT
 from snowsplat.sfm.capture_verdict import capture_verdict
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
-from snowsplat.sfm.colmap.options import thread_count
+from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
 from snowsplat.sfm.coverage import measure_coverage
 from snowsplat.sfm.dataset_report import REPORT, write_report
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
@@ -162,12 +162,17 @@ def _run(
         if outcomes[name].again:
             left.finished_before(name)
 
-    def gather_photos(report: Report) -> dict[str, Any]:
-        return _gather(sources, folder, options.gather, report, in_place)
+    chosen_photos = options.gather
+    if options.sfm.camera_model == PANORAMA_MODEL:
+        chosen_photos = replace(chosen_photos, panoramas=True)
 
-    chosen = asdict(options.gather)
-    if chosen["photos"] is None:  # earlier versions did not have this setting
-        del chosen["photos"]
+    def gather_photos(report: Report) -> dict[str, Any]:
+        return _gather(sources, folder, chosen_photos, report, in_place)
+
+    chosen = asdict(chosen_photos)
+    for name, default in (("photos", None), ("panoramas", False)):
+        if chosen[name] == default:  # earlier versions did not have these settings
+            del chosen[name]
     stage(
         "photos",
         {"input": _fingerprint(sources.paths), **chosen},
@@ -199,7 +204,7 @@ def _run(
 
     def write(report: Report) -> dict[str, Any]:
         sfm, coverage = outcomes["poses"].result, measure_coverage(folder / "sparse" / "0")
-        bad = problems(folder / "images", coverage.names)
+        bad = problems(folder / "input", coverage.names)
         verdict = capture_verdict(coverage, sfm, bad)
         facts = {
             "inputs": stages.about["inputs"],

@@ -17,7 +17,9 @@ from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.placement import Placement, placement_of
 from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.evaluation import verdict
+from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.more_photos import Advice, advice
+from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -80,12 +82,16 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
 def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
     sequences = {photo["name"]: photo["sequence"] for photo in facts["gathered"]["photos"]}
     model = read_model(dataset / "sparse" / "0")
-    photos = []
+    photos, drawn = [], set[str]()
     for image in model.images:
         camera = posed_camera(model, image)
         half = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
         pose = camera.cam_from_world.numpy()
-        photos.append(PlacedPhoto(printable(image.name), sequences.get(image.name), pose, *half))
+        # One of several views of a photo stands for the others in the line of a video.
+        photo = photo_of(image.name) if image.number in model.frames else image.name
+        sequence = None if photo in drawn else sequences.get(photo)
+        drawn.add(photo)
+        photos.append(PlacedPhoto(printable(image.name), sequence, pose, *half))
     return photos
 
 
@@ -153,7 +159,7 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
 
 def _bad_photos(dataset: Path, bad: dict[str, str]) -> str:
     rows = [
-        [picture(_thumbnail(dataset / "images" / name), name), text(name), text(problem)]
+        [picture(_thumbnail(_file_of(dataset, name)), name), text(name), text(problem)]
         for name, problem in list(bad.items())[:_MAX_THUMBNAILS]
     ]
     rest = "" if len(bad) <= _MAX_THUMBNAILS else f", and {len(bad) - _MAX_THUMBNAILS:,} more"
@@ -231,6 +237,12 @@ def _strip(dataset: Path, names: Sequence[str]) -> str:
     return f'<h2>Images</h2>\n<div class="strip">{images}</div>'
 
 
+def _file_of(dataset: Path, photo: str) -> Path:
+    """The undistorted photo, or the photo itself if it became several views."""
+    path = dataset / "images" / photo
+    return path if path.is_file() else dataset / "input" / photo
+
+
 def _thumbnail(path: Path) -> Image.Image:
     with Image.open(path) as image:
         image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # faster JPEG decoding
@@ -247,6 +259,10 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     rows = []
     for camera in sfm["cameras"]:
         width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
+        if camera["model"] == PANORAMA_MODEL:
+            size = f"{width} × {height}"
+            rows.append([str(camera["images"]), size, "all directions", camera["model"]])
+            continue
         # The angle of view without distortion; that of the distorted lens differs a little.
         half = max(width, height) / 2 / focal if focal > 0 else 0.0
         fisheye = str(camera["model"]).endswith("FISHEYE")

@@ -20,6 +20,8 @@ _FEWEST = 3
 # Photos surround a subject if they look at it from directions that cover at least half of a circle.
 # Then a gap of at least 40 degrees between them is worth a photo.
 _SURROUND, _GAP = math.radians(180), math.radians(40)
+# Photos from one place are nearer to one another than this, in units of the largest distance.
+_SAME_PLACE = 1e-6
 # Directions of a gap are suggested at this distance from one another.
 _SPACING = math.radians(20)
 # A photo is far from the others if the nearest one is this many times as far away as usual.
@@ -98,7 +100,8 @@ def _gaps_around(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarra
 def _lonely(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, str]]:
     """Places between photos that are far from all others and their nearest neighbours."""
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
+    # The photo itself, and other photos from its place, such as the views of a panorama.
+    apart[apart <= _SAME_PLACE * apart.max()] = np.inf
     nearest = apart.min(1)
     usual = float(np.median(nearest))
     lonely = np.flatnonzero(nearest > max(_FAR * usual, 1e-9))

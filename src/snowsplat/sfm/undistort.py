@@ -97,7 +97,8 @@ def undistort(
 ) -> Undistorted:
     """Make ``images/``, ``masks/`` and ``sparse/0`` of a dataset whose poses are known.
 
-    Photos without a pose are left out. Files keep their names and formats: JPEG is saved at quality
+    Photos without a pose are left out. Those of a wide lens and panoramas become several images;
+    see `in_views`. Files keep their names and formats: JPEG is saved at quality
     95 without chroma subsampling, all others without loss, with transparency. If a camera has no
     distortion, its photos are copied. A mask is written for each photo that has one, unless all
     masked pixels are transparent in the image. The model is written last.
@@ -141,9 +142,16 @@ def undistort(
             views = [(image.name, pinholes[image.camera_id])]
         jobs.append(_Job(image.name, size, views, has_mask))
     jobs.sort(key=lambda job: job.name)
+    count = Counter(name for job in jobs for name, _ in job.views)
+    for name in (name for name, times in count.items() if times > 1):
+        raise UserError(
+            f"{dataset / 'images' / name}: is the name of a photo and of a part of one; "
+            "rename this photo"
+        )
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
-    pixels = max(view.width * view.height for job in jobs for _, view in job.views)
+    pixels = max(w * h for w, h in (job.camera_size for job in jobs))
+    pixels = max(pixels, *(view.width * view.height for job in jobs for _, view in job.views))
     threads = min(
         threads or min(4, os.cpu_count() or 1),
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
@@ -167,12 +175,14 @@ def undistort(
 def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
     """The pinhole views of a lens with a field of view of more than 120°; empty: it is not wide.
 
+    A panorama has six, the sides of a cube with a margin.
+
     ``masks``: of photos of the camera. If they mask what is outside of an image circle, the views
     show only the circle.
     """
     lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     try:
-        views = lens_views(lens, _circle(camera, masks))
+        views = lens_views(lens, None if camera.is_spherical() else _circle(camera, masks))
     except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
         return ()
     return () if views[0].rotation is None else views

@@ -1,7 +1,11 @@
-"""Cameras with lens distortion: COLMAP's OPENCV and OPENCV_FISHEYE with a single focal length."""
+"""Cameras with lens distortion: COLMAP's OPENCV and OPENCV_FISHEYE with a single focal length.
+
+And the camera of a 360° panorama.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -120,3 +124,37 @@ class FisheyeLens:
         k1, k2, k3, k4 = self.distortion
         squared = angle * angle
         return angle * (1 + squared * (k1 + squared * (k2 + squared * (k3 + squared * k4))))
+
+
+@dataclass(frozen=True)
+class Equirectangular:
+    """The camera of a 360° panorama, in COLMAP's model EQUIRECTANGULAR.
+
+    A column is a longitude and a row is a latitude: the direction (0, 0, 1) is at the centre of the
+    image, (1, 0, 0) a quarter of the width to the right, and (0, 1, 0) in the last row.
+    """
+
+    width: int
+    height: int
+    model: ClassVar[str] = "EQUIRECTANGULAR"
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (3, P) in the camera's frame, of pixel positions (2, P)."""
+        longitude = (pixels[0] / self.width - 0.5) * 2 * math.pi
+        latitude = (pixels[1] / self.height - 0.5) * math.pi
+        level = np.cos(latitude)
+        return np.stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)])
+
+    @property
+    def focal(self) -> float:
+        """Pixels per radian at the equator."""
+        return self.width / (2 * math.pi)
+
+    @property
+    def params(self) -> tuple[float, ...]:
+        """Parameters of COLMAP's EQUIRECTANGULAR: the width and the height in pixels."""
+        return (float(self.width), float(self.height))
+
+
+#: The camera of a photo.
+AnyLens = Lens | FisheyeLens | Equirectangular

@@ -15,9 +15,10 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.panorama import panorama_xmp
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
-from snowsplat.synthetic.lens import FisheyeLens, Lens
+from snowsplat.synthetic.lens import AnyLens, Equirectangular, FisheyeLens, Lens
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
@@ -39,7 +40,7 @@ _JPEG_QUALITY = 92
 class Truth:
     """The true lens and poses of the photos."""
 
-    lens: Lens | FisheyeLens
+    lens: AnyLens
     poses: dict[str, Tensor]  # photo name -> cam_from_world (3, 4) float64, metres, z up
 
     def write(self, folder: Path) -> None:
@@ -102,7 +103,7 @@ def fisheye_lens(
 def take_photos(
     folder: Path | str,
     build: Callable[[], Scene],
-    lens: Lens | FisheyeLens,
+    lens: AnyLens,
     poses: Sequence[Tensor],
     seed: int = 0,
     report: Report = silent,
@@ -172,7 +173,7 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 
 def photograph(
     scene: Scene,
-    lens: Lens | FisheyeLens,
+    lens: AnyLens,
     cam_from_world: Tensor,
     random: np.random.Generator,
     passing: Scene | None = None,
@@ -215,7 +216,7 @@ def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
 
 
 @functools.lru_cache(1)
-def _tiles(lens: Lens | FisheyeLens) -> list[tuple[slice, slice, np.ndarray]]:
+def _tiles(lens: AnyLens) -> list[tuple[slice, slice, np.ndarray]]:
     """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""
     tiles = []
     for top in range(0, lens.height, _TILE):
@@ -234,7 +235,7 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
     return np.rint(255 * srgb).astype(np.uint8)
 
 
-def _save(path: Path, pixels: np.ndarray, lens: Lens | FisheyeLens) -> None:
+def _save(path: Path, pixels: np.ndarray, lens: AnyLens) -> None:
     """Save a JPEG. Frames of an action camera, which has a fisheye lens, have no focal length."""
     image = Image.fromarray(pixels)
     exif = Image.Exif()
@@ -242,4 +243,6 @@ def _save(path: Path, pixels: np.ndarray, lens: Lens | FisheyeLens) -> None:
     exif[0x0112] = 1  # Orientation: as stored
     if isinstance(lens, Lens):
         exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
-    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif)
+    around = isinstance(lens, Equirectangular)
+    xmp = {"xmp": panorama_xmp(*image.size)} if around else {}
+    image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif, **xmp)

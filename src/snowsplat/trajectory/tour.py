@@ -22,7 +22,8 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
     """Indices of the cameras in the order of a path.
 
     Photos of a walk and frames of a video are named in the order in which they were taken. Other
-    cameras are visited by a tour with small changes of position and direction.
+    cameras are visited by a tour with small changes of position and direction. Of the views of a
+    panorama, only one is visited.
 
     Args:
         cameras: the cameras.
@@ -30,6 +31,7 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
         distance: world units from the cameras to what they see.
     """
     by_name = sorted(range(len(names)), key=lambda i: natural_key(names[i]))
+    by_name = _one_per_place(cameras, by_name)
     step = -(-len(by_name) // MOST_CAMERAS)
     by_name = by_name[::step]
     chosen = [cameras[i] for i in by_name]
@@ -39,6 +41,25 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
     as_named = list(range(len(by_name)))
     use_names = _length(lengths, as_named) <= _LONGEST_BY_NAME * _length(lengths, tour)
     return [by_name[i] for i in (as_named if use_names else tour)]
+
+
+def _one_per_place(cameras: Sequence[Camera], order: list[int]) -> list[int]:
+    """The cameras of ``order``; of those that follow one another at one place, only the one that
+    looks most in the direction of the way to the next place.
+    """
+    centres, ahead = positions_of(cameras), rotations_of(cameras)[:, 2]
+    places: list[list[int]] = []
+    for i in order:
+        if places and torch.allclose(centres[i], centres[places[-1][0]]):
+            places[-1].append(i)
+        else:
+            places.append([i])
+    chosen = []
+    for k, place in enumerate(places):
+        start, end = (k, k + 1) if k + 1 < len(places) else (max(0, k - 1), k)
+        way = centres[places[end][0]] - centres[places[start][0]]
+        chosen.append(max(place, key=lambda i: float(ahead[i] @ way)))
+    return chosen
 
 
 def short_tour(lengths: Tensor) -> list[int]:

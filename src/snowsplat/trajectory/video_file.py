@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.trajectory.spherical_metadata import mark_as_spherical
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
@@ -27,7 +28,7 @@ _LIMITED_RANGE = 1
 
 @contextmanager
 def video_writer(
-    path: Path, width: int, height: int, fps: float
+    path: Path, width: int, height: int, fps: float, *, panorama: bool = False
 ) -> Iterator[Callable[[np.ndarray], None]]:
     """Write a video: the context is a function that adds a frame, (height, width, 3) uint8 RGB.
 
@@ -43,6 +44,7 @@ def video_writer(
         width: pixels, even, because colours are stored per 2×2 pixels.
         height: pixels, even.
         fps: frames per second.
+        panorama: each frame is an equirectangular image of all directions; the file says so.
 
     Raises:
         ValueError: the size is odd, the rate is not positive, or a frame has another size.
@@ -74,23 +76,23 @@ def video_writer(
 
     encoder = _encoder()
     try:
-        with (
-            atomic_path(path) as temporary,
-            av.open(
+        with atomic_path(path) as temporary:
+            with av.open(
                 str(temporary), "w", format="mp4", options={"movflags": "+faststart"}
-            ) as container,
-        ):
-            stream = container.add_stream(encoder, rate=rate)
-            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            codec = stream.codec_context
-            codec.color_primaries = codec.color_trc = codec.colorspace = _BT709
-            codec.color_range = _LIMITED_RANGE
-            if encoder == "libx264":
-                stream.options = {"crf": _CRF}
-            else:
-                stream.bit_rate = round(_BITS_PER_PIXEL * width * height * rate)
-            yield add
-            container.mux(stream.encode(None))
+            ) as container:
+                stream = container.add_stream(encoder, rate=rate)
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                codec = stream.codec_context
+                codec.color_primaries = codec.color_trc = codec.colorspace = _BT709
+                codec.color_range = _LIMITED_RANGE
+                if encoder == "libx264":
+                    stream.options = {"crf": _CRF}
+                else:
+                    stream.bit_rate = round(_BITS_PER_PIXEL * width * height * rate)
+                yield add
+                container.mux(stream.encode(None))
+            if panorama:
+                mark_as_spherical(temporary)
     except av.FFmpegError as error:
         reason = error.strerror or str(error)
         raise UserError(

@@ -69,6 +69,13 @@ def test_the_worst_photos_are_named(dataset):
     assert "of what it shows is in at most two training photos" in lonely.reasons[0].text
 
 
+def test_a_photo_without_contrast_is_not_wrong(dataset):
+    """Of a white ceiling, errors of one grey level are all of the contrast."""
+    ceiling = evaluation(0.95, 0.96, 0.97)
+    ceiling.views[1] = ViewMetrics("view_04.png", 48.0, 0.99, 48.0, None, -1.0)
+    assert "looks wrong" not in told(scene_verdict(ceiling, SHARP, dataset))
+
+
 def test_what_the_training_has_found(dataset):
     good = evaluation(0.95, 0.96, 0.97)
     verdict = scene_verdict(good, SHARP, dataset, left_out=["a.png"], spread=0.4, poses="off by 3")

@@ -32,6 +32,10 @@ _SMALLEST_CAMERA = _CAMERA_HEAD.size + 2 * 8
 # observations follow.
 _IMAGE_HEAD = struct.Struct("<I4d3dI")
 _SMALLEST_IMAGE = _IMAGE_HEAD.size + 1 + _COUNT.size
+# Id, rig id, pose, number of sensor data. The data follow: kind and id of the sensor, image id.
+_FRAME_HEAD = struct.Struct("<II7dI")
+_FRAME_DATA = struct.Struct("<iIQ")
+_CAMERA = 0  # the kind of sensor
 # x, y and point id.
 _OBSERVATION_BYTES = 24
 # Id, xyz, rgb, reprojection error, track length. The track follows, 8 bytes per element.
@@ -124,13 +128,34 @@ def read_images(path: Path) -> list[ColmapImage]:
     check_count(path, "images", cursor.count)
     images = []
     for _ in range(cursor.count):
-        _, *pose, camera_id = cursor.take(_IMAGE_HEAD)
+        number, *pose, camera_id = cursor.take(_IMAGE_HEAD)
         name = cursor.take_string()
         (observations,) = cursor.take(_COUNT)
         cursor.skip(_OBSERVATION_BYTES * observations)
-        images.append(ColmapImage(name, camera_id, tuple(pose)))
+        images.append(ColmapImage(name, camera_id, tuple(pose), number))
     cursor.finish()
     return images
+
+
+def read_frames(path: Path) -> list[tuple[int, list[int]]]:
+    """Read a frames.bin: the id of each frame and the ids of its images.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    cursor = _Cursor(path, "frames", _FRAME_HEAD.size)
+    check_count(path, "frames", cursor.count)
+    frames = []
+    for _ in range(cursor.count):
+        number, *_, count = cursor.take(_FRAME_HEAD)
+        images = []
+        for _ in range(count):  # ends with the file
+            kind, _, image = cursor.take(_FRAME_DATA)
+            if kind == _CAMERA:
+                images.append(image)
+        frames.append((number, images))
+    cursor.finish()
+    return frames
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ The format: https://colmap.github.io/format.html
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from snowsplat.data.colmap import text as text_files
 from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel, PointRecords
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.util.errors import UserError
+
+logger = logging.getLogger(__name__)
 
 
 def model_is_text(folder: Path) -> bool | None:
@@ -53,7 +56,22 @@ def read_model(folder: Path) -> ColmapModel:
     else:
         cameras = binary_files.read_cameras(folder / "cameras.bin")
         images = binary_files.read_images(folder / "images.bin")
-    return ColmapModel(folder, is_text, cameras, sorted(images, key=lambda image: image.name))
+    ordered = sorted(images, key=lambda image: image.name)
+    return ColmapModel(folder, is_text, cameras, ordered, _read_frames(folder, is_text))
+
+
+def _read_frames(folder: Path, is_text: bool) -> dict[int, int]:
+    """`ColmapModel.frames`; empty with a warning if the file is damaged: it is used for no pose."""
+    path = folder / ("frames.txt" if is_text else "frames.bin")
+    if not path.is_file():  # of COLMAP before version 3.12
+        return {}
+    try:
+        read = text_files.read_frames if is_text else binary_files.read_frames
+        frames = read(path)
+    except UserError as error:
+        logger.warning("%s", error)
+        return {}
+    return {image: number for number, images in frames if len(images) > 1 for image in images}
 
 
 def read_points(folder: Path) -> Points | None:

@@ -102,9 +102,15 @@ def _images_on_disk(root: Path, images: str, model: ColmapModel) -> list[PosedIm
             continue
         where, file, name = places[image.name]
         camera, lens = posed_camera(model, image), _lens(model.cameras[image.camera_id])
+        frame = model.frames.get(image.number)
         posed.append(
             PosedImage(
-                safe_name(name), camera, where, file, lens=None if is_pinhole(lens) else lens
+                safe_name(name),
+                camera,
+                where,
+                file,
+                frame=None if frame is None else str(frame),
+                lens=None if is_pinhole(lens) else lens,
             )
         )
     if missing:

@@ -26,7 +26,9 @@ from snowsplat.util.files import shown
 
 logger = logging.getLogger(__name__)
 
-# A camera has at most 4 + 12 words. More are not split, to limit the memory for a damaged line.
+# More words of a line are not split, to limit the memory for a damaged one. A camera has at most
+# 4 + 16 words; a frame has 10, and three for each of its images.
+_MAX_FRAME_WORDS = 10 + 3 * 1000
 _MAX_CAMERA_WORDS = 20
 # Characters of the name of an image.
 _LONGEST_NAME = 1000
@@ -122,7 +124,7 @@ def read_images(path: Path) -> list[ColmapImage]:
             words = line.split(maxsplit=9)
             try:
                 pose = tuple(map(float, words[1:8]))
-                images.append(ColmapImage(words[9], int(words[8]), pose))
+                images.append(ColmapImage(words[9], int(words[8]), pose, int(words[0])))
             except (ValueError, IndexError):
                 raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
             check_count(path, "images", len(images))
@@ -151,6 +153,24 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def read_frames(path: Path) -> list[tuple[int, list[int]]]:
+    """Read a frames.txt: the id of each frame and the ids of its images.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    frames = []
+    for line in filter(None, _lines(path)):
+        words = line.split(maxsplit=_MAX_FRAME_WORDS)
+        try:
+            data = zip(words[10::3], words[12::3], strict=True)
+            frames.append((int(words[0]), [int(image) for kind, image in data if kind == "CAMERA"]))
+        except (ValueError, IndexError):
+            raise damaged(path, f"not a frame: line {shown(line[:60])!r}") from None
+        check_count(path, "frames", len(frames))
+    return frames
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

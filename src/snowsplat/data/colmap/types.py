@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +55,7 @@ class ColmapImage:
     name: str  # relative to the image folder
     camera_id: int
     pose: tuple[float, ...]  # cam_from_world: quaternion (w, x, y, z), then translation (x, y, z)
+    number: int = field(default=0, compare=False)  # the image id, in files that were read
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,8 @@ class ColmapModel:
     text: bool  # read from .txt files, not from .bin
     cameras: Mapping[int, ColmapCamera]  # by camera id
     images: Sequence[ColmapImage]  # sorted by name
+    # Image id -> frame id, of images that were taken at one time by the cameras of a rig.
+    frames: Mapping[int, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

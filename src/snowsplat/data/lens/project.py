@@ -174,6 +174,9 @@ def directions(lens: LensModel, pixels: np.ndarray) -> np.ndarray:
     fx, fy, cx, cy, _ = intrinsics(lens)
     pixels = np.asarray(pixels, np.float64)
     angles = (pixels - (cx, cy)) / (fx, fy)
+    if lens.model == "EQUIRECTANGULAR":  # longitude and latitude
+        (x, y), (level, down) = np.sin(angles).T, np.cos(angles).T
+        return np.column_stack([down * x, y, down * level])
     if not lens.model.endswith("FISHEYE"):  # these are tangents
         tangent = np.maximum(np.linalg.norm(angles, axis=1, keepdims=True), _TINY)
         angles = angles * np.arctan(tangent) / tangent

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from snowsplat.data.panorama import panorama_xmp
 from snowsplat.util.files import atomic_path
 
 # Anchors of a colour map from far (0) to near (1) of increasing lightness: violet to yellow.
@@ -30,6 +31,15 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     """Write (H, W, 3) uint8 or (H, W) uint16, atomically."""
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3)
+
+
+def write_panorama(path: Path, pixels: np.ndarray) -> None:
+    """Write (H, W, 3) uint8, equirectangular, as a JPEG file that says so, atomically."""
+    image = Image.fromarray(pixels)
+    with atomic_path(path) as temporary:
+        image.save(
+            temporary, format="JPEG", quality=95, subsampling=0, xmp=panorama_xmp(*image.size)
+        )
 
 
 def mean_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:

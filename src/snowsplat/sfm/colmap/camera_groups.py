@@ -47,7 +47,7 @@ def may_differ(photos: Sequence[Photo]) -> bool:
 
     A camera of which EXIF has the focal lengths has only one: see `Photo.group`.
     """
-    return any(photo.focal is None for photo in photos)
+    return any(photo.focal is None and not photo.panorama for photo in photos)
 
 
 def separate(photos: Sequence[Photo]) -> list[Photo]:
@@ -88,7 +88,7 @@ def focals_of(model: pycolmap.Reconstruction) -> dict[int, float]:
     return {
         image.image_id: model.cameras[image.camera_id].mean_focal_length()
         for image in images
-        if image.num_points3D >= _MIN_POINTS
+        if image.num_points3D >= _MIN_POINTS and not model.cameras[image.camera_id].is_spherical()
     }
 
 
@@ -144,8 +144,9 @@ def better(
 
 def describe(model: pycolmap.Reconstruction) -> str:
     """The focal lengths of the cameras of ``model``, as text for users; empty: only one."""
-    images = [model.image(image_id) for image_id in model.reg_image_ids()]
-    distinct = sorted({round(model.cameras[i.camera_id].mean_focal_length()) for i in images})
+    used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+    cameras = [model.cameras[i] for i in used if not model.cameras[i].is_spherical()]
+    distinct = sorted({round(camera.mean_focal_length()) for camera in cameras})
     if len(distinct) < 2:
         return ""
     if len(distinct) > _NAMED:

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.lens import is_fisheye, lens_of
+from snowsplat.sfm.colmap.lens import is_fisheye, lens_of, pixels_per_radian
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
@@ -160,7 +160,7 @@ def check_pairs(
             follows = (first, second) in follow
             pair = CheckedPair(first, second, len(rows), int(is_hit.sum()), follows=follows)
             images = model.image(first), model.image(second)
-            focal = np.mean([model.camera(i.camera_id).mean_focal_length() for i in images])
+            focal = np.mean([pixels_per_radian(model.camera(i.camera_id)) for i in images])
             pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
             both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
             error = max_error / float(focal)
@@ -219,10 +219,10 @@ def unconfirmed_photos(pairs: Sequence[CheckedPair]) -> set[int]:
 def _rays(camera: pycolmap.Camera, pixels: Floats) -> Floats:
     """The positions (N, 2) of ``pixels`` (N, 2) in the normalised image plane of a camera.
 
-    For a fisheye lens, unit vectors (N, 3): its pixels are angles, up to 90° or more to its axis,
-    where COLMAP's are wrong. NaN where the model is not defined.
+    For a fisheye lens or a panorama, unit vectors (N, 3): its pixels are angles, up to 90° or more
+    to its axis, where COLMAP's are wrong. NaN where the model is not defined.
     """
-    if not is_fisheye(camera.model_name):
+    if not (is_fisheye(camera.model_name) or camera.is_spherical()):
         return np.asarray(camera.cam_from_img(pixels))
     return directions(lens_of(camera), pixels)
 
@@ -258,8 +258,8 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
 
     The point is projected into the photo ``other``. The match is a miss if the distance between the
     projection and its feature in ``other`` is larger than ``max_error``, in the normalised image
-    plane, or if the point is behind the camera of ``other``. For a fisheye lens, the distance is
-    that of unit vectors.
+    plane, or if the point is behind the camera of ``other``. For a fisheye lens or a
+    panorama, the distance is that of unit vectors.
     """
     _, ids, _ = one
     image, _, rays = other

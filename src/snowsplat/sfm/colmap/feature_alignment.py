@@ -19,6 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database
+from snowsplat.sfm.colmap.options import detection_size
 from snowsplat.sfm.colmap.patches import SIDE, Floats, align_patches, cut_patches, patch_axes
 from snowsplat.sfm.colmap.sift import read_grey
 from snowsplat.util import native_library
@@ -49,7 +50,7 @@ def align_features(
     Args:
         database: has the features.
         images: the folder of the photos.
-        image_size: photos are resized to this longest side, as for the detection of the features.
+        image_size: that of the detection of the features; see `detection_size`.
 
     Raises:
         OSError: a photo is missing.
@@ -61,10 +62,15 @@ def align_features(
         keypoints = {int(i): source.read_keypoints(int(i)) for i in np.unique(features.image)}
     for block in _blocks(features):
         names = {int(i): model.image(int(i)).name for i in np.unique(block.image)}
-        patches = _Patches.cut(block, names, keypoints, images, image_size, threads)
+        sizes = {i: detection_size(image_size, _is_panorama(model, i)) for i in names}
+        patches = _Patches.cut(block, names, keypoints, images, sizes, threads)
         positions, good = patches.aligned(block)
         for i in np.flatnonzero(good):
             model.image(int(block.image[i])).points2D[int(block.row[i])].xy = positions[i]
+
+
+def _is_panorama(model: pycolmap.Reconstruction, image: int) -> bool:
+    return bool(model.cameras[model.image(image).camera_id].is_spherical())
 
 
 def _features_of(model: pycolmap.Reconstruction) -> _Features:
@@ -96,7 +102,7 @@ class _Patches(NamedTuple):
         names: dict[int, str],
         keypoints: dict[int, Floats],
         images: Path,
-        image_size: int,
+        sizes: dict[int, int],
         threads: int,
     ) -> _Patches:
         count = len(features.image)
@@ -107,7 +113,7 @@ class _Patches(NamedTuple):
         def cut_from(image: int) -> None:
             (chosen,) = np.nonzero(features.image == image)
             found = np.asarray(keypoints[image], np.float64)[features.row[chosen]]
-            grey, size = read_grey(images / names[image], image_size)
+            grey, size = read_grey(images / names[image], sizes[image])
             ratio = np.array(size) / grey.shape[::-1]
             found[:, :2] /= ratio
             found[:, 2:] /= ratio.mean()

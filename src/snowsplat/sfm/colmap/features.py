@@ -10,7 +10,8 @@ from pathlib import Path
 import pycolmap
 
 from snowsplat.sfm.colmap.database import closing_database
-from snowsplat.sfm.colmap.options import Effort
+from snowsplat.sfm.colmap.options import Effort, detection_size, feature_count
+from snowsplat.sfm.colmap.panorama_features import detect_in_panorama
 from snowsplat.sfm.colmap.sift import Features, detect_sift, photos_at_once
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import Report
@@ -71,13 +72,15 @@ def extract_features(
     progress: WorkerProgress,
 ) -> None:
     """Detect features in all photos that have none in ``database`` yet, and write them there."""
-    size, count = effort.image_size, effort.features
 
     def detect(photo: Photo) -> Features:
         mask = folders.masks / f"{photo.name}.png" if photo.mask else None
-        return detect_sift(folders.images / photo.name, mask, size, count)
+        size = detection_size(effort.image_size, photo.panorama)
+        count = feature_count(effort.features, photo.panorama)
+        detect_in = detect_in_panorama if photo.panorama else detect_sift
+        return detect_in(folders.images / photo.name, mask, size, count)
 
-    at_once = photos_at_once(size, threads)
+    at_once = photos_at_once(effort.image_size, threads)
     with closing_database(database) as opened, ThreadPoolExecutor(at_once) as pool:
         counts = []
         left = [i for i in range(len(photos)) if not opened.exists_descriptors(i + 1)]

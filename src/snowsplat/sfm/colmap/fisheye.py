@@ -69,7 +69,7 @@ def lens_evidence(database: Path, photos: Sequence[Photo], scale: float) -> dict
     cameras = camera_ids(photos)
     pairs: dict[int, list[tuple[int, int]]] = {}
     for (i, j), count in sorted(match_counts(database).items(), key=lambda entry: -entry[1]):
-        if cameras[i] == cameras[j] and count >= _MIN_MATCHES:
+        if cameras[i] == cameras[j] and count >= _MIN_MATCHES and not photos[i].panorama:
             pairs.setdefault(cameras[i], []).append((i, j))
     found = {}
     with closing_database(database) as source:

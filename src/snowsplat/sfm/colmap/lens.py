@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
 from snowsplat.data.lens.model import LensModel
+from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
 
 # With fewer photos, the eight parameters of the camera model OPENCV are not well determined.
@@ -127,7 +128,13 @@ def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
     cameras = []
     known = exif_focals(photos) if lens.exif else {}
     for number, key in enumerate(sorted({_key(photo) for photo in photos}), start=1):
-        _, width, height = key
+        _, width, height, panorama = key
+        if panorama:  # it has no parameter that could be estimated
+            camera = pycolmap.Camera(model=PANORAMA_MODEL, width=width, height=height)
+            camera.camera_id, camera.params = number, [width, height]
+            camera.has_prior_focal_length = True
+            cameras.append(camera)
+            continue
         count = sum(_key(photo) == key for photo in photos)
         model, guess = lens.model, GUESSED_FOCAL
         if number in lens.fisheyes or is_fisheye(model):
@@ -188,13 +195,22 @@ def exif_focals(photos: Sequence[Photo]) -> dict[int, float]:
     return {number: float(np.median(values)) for number, values in focals.items()}
 
 
-def _key(photo: Photo) -> tuple[str, int, int]:
+def pixels_per_radian(camera: pycolmap.Camera) -> float:
+    """The mean focal length in pixels; of a panorama, the resolution at its equator."""
+    if camera.is_spherical():
+        return float(camera.width / (2 * np.pi))
+    return camera.mean_focal_length()
+
+
+def _key(photo: Photo) -> tuple[str, int, int, bool]:
     # Photos of a group normally have the same size. If not, they need separate cameras.
-    return photo.group, photo.width, photo.height
+    return photo.group, photo.width, photo.height, photo.panorama
 
 
 def findings_of(camera: pycolmap.Camera, exif: float | None) -> list[Finding]:
     """What is wrong with an estimated lens; ``exif``: the focal length in EXIF, in pixels."""
+    if camera.is_spherical():
+        return []
     fx, fy = camera.focal_length_x, camera.focal_length_y
     cx, cy = camera.principal_point_x, camera.principal_point_y
     found = lens_findings(camera.width, camera.height, fx, fy, cx, cy, known_focal=exif)

@@ -26,7 +26,10 @@ CAMERA_MODELS = (
     "RAD_TAN_THIN_PRISM_FISHEYE",
     "SIMPLE_FISHEYE",
     "FISHEYE",
+    "EQUIRECTANGULAR",
 )
+#: The camera model of 360° panoramas, twice as wide as high.
+PANORAMA_MODEL = "EQUIRECTANGULAR"
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class SfmOptions:
 
     # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
     # eight parameters, else SIMPLE_RADIAL; of a fisheye lens, OPENCV_FISHEYE or
-    # SIMPLE_RADIAL_FISHEYE.
+    # SIMPLE_RADIAL_FISHEYE. Panoramas (`Photo.panorama`) have their own model.
     camera_model: str = "auto"
     mapper: Mapper = "incremental"
     effort: EffortName = "normal"
@@ -97,6 +100,21 @@ class Effort:
             image_size=self.image_size * 2 // 3,
             features=self.features // 2,
         )
+
+
+# Features of a panorama, and its width for their detection, divided by those of a photo. A panorama
+# has about five times the field of view.
+_PANORAMA_FEATURES, _PANORAMA_SIZE = 2, 2.5
+
+
+def detection_size(image_size: int, panorama: bool) -> int:
+    """The longest side, in pixels, at which features are detected; larger photos are resized."""
+    return round(_PANORAMA_SIZE * image_size) if panorama else image_size
+
+
+def feature_count(features: int, panorama: bool) -> int:
+    """The approximate number of features of a photo."""
+    return _PANORAMA_FEATURES * features if panorama else features
 
 
 EFFORTS: dict[EffortName, Effort] = {

@@ -63,7 +63,13 @@ from snowsplat.sfm.colmap.lens import (
     with_all_parameters,
 )
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
-from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
+from snowsplat.sfm.colmap.options import (
+    Effort,
+    Mapper,
+    SfmOptions,
+    SfmResult,
+    detection_size,
+)
 from snowsplat.sfm.colmap.pair_matching import match_pairs, verify_pairs
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.repair import repair
@@ -306,8 +312,11 @@ class PoseEstimation:
         open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
         choice = choose_pairs(self.photos, pairing, self._similarity(database))
-        sizes = [max(photo.width, photo.height) for photo in self.photos]
-        scale = max(1.0, float(np.median(sizes)) / effort.image_size)
+        scales = [
+            max(photo.width, photo.height) / detection_size(effort.image_size, photo.panorama)
+            for photo in self.photos
+        ]
+        scale = max(1.0, float(np.median(scales)))
         match_pairs(database, choice.pairs, self.threads, self.progress)
         return Matched(database, effort, choice, scale)
 

@@ -66,16 +66,26 @@ def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> 
     """
     cv2.setNumThreads(1)  # other photos are processed in parallel
     grey, size = read_grey(photo, image_size)
-    allowed = None if mask is None else _read_mask(mask, grey)
+    found = detect_in_grey(grey, None if mask is None else read_mask(mask, grey), count)
+    stretch = np.array(size, np.float32) / grey.shape[::-1]
+    found.keypoints[:, :2] *= stretch
+    found.keypoints[:, 2:] *= stretch.mean()
+    return found
+
+
+def detect_in_grey(
+    grey: NDArray[np.uint8], allowed: NDArray[np.uint8] | None, count: int
+) -> Features:
+    """The ``count`` largest features of a grey image (H, W), in pixels of this image.
+
+    ``allowed`` (H, W) is 0 where no feature is wanted.
+    """
     sift = new_detector()
     found = sorted(sift.detect(grey, allowed), key=lambda keypoint: -keypoint.size)[:count]
     if not found:
         return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8))
     keypoints, histograms = sift.compute(grey, found)
-    resized = np.array(grey.shape[::-1])
-    return Features(
-        _in_photo(keypoints, np.array(size) / resized), _root_sift(np.asarray(histograms))
-    )
+    return Features(_as_rows(keypoints), _root_sift(np.asarray(histograms)))
 
 
 def new_detector() -> cv2.SIFT:
@@ -102,21 +112,20 @@ def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[in
     return grey, (width, height)
 
 
-def _read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W): the mask in the size of the resized photo."""
     height, width = grey.shape
     with open_image(mask) as image:
         return np.asarray(image.convert("L").resize((width, height), Image.Resampling.NEAREST))
 
 
-def _in_photo(
-    keypoints: Sequence[cv2.KeyPoint], stretch: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Keypoints (N, 6) in the photo, which is ``stretch`` (2,) times as large as the resized one.
+def _as_rows(keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
+    """Keypoints (N, 6), as in `Features`.
 
     OpenCV measures positions from the centre of the first pixel.
     """
-    position = (np.array([k.pt for k in keypoints]) + 0.5) * stretch
-    scale = np.array([k.size for k in keypoints]) / 2 * stretch.mean()  # OpenCV has the diameter
+    position = np.array([k.pt for k in keypoints]) + 0.5
+    scale = np.array([k.size for k in keypoints]) / 2  # OpenCV has the diameter
     angle = np.radians([k.angle for k in keypoints])
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
     return np.column_stack([position, cos, -sin, sin, cos]).astype(np.float32)

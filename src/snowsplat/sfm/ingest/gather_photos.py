@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -16,7 +16,12 @@ from PIL import Image
 
 from snowsplat.data.files.mask_look import MaskLook, look_of
 from snowsplat.sfm.ingest.mask_files import read_mask, write_mask
-from snowsplat.sfm.ingest.panorama import PANORAMA, shows_all_around
+from snowsplat.sfm.ingest.panorama import (
+    NOT_TWICE_AS_WIDE,
+    Panorama,
+    is_twice_as_wide,
+    shows_all_around,
+)
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photo_files import (
     Header,
@@ -45,23 +50,26 @@ class Planned:
 
 
 def plan_photos(
-    sources: Sequence[Source], longest: int | None, skipped: list[tuple[str, str]]
+    sources: Sequence[Source],
+    longest: int | None,
+    skipped: list[tuple[str, str]],
+    panoramas: bool = False,
 ) -> list[Planned]:
     """Choose the name of each photo in ``input/``. Photos are sorted by this name.
 
     If two photos would have the same name, the one whose name need not change keeps it. Photos that
-    cannot be used are appended to ``skipped``, with the reason.
+    cannot be used are appended to ``skipped``, with the reason. ``panoramas``: all photos are 360°
+    panoramas, even if their metadata do not say so.
     """
     read = []
     for source in sources:
         try:
             header = read_header(source.path)
+            if panoramas:
+                header = _as_panorama(header)
         except Unusable as error:
             skipped.append((shown(source.path), str(error)))
         else:
-            if header.panorama:
-                skipped.append((shown(source.path), header.panorama))
-                continue
             if header.animated > 1:
                 reason = f"is an animation of {header.animated} pictures, of which one is used; "
                 skipped.append(
@@ -78,6 +86,13 @@ def plan_photos(
 def _page_name(name: str, page: int) -> str:
     path = PurePosixPath(name)
     return str(path.with_name(f"{path.stem}_page{page + 1:03d}{path.suffix}")) if page else name
+
+
+def _as_panorama(header: Header) -> Header:
+    """The header of a panorama. Raises Unusable if the photo cannot be one."""
+    if header.panorama is None and not is_twice_as_wide(*header.size(None)):
+        raise Unusable(NOT_TWICE_AS_WIDE)
+    return replace(header, panorama=header.panorama or Panorama())
 
 
 def evenly_spread(planned: Sequence[Planned], count: int) -> list[Planned]:
@@ -141,13 +156,16 @@ def _write_photo(
     else:
         image = decode(source.path, header, longest, plan.page)
     used = read_mask(source.mask, header, header.size(longest)) if source.mask else None
-    if shows_all_around(image):
-        raise Unusable(PANORAMA)
+    panorama = header.panorama or (Panorama() if shows_all_around(image) else None)
     alpha = image.mode == "RGBA"
     if alpha:
         opaque = np.asarray(image.getchannel("A")) > 0
         used = opaque if used is None else used & opaque
     _check_content(image, used)
+    width, height = header.size(longest)
+    if panorama is not None and panorama.cropped:
+        image, used = _with_missing_rows(image, used, panorama)
+        width, height = image.size
     if not in_place:
         target.parent.mkdir(parents=True, exist_ok=True)
         if ready:
@@ -156,25 +174,39 @@ def _write_photo(
             save(image, target, source.path)
     if used is not None:
         write_mask(dataset / "distorted" / "masks" / f"{plan.name}.png", used)
-    width, height = header.size(longest)
     exif = header.exif
     scale = max(width, height) / max(header.width, header.height)
     folder = str(PurePosixPath(plan.name).parent)
+    around = panorama is not None
+    kind = "panorama" if around else ""
     photo = Photo(
         name=plan.name,
         source=shown(source.path),
         width=width,
         height=height,
-        group=" ".join(filter(None, [f"{folder}/", exif.camera, f"{width}x{height}"])),
+        group=" ".join(filter(None, [f"{folder}/", exif.camera, f"{width}x{height}", kind])),
         sequence=None,
-        focal=None if exif.focal is None else exif.focal * scale,
+        focal=None if exif.focal is None or around else exif.focal * scale,
         location=exif.location,
         mask=used is not None,
         alpha=alpha,
         location_error=exif.location_error,
-        attitude=exif.attitude,
+        attitude=None if around else exif.attitude,  # of the device, not of the picture
+        panorama=around,
     )
     return photo, None if used is None or source.mask is None else look_of(used)
+
+
+def _with_missing_rows(
+    image: Image.Image, used: np.ndarray | None, panorama: Panorama
+) -> tuple[Image.Image, np.ndarray]:
+    """The whole panorama with black rows where the photo has none, and the used pixels (H, W)."""
+    above, below = panorama.rows(image.height)
+    if used is None:
+        used = np.ones((image.height, image.width), bool)
+    whole = Image.new(image.mode, (image.width, above + image.height + below))
+    whole.paste(image, (0, above))
+    return whole, np.pad(used, ((above, below), (0, 0)))
 
 
 def _check_content(image: Image.Image, used: np.ndarray | None) -> None:

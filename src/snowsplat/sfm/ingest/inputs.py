@@ -12,7 +12,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.files.mask_look import doubt_about_masks
@@ -23,14 +23,7 @@ from snowsplat.sfm.ingest.gather_photos import (
     plan_photos,
     write_photos,
 )
-from snowsplat.sfm.ingest.panorama import (
-    CUT_INTO_VIEWS,
-    PANORAMA,
-    STITCHED,
-    is_spherical_video,
-    is_twice_as_wide,
-    spherical_video,
-)
+from snowsplat.sfm.ingest.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside
 from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
@@ -66,6 +59,7 @@ class GatherOptions:
     size: int | None = None  # resize to this longest side in pixels, if larger; None: keep
     # Maximum number of photos; they are evenly spread in the order of their names. None: all.
     photos: int | None = None
+    panoramas: bool = False  # all photos and videos show all directions; False: if they say so
 
 
 def find_inputs(inputs: Sequence[Path]) -> list[Path]:
@@ -105,13 +99,11 @@ def gather(
         logger.warning("%s", note)
     skipped = list(sources.left_out)
     in_place = sources.contain(folder)
-    planned = plan_photos(sources.photos, options.size, skipped)
+    planned = plan_photos(sources.photos, options.size, skipped, options.panoramas)
     if options.photos is not None:
         planned = evenly_spread(planned, options.photos)
-    for video in sources.videos:
-        if is_spherical_video(video.path):
-            raise spherical_video(video.path)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
+    around = [_shows_all_around(clip, options) for _, clip in clips]
     if in_place:
         _refuse_changes(planned, sources.videos, options)
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,9 +111,9 @@ def gather(
     _check_disk_space(dataset, planned, clips, options)
     try:
         photos, looks = write_photos(planned, dataset, options.size, in_place, skipped, report)
-        photos = _without_panoramas(photos, folder, in_place, skipped)
-        for source, clip in clips:
-            photos += _take_frames(source, clip, folder, options, skipped, notes, report)
+        photos = _with_panoramas(photos)
+        for (source, clip), panorama in zip(clips, around, strict=True):
+            photos += _take_frames(source, clip, folder, options, panorama, skipped, notes, report)
         photos.sort(key=lambda photo: natural_key(photo.name))
         photos, found = set_fixed_parts_aside(photos, dataset, in_place)
         notes += found
@@ -160,21 +152,42 @@ def _check(options: GatherOptions) -> None:
         raise SettingError("size", f"{options.size} is too small; use {_MIN_SIZE} or more")
 
 
-def _without_panoramas(
-    photos: list[Photo], folder: Path, in_place: bool, skipped: list[tuple[str, str]]
-) -> list[Photo]:
-    """The photos without those of a panorama's size, if most of this size are panoramas.
+def _with_panoramas(photos: list[Photo]) -> list[Photo]:
+    """The photos; those of a panorama's size are panoramas if most of this size are.
 
     Not every panorama is recognised by its pixels: there may be an edge at a pole.
     """
     alike = [photo for photo in photos if is_twice_as_wide(photo.width, photo.height)]
-    if not alike or sum(reason == PANORAMA for _, reason in skipped) < len(alike):
+    if 2 * sum(photo.panorama for photo in alike) < len(alike):
         return photos
-    skipped += [(photo.source, PANORAMA) for photo in alike]
-    if not in_place:
-        for photo in alike:
-            (folder / photo.name).unlink()
-    return [photo for photo in photos if photo not in alike]
+    return [
+        replace(photo, panorama=True, group=f"{photo.group} panorama", focal=None, attitude=None)
+        if photo in alike and not photo.panorama
+        else photo
+        for photo in photos
+    ]
+
+
+def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
+    """Whether the frames of a video are 360° panoramas, by the header of the file.
+
+    Raises:
+        UserError: they show all directions, but not as one equirectangular picture.
+    """
+    found = spherical_video(clip.path)
+    problem = found.problem if found else ""
+    if (
+        not problem
+        and (found or options.panoramas)
+        and not is_twice_as_wide(clip.width, clip.height)
+    ):
+        problem = f"has frames of {clip.width}x{clip.height} pixels"
+    if problem:
+        raise UserError(
+            f"{shown(clip.path)}: is a 360° video that {problem}; export it with one "
+            "equirectangular picture of all directions, which is twice as wide as high"
+        )
+    return found is not None or options.panoramas
 
 
 def _refuse_changes(
@@ -199,6 +212,7 @@ def _take_frames(
     clip: Clip,
     folder: Path,
     options: GatherOptions,
+    panorama: bool,
     skipped: list[tuple[str, str]],
     notes: list[str],
     report: Report,
@@ -206,7 +220,7 @@ def _take_frames(
     frame_folder = folder / source.name
     frame_folder.mkdir(parents=True, exist_ok=True)
     max_frames = max_frame_count(clip, options.fps, options.frames)
-    frames = extract_frames(clip, frame_folder, max_frames, options.size, report)
+    frames = extract_frames(clip, frame_folder, max_frames, options.size, report, panorama)
     label = source.path.name if not source.name else source.name
     notes += [f"{label}: {line}" for line in frames.notes]
     skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
@@ -216,12 +230,13 @@ def _take_frames(
             source=f"{label} at {frame.seconds:.1f} s",
             width=frame.width,
             height=frame.height,
-            group=f"{label} {frame.width}x{frame.height}",
+            group=f"{label} {frame.width}x{frame.height}" + " panorama" * frames.panoramas,
             sequence=label,
             focal=None,
             location=None,
             mask=False,
             alpha=False,
+            panorama=frames.panoramas,
         )
         for frame in frames.kept
     ]
@@ -276,11 +291,10 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
             f"{video}: the camera does not move ({who} show the same view), but depth needs "
             "motion; film while walking around the scene"
         )
-    if reason in (PANORAMA, STITCHED):
-        what = "360° panoramas" if reason == PANORAMA else "stitched panoramas"
+    if reason == STITCHED:
         return UserError(
-            f"photos: {who} are {what}, but poses are estimated for lenses that show a part of "
-            f"the surroundings; {CUT_INTO_VIEWS}"
+            f"photos: {who} are stitched panoramas, which no lens has taken; use the single "
+            "photos, or panoramas of all directions (equirectangular, twice as wide as high)"
         )
     if reason in (BLACK, WHITE, FLAT):
         what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]

@@ -2,38 +2,34 @@
 
 An equirectangular panorama shows all directions in an image that is twice as wide as high. A row is
 a circle of latitude, so the left and the right border are neighbours, and the first and the last
-row are one point each. No pinhole camera takes such a picture: its poses would be wrong.
+row are one point each.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from snowsplat.util.errors import UserError
-from snowsplat.util.files import shown
-
 # Reasons why a photo is unusable.
-PANORAMA = "is a 360° panorama"
-STITCHED = "is a stitched panorama"
-#: What to do, for the end of an error about panoramas.
-CUT_INTO_VIEWS = (
-    "cut each into ordinary views first, e.g. the six sides of a cube with a field of view of 90°"
-)
+STITCHED = "is a stitched panorama, not of all directions"
+NOT_TWICE_AS_WIDE = "is not twice as wide as high, as a 360° panorama is"
 
 # XMP, as an attribute or as an element: https://developers.google.com/streetview/spherical-metadata
 _PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
 _PIXELS = re.compile(
-    rb"GPano:(FullPanoWidthPixels|CroppedAreaImageWidthPixels)\s*(?:=\s*[\"']|>)\s*(\d+)"
+    rb"GPano:(FullPano(?:Width|Height)Pixels|CroppedArea(?:ImageWidth|ImageHeight|Top)Pixels)"
+    rb"\s*(?:=\s*[\"']|>)\s*(\d+)"
 )
-# Spherical video, version 1 (XML) and 2 (a box with an "equi" box inside), in the header of an mp4.
-_SPHERICAL = re.compile(
-    rb"<GSpherical:Spherical>\s*true|sv3d.{1,400}?(?:equi|cbmp)", re.DOTALL | re.IGNORECASE
-)
+# Spherical video, version 1: XML in the header of an mp4 file.
+_SPHERICAL = re.compile(rb"<GSpherical:Spherical>\s*true", re.IGNORECASE)
+_STEREO = re.compile(rb"<GSpherical:StereoMode>\s*(?:top-bottom|left-right)", re.IGNORECASE)
+# Version 2: a box sv3d that has a box proj with a box of the projection, and beside it a box st3d.
+_LONGEST_BOX = 1024  # bytes between the names of these boxes
 _LONGEST_HEADER = 64 << 20  # bytes; longer ones are not searched
 
 _WIDTH = 256  # pixels of the copy that is tested
@@ -47,16 +43,47 @@ _POINT = 0.5
 _MIN_CONTRAST = 4.0  # grey levels; in a border without structure, a seam is not visible
 
 
-def panorama_in_xmp(xmp: bytes) -> str | None:
-    """`PANORAMA` or `STITCHED`, if the XMP packet of a photo says so."""
+@dataclass(frozen=True)
+class Panorama:
+    """Which part of an equirectangular panorama a photo shows: all columns, and these rows.
+
+    ``above``, ``below``: the rows that are missing, as shares of the height of the photo.
+    """
+
+    above: float = 0.0
+    below: float = 0.0
+
+    @property
+    def cropped(self) -> bool:
+        """Whether rows are missing."""
+        return self.above > 0 or self.below > 0
+
+    def rows(self, height: int) -> tuple[int, int]:
+        """The missing rows above and below a photo of this height."""
+        return round(self.above * height), round(self.below * height)
+
+
+def panorama_in_xmp(xmp: bytes, width: int, height: int) -> Panorama | str | None:
+    """The panorama, or `STITCHED`, if the XMP packet of a photo says so.
+
+    ``width``, ``height``: of the photo, which may be smaller than the XMP packet says.
+    """
     found = _PROJECTION.search(xmp)
     if found is None or found[1].lower() not in (b"equirectangular", b"cylindrical"):
         return None
-    widths = {name: int(value[:9]) for name, value in _PIXELS.findall(xmp)}
-    whole = widths.get(b"FullPanoWidthPixels", 0)
-    part = widths.get(b"CroppedAreaImageWidthPixels", whole)
-    all_around = found[1].lower() == b"equirectangular" and part >= whole
-    return PANORAMA if all_around else STITCHED
+    sizes = {name: int(value[:9]) for name, value in _PIXELS.findall(xmp)}
+    whole, whole_height = (sizes.get(b"FullPano%sPixels" % s, 0) for s in (b"Width", b"Height"))
+    part = sizes.get(b"CroppedAreaImageWidthPixels", whole)
+    rows = sizes.get(b"CroppedAreaImageHeightPixels", whole_height)
+    if found[1].lower() == b"cylindrical" or part < whole:
+        return STITCHED
+    if is_twice_as_wide(width, height):  # of all directions, whatever the numbers are
+        return Panorama()
+    top = sizes.get(b"CroppedAreaTopPixels", 0)
+    if not 0 < rows <= whole_height - top:
+        return STITCHED
+    panorama = Panorama(top / rows, (whole_height - top - rows) / rows)
+    return panorama if is_twice_as_wide(width, height + sum(panorama.rows(height))) else STITCHED
 
 
 def is_twice_as_wide(width: int, height: int) -> bool:
@@ -86,21 +113,50 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDAr
     return np.asarray(np.abs(first - second).mean(axis=0))
 
 
-def spherical_video(path: Path) -> UserError:
-    """The error to raise for a 360° video."""
-    return UserError(
-        f"{shown(path)}: is a 360° video, but poses are estimated for lenses that show a part of "
-        "the surroundings; export a flat video of one direction, or frames as panoramas and "
-        f"{CUT_INTO_VIEWS}"
-    )
+@dataclass(frozen=True)
+class Spherical:
+    """What the header of a video says of its projection.
+
+    ``problem``: why its frames are no panoramas of all directions, as text for users; empty: they
+    are.
+    """
+
+    problem: str = ""
 
 
-def is_spherical_video(path: Path) -> bool:
-    """Whether the header of an mp4 file says that the video shows all directions.
+def spherical_video(path: Path) -> Spherical | None:
+    """What the header of an mp4 file says; None: that it is an ordinary video.
 
     Raises:
         OSError: the file cannot be read.
     """
+    header = _header(path)
+    at = header.find(b"sv3d")
+    if at >= 0:
+        return _version_2(header, at)
+    if _SPHERICAL.search(header):
+        return Spherical("shows two pictures, for two eyes" if _STEREO.search(header) else "")
+    return None
+
+
+def _version_2(header: bytes, at: int) -> Spherical | None:
+    """What the box sv3d says, whose name is at ``at`` in the header of an mp4 file."""
+    near = header[at : at + _LONGEST_BOX]
+    stereo = header[max(0, at - _LONGEST_BOX) : at + _LONGEST_BOX].partition(b"st3d")[2]
+    if len(stereo) > 4 and stereo[4]:
+        return Spherical("shows two pictures, for two eyes")
+    if b"cbmp" in near or b"mshp" in near:
+        return Spherical("has the projection of a cube or a mesh")
+    _, found, box = near.partition(b"equi")
+    if not found:
+        return None
+    # Version and flags, then the parts cut off at the top, bottom, left and right.
+    bounds = [int.from_bytes(box[i : i + 4], "big") for i in range(4, 20, 4)]
+    return Spherical("shows only a part of all directions" if any(bounds) else "")
+
+
+def _header(path: Path) -> bytes:
+    """The box moov of an mp4 file; empty if there is none."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         start = 0
@@ -112,8 +168,8 @@ def is_spherical_video(path: Path) -> bool:
                 length = int.from_bytes(head[8:], "big")
             if head[4:8] == b"moov" and length <= _LONGEST_HEADER:
                 file.seek(start)
-                return _SPHERICAL.search(file.read(length)) is not None
+                return file.read(length)
             if length < 8 or not head[4:8].isalpha():
-                return False
+                return b""
             start += length
-    return False
+    return b""

@@ -35,3 +35,4 @@ class Photo:
     alpha: bool  # whether the photo has transparent pixels
     location_error: float | None = None  # m, horizontal, as the receiver states it
     attitude: Attitude | None = None
+    panorama: bool = False  # equirectangular, of all directions

@@ -20,7 +20,7 @@ from snowsplat.data.colour_profile import is_transparent
 from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of
 from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
-from snowsplat.sfm.ingest.panorama import panorama_in_xmp
+from snowsplat.sfm.ingest.panorama import STITCHED, Panorama, panorama_in_xmp
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Formats that COLMAP reads, by file extension.
@@ -53,7 +53,7 @@ class Header:
     #: The pages of the size of the first one, from 0: a scanner writes several photos to a TIFF.
     pages: tuple[int, ...] = (0,)
     animated: int = 1  # number of pictures of an animation, of which only the first is used
-    panorama: str | None = None  # `PANORAMA` or `STITCHED`, if the metadata say so
+    panorama: Panorama | None = None  # if the metadata say so
 
     @property
     def sideways(self) -> bool:
@@ -68,8 +68,10 @@ class Header:
     def is_ready(self, longest: int | None) -> bool:
         """Whether COLMAP can read the file unchanged, and its pixels are upright."""
         as_stored = self.size(longest) == (self.width, self.height)
+        whole = self.panorama is None or not self.panorama.cropped
         upright = self.exif.orientation == 1 and as_stored
-        return self.format in _SUFFIXES and self.plain and upright and len(self.pages) == 1
+        ready = upright and whole and len(self.pages) == 1
+        return self.format in _SUFFIXES and self.plain and ready
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
@@ -94,7 +96,7 @@ def read_header(path: Path) -> Header:
     """Read the header of a photo, without decoding it.
 
     Raises:
-        Unusable: the format is unknown, or the photo is damaged or too small.
+        Unusable: the format is unknown, or the photo is damaged, too small, or stitched.
     """
     try:
         with open_image(path, header_only=True) as image:
@@ -106,6 +108,7 @@ def read_header(path: Path) -> Header:
             plain_modes = ("L", "RGB", "RGBA") if image.format == "PNG" else ("L", "RGB")
             width, height = _stored_size(image)
             xmp = _xmp(image)
+            panorama = panorama_in_xmp(xmp, width, height)
             header = Header(
                 format=image.format or "",
                 width=width,
@@ -115,7 +118,7 @@ def read_header(path: Path) -> Header:
                 and _bits(path, image) == 8,
                 transparent=transparent,
                 exif=read_exif(exif, width, height, xmp, image.info.get("original_orientation")),
-                panorama=panorama_in_xmp(xmp),
+                panorama=panorama if isinstance(panorama, Panorama) else None,
                 animated=getattr(image, "n_frames", 1) if image.format in _ANIMATIONS else 1,
                 pages=_pages(image),  # the last, because it reads another page
             )
@@ -123,6 +126,8 @@ def read_header(path: Path) -> Header:
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
         raise Unusable(f"has only {header.width}x{header.height} pixels")
+    if panorama == STITCHED:
+        raise Unusable(STITCHED)
     return header
 
 

@@ -66,7 +66,8 @@ def set_fixed_parts_aside(
             parts = find_fixed_parts(np.stack(copies))
             if parts is None:
                 continue
-            crops = not in_place and all(p.name.lower().endswith(_CROPPED) for p in group)
+            whole = in_place or group[0].panorama  # never cropped
+            crops = not whole and all(p.name.lower().endswith(_CROPPED) for p in group)
             crop = parts.crop if crops else None
             size = group[0].width, group[0].height
             box = (0, 0, *size) if crop is None else box_of(crop, *size)

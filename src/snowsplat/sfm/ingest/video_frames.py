@@ -31,7 +31,6 @@ from snowsplat.sfm.ingest.clip import (
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     Crop,
-    FixedParts,
     box_of,
     describe_bars,
     find_fixed_parts,
@@ -39,7 +38,7 @@ from snowsplat.sfm.ingest.fixed_parts import (
 from snowsplat.sfm.ingest.interlace import field_order, whole_frames
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
-from snowsplat.sfm.ingest.panorama import shows_all_around, spherical_video
+from snowsplat.sfm.ingest.panorama import shows_all_around
 from snowsplat.sfm.ingest.photo_files import resized, save, scaled_size
 from snowsplat.sfm.ingest.sharpness import (
     CONTENT_SIDE,
@@ -86,10 +85,16 @@ class Frames:
     skipped: list[tuple[float, str]] = field(default_factory=list)
     read: int = 0  # number of decoded frames
     notes: list[str] = field(default_factory=list)  # lines for the user
+    panoramas: bool = False  # the frames show all directions
 
 
 def extract_frames(
-    clip: Clip, folder: Path, max_frames: int, size: int | None, report: Report
+    clip: Clip,
+    folder: Path,
+    max_frames: int,
+    size: int | None,
+    report: Report,
+    panoramas: bool = False,
 ) -> Frames:
     """Write ``frame_00001.jpg`` … to an existing folder, in the order of time.
 
@@ -99,9 +104,10 @@ def extract_frames(
     Args:
         max_frames: maximum number of frames, at least 1.
         size: resize larger frames to this longest side in pixels; None keeps the size.
+        panoramas: the frames are 360° panoramas; False: if their pixels are those of panoramas.
 
     Raises:
-        UserError: no frame can be decoded, or the video shows all directions.
+        UserError: no frame can be decoded.
         OSError: the disk is full.
     """
     import av
@@ -109,10 +115,13 @@ def extract_frames(
     frames = Frames()
     name = clip.path.name
     try:
-        parts = _fixed_parts(clip)
+        copies = _copies(clip)
         order = field_order(clip)
     except (av.FFmpegError, ValueError) as error:
         raise undecodable(clip.path, error) from None
+    frames.panoramas = panoramas or _are_panoramas(copies)
+    # The rows at the poles of a panorama would be bars.
+    parts = find_fixed_parts(np.stack(copies)) if copies and not frames.panoramas else None
     crop = parts.crop if parts else None
     fixed = None if parts is None else _cropped(parts.fixed, crop)
     candidates = _Candidates(clip, folder, max_frames, size, crop, fixed)
@@ -264,22 +273,21 @@ def _grey(frame: VideoFrame) -> np.ndarray:
     return small.to_ndarray()
 
 
-def _fixed_parts(clip: Clip) -> FixedParts | None:
-    """What is fixed to the frame, found before the frames are chosen, as it would hide the motion.
+def _copies(clip: Clip) -> list[np.ndarray]:
+    """Small copies of frames, of one size, to find what is fixed before the frames are chosen.
 
-    The copies are not rotated. Only if there are few key frames, all frames are decoded.
-
-    Raises:
-        UserError: the video shows all directions. The rows at its poles would be bars.
+    What is fixed would hide the motion. The copies are not rotated. Only if there are few key
+    frames, all frames are decoded.
     """
     copies = _spread_copies(clip, key_frames=True)
     if len(copies) < _FEW_KEY_FRAMES:
         copies = _spread_copies(clip, key_frames=False)
-    same = [copy for copy in copies if copy.shape == copies[0].shape]
-    around = sum(shows_all_around(Image.fromarray(copy)) for copy in same)
-    if around > len(same) / 2:
-        raise spherical_video(clip.path)
-    return find_fixed_parts(np.stack(same)) if same else None
+    return [copy for copy in copies if copy.shape == copies[0].shape]
+
+
+def _are_panoramas(copies: list[np.ndarray]) -> bool:
+    around = sum(shows_all_around(Image.fromarray(copy)) for copy in copies)
+    return around > len(copies) / 2
 
 
 def _spread_copies(clip: Clip, key_frames: bool) -> list[np.ndarray]:

@@ -21,6 +21,8 @@ from snowsplat.training.starts.point_colors import point_pixels
 _GOOD, _USABLE = 0.9, 0.75
 #: A single photo below this share shows something else than the scene.
 _WRONG = 0.5
+#: dB. Smaller errors, of 4 grey levels, are not visible: a white ceiling has less contrast.
+_VISIBLE = 36.0
 #: If the errors of held-out photos are larger than those of training photos by this factor, the
 #: scene lacks photos. It is then made for these photos, and wrong elsewhere.
 _LACKS_PHOTOS = 2.0
@@ -109,7 +111,8 @@ def _new_views(held_out: Evaluation, trained_on: Evaluation) -> list[Reason]:
 def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
     """The held-out photos that show something else than the scene, the worst first."""
     wrong = sorted(
-        (view for view in held_out.views if _share(view) < _WRONG), key=lambda view: _share(view)
+        (v for v in held_out.views if _share(v) < _WRONG and v.psnr_aligned < _VISIBLE),
+        key=lambda view: _share(view),
     )
     if not wrong:
         return []
