@@ -68,8 +68,8 @@ def find_masks(root: Path, photos: Sequence[str]) -> FoundMasks:
     left = [photo for photo in photos if photo not in found.beside]
     listed: set[Path] = set()
     for folder in sorted(_ancestors(by_folder), key=lambda f: (-f.count("/"), not f, f)):
-        inside = {p: p[len(folder) :].lstrip("/") for p in left if _is_below(p, folder)}
         for masks in _mask_folders(root / folder):
+            inside = {p: p[len(folder) :].lstrip("/") for p in left if _is_below(p, folder)}
             listed |= _find_in(masks, inside, found)
     # In ``input``, a dataset keeps its original photos; masks beside it are those of other images.
     if root.name.casefold() in PHOTO_FOLDERS - {"input"}:

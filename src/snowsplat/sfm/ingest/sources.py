@@ -201,15 +201,16 @@ def _search(root: Path) -> _Folder:
     if unread := unread_photos(files, photos):
         found.left_out.append((shown(root), unread))
     found.videos = [file for file in files if _is_video_name(file)]
-    for copy in find_copies(root, photos):
-        found.left_out.append((shown(root / copy.name), f"is the same picture as {copy.used}"))
-        photos.remove(copy.name)
+    no_views = {
+        copy.name: f"is the same picture as {copy.used}" for copy in find_copies(root, photos)
+    }
+    no_views |= {
+        map_: f"is a {kind} of another photo" for map_, kind in _maps_beside(photos).items()
+    }
+    found.left_out += [(shown(root / name), reason) for name, reason in no_views.items()]
+    photos = [photo for photo in photos if photo not in no_views]
     found.masks = find_masks(root, photos)
-    photos = [photo for photo in photos if photo not in found.masks.beside]
-    for photo, kind in _maps_beside(photos).items():
-        found.left_out.append((shown(root / photo), f"is a {kind} of another photo"))
-        photos.remove(photo)
-    found.photos = photos
+    found.photos = [photo for photo in photos if photo not in found.masks.beside]
     return found
 
 
