@@ -280,7 +280,6 @@ BROKEN = {
         primitive(d)["attributes"].pop(f"{PREFIX}SH_DEGREE_1_COEF_{n}") for n in range(3)
     ],
     "triangles": lambda d: primitive(d).update(mode=4),
-    "another kernel": lambda d: extension(d).update(kernel="box"),
     "packed": lambda d: (
         primitive(d).update(attributes={"POSITION": 0}),
         extension(d).update(extensions={"KHR_gaussian_splatting_compression_spz_2": {}}),

@@ -71,6 +71,9 @@ class Convert:
     spz_version: Annotated[Literal[2, 3, 4] | None, flag("{2,3,4}", default="3")] = None
     """Version of an .spz file: 2 for older viewers, with coarser rotations; 4 for the newest
     viewers, faster to load."""
+    georeferenced: Annotated[bool, switch()] = False
+    """Write positions in the world, as doubles (.ply), for a scene that is far away from 0. Without
+    it, they are relative to the origin that is noted in the file or beside it."""
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
 
@@ -96,6 +99,7 @@ class Convert:
                 edits,
                 dataset=self.refine,
                 spz_version=self.spz_version,
+                georeferenced=self.georeferenced,
                 overwrite=self.overwrite,
                 observer=observer,
             )

@@ -7,10 +7,12 @@ write `GaussianArrays` with NumPy; torch is imported when these become `Gaussian
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from snowsplat.formats.gaussian_arrays import GaussianArrays
+from snowsplat.formats.origin_file import read_origin, write_origin
 from snowsplat.formats.registry import (
     FORMATS,
     Format,
@@ -18,6 +20,7 @@ from snowsplat.formats.registry import (
     format_for_writing,
     register_format,
 )
+from snowsplat.scene.origin import HERE
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -48,7 +51,8 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     format = format_for_reading(path)
     if format.read is None:
         raise UserError(f"{path}: {format.name} files can be written, not read")
-    return format.read(path)
+    scene = format.read(path)
+    return scene if format.stores_origin else replace(scene, origin=read_origin(path))
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
@@ -56,8 +60,14 @@ def read_gaussians(path: Path | str) -> Gaussians:
     return read_arrays(path).to_gaussians()
 
 
-def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+def write_gaussians(path: Path | str, gaussians: Gaussians, **options: Any) -> None:
     """Write a scene file atomically, in the format that the suffix of its name selects.
+
+    The origin of a scene that has one is in the file or, if the format cannot store it, in
+    NAME.origin.json beside it.
+
+    Args:
+        options: of the function that writes the format, such as ``version`` of `write_spz`.
 
     Raises:
         UserError: the suffix belongs to no format that can be written.
@@ -66,7 +76,9 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     path = Path(path)
     format = format_for_writing(path)
     assert format.write is not None
-    format.write(path, GaussianArrays.from_gaussians(gaussians))
+    format.write(path, GaussianArrays.from_gaussians(gaussians), **options)
+    if not format.stores_origin:
+        write_origin(path, gaussians.origin if format.read else HERE)
     if gaussians.antialiased and not format.marks_antialiased:
         logger.warning(
             "%s: the scene is antialiased, but %s files cannot say so: viewers will show fine "

@@ -19,13 +19,14 @@ those of the uncompressed PLY. The layout was taken from
 github.com/playcanvas/splat-transform (MIT).
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.ply import is_antialiased, mode_comments
+from snowsplat.formats.ply import is_antialiased, origin_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -81,9 +82,9 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         np.float32(2)
     )
     steps = _largest_integers(_XYZ)
-    return decoded(
+    scene = decoded(
         path,
-        _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), steps),
+        _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), steps).astype("f4"),
         _dequantize(bounds[:, 6:9], bounds[:, 9:], _fields(words[:, 2], _XYZ), steps),
         packing.from_largest_of_four(largest, others),
         packing.opacity_logits(rgba[:, 3]),
@@ -91,6 +92,7 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         _read_sh(path, vertices),
         antialiased=is_antialiased(vertices.comments),
     )
+    return replace(scene, origin=origin_in(vertices.comments))
 
 
 def _read_sh(path: Path, vertices: PlyTable) -> np.ndarray:
@@ -165,6 +167,9 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     order = packing.spatial_order(packable.means)
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packable.select(order)
     n, k = sh_rest.shape[:2]
+    cut = packing.Cut(path, "compressed PLY", n)
+    packing.cut_scales(cut, log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT, step=0)
+    cut.note("SH", (np.abs(sh_rest) > _SH_LIMIT).any((1, 2)), "at most 4", rare=True)
     log_scales = np.clip(log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
     colors = 0.5 + SH_C0 * sh_dc[:, 0]
 
@@ -189,7 +194,8 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     if k:
         elements.append(("sh", n, [("uchar", f"f_rest_{i}") for i in range(3 * k)]))
     limits = np.concatenate(bounds, 1).astype("<f4")
-    head = header_of(elements, mode_comments(gaussians.antialiased))
+    head = header_of(elements, scene_comments(gaussians.antialiased, gaussians.origin))
+    cut.report(".ply keeps them")
     return [head, limits.tobytes(), words.tobytes(), sh.tobytes()]
 
 

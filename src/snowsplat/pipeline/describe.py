@@ -29,7 +29,7 @@ def describe(path: Path | str) -> dict[str, Any]:
     The key "kind" has one of these values; the other keys depend on it:
 
     - "scene": format, number of Gaussians, bounds, and percentiles of opacity and scale. ``path``
-      may also be a folder with a `lod-meta.json`.
+      may also be a folder with a `lod-meta.json` or a SOG `meta.json`.
     - "point cloud": number of points, bounds.
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
@@ -38,7 +38,8 @@ def describe(path: Path | str) -> dict[str, Any]:
     - "dataset": number and sizes of the photos, focal lengths, number of points, extent, and
       what is impossible or doubtful about the cameras.
 
-    Bounds and lengths are in world units, in the frame of the file. torch is imported only for
+    Bounds and lengths are in world units, in the frame of the file, relative to the "origin" of a
+    scene that has one (`scene.origin`). torch is imported only for
     datasets, photos and videos.
 
     Raises:
@@ -83,21 +84,23 @@ def _scene(path: Path, format: Format) -> dict[str, Any]:
 
 
 def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
-    finite = gaussians.select(gaussians.finite_rows())
-    count, finite_count = len(gaussians.means), len(finite.means)
+    usable = gaussians.select(gaussians.usable_rows())
+    count, usable_count = len(gaussians.means), len(usable.means)
     facts: dict[str, Any] = {
         "gaussians": count,
         "sh_degree": SH_REST_COUNTS.index(gaussians.sh_rest.shape[1]),
         "antialiased": gaussians.antialiased,
         "bytes_in_memory": sum(array.nbytes for array in gaussians),
     }
-    if finite_count < count:
-        facts["not_finite"] = count - finite_count
-    if finite_count:
+    if any(gaussians.origin):
+        facts["origin"] = list(gaussians.origin)
+    if usable_count < count:
+        facts["not_finite"] = count - usable_count
+    if usable_count:
         with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-finite.opacity_logits))
-            scales = np.exp(finite.log_scales)
-        facts |= _bounds(finite.means)
+            opacities = 1 / (1 + np.exp(-usable.opacity_logits))
+            scales = np.exp(usable.log_scales)
+        facts |= _bounds(usable.means)
         facts["opacity"] = _percentiles(opacities)
         facts["scale"] = _percentiles(scales.max(1))
         ratio = scales.max(1) / scales.min(1).clip(1e-12)

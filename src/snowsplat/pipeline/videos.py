@@ -232,6 +232,7 @@ def cameras_along(
                 "path", f"{path} is unknown; use {known} or a file of cameras (.json)"
             )
         _, keys = read_cameras(Path(path))
+        keys = _in_frame_of(gaussians, keys)
         distance = trajectory.viewing_distance(keys, gaussians.means)
         cameras = trajectory.key_path(keys, frames, distance)
     elif trained is not None:
@@ -253,6 +254,15 @@ def cameras_along(
         )
     width, height = size.for_camera(cameras[0])
     return [trajectory.resized(camera, width, height) for camera in cameras]
+
+
+def _in_frame_of(gaussians: Gaussians, cameras: list[Camera]) -> list[Camera]:
+    """Cameras relative to the origin of the scene. In the world they are nearer to it than to 0."""
+    middle = torch.stack([camera.position for camera in cameras]).mean(0)
+    origin = torch.tensor(gaussians.origin, dtype=middle.dtype)
+    if (middle - origin).norm() >= middle.norm():
+        return cameras
+    return [camera.seen_from(gaussians.origin) for camera in cameras]
 
 
 @dataclass(frozen=True)
