@@ -52,14 +52,17 @@ def is_compressed_ply(head: bytes) -> bool:
 
 
 @np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
-def read_compressed_ply(path: Path | str) -> GaussianArrays:
+def read_compressed_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     """Read a scene of any SH degree.
+
+    Args:
+        data: see `open_table`.
 
     Raises:
         UserError: the file cannot be read, is damaged or truncated, or is another kind of PLY file.
     """
     path = Path(path)
-    vertices, chunks = open_table(path), open_table(path, "chunk")
+    vertices, chunks = open_table(path, data=data), open_table(path, "chunk", data)
     missing = [n for n in _WORDS if vertices.columns.get(n) != "u4"]
     missing += [n for n in _GEOMETRY_BOUNDS if n not in chunks.columns]
     if missing:
@@ -89,18 +92,18 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         packing.from_largest_of_four(largest, others),
         packing.opacity_logits(rgba[:, 3]),
         (_dequantize(colors[:, :3], colors[:, 3:], rgba[:, :3], 255)[:, None] - 0.5) / SH_C0,
-        _read_sh(path, vertices),
+        _read_sh(path, vertices, data),
         antialiased=is_antialiased(vertices.comments),
     )
     return replace(scene, origin=origin_in(vertices.comments))
 
 
-def _read_sh(path: Path, vertices: PlyTable) -> np.ndarray:
+def _read_sh(path: Path, vertices: PlyTable, data: bytes | None) -> np.ndarray:
     """sh_rest (N, K, 3); K = 0 if the file has no ``sh`` element."""
     n = vertices.count
     if "sh" not in vertices.elements:
         return np.zeros((n, 0, 3), np.float32)
-    table = open_table(path, "sh")
+    table = open_table(path, "sh", data)
     k = len(table.columns) // 3
     names = [f"f_rest_{i}" for i in range(3 * k)]
     if k not in SH_REST_COUNTS or list(table.columns) != names or table.count != n:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from snowsplat.formats.archive import is_archive, read_archive
 from snowsplat.formats.compressed_ply import (
     is_compressed_ply,
     read_compressed_ply,
@@ -17,6 +18,7 @@ from snowsplat.formats.compressed_ply import (
 )
 from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.gltf import is_glb, is_gltf, read_gltf, write_glb
+from snowsplat.formats.gsplat_checkpoint import is_checkpoint, read_checkpoint
 from snowsplat.formats.ksplat import read_ksplat
 from snowsplat.formats.lod import INDEX, LEVELS, is_lod, lod_bytes, read_lod
 from snowsplat.formats.lod_writer import write_lod
@@ -95,6 +97,25 @@ FORMATS: list[Format] = [
         "precision: positions have 24 bits, rotations 10, SH 4 to 8, all other values 8",
         True,
         spz_version,
+    ),
+    Format(
+        "gsplat checkpoint",
+        (".pt",),
+        is_checkpoint,
+        read_checkpoint,
+        None,
+        "nothing",
+        False,
+    ),
+    Format(
+        "zip file",
+        (".zip", ".ssproj", ".usdz"),
+        is_archive,
+        read_archive,
+        None,
+        "nothing that the file in it has",
+        True,
+        stores_origin=True,
     ),
     Format(
         "SOG",

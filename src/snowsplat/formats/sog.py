@@ -42,6 +42,8 @@ from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
+#: The name of the description of a scene, in a zip file or a folder.
+META = "meta.json"
 _PALETTE_LIMIT = 1 << 16  # labels have 16 bits
 _PALETTE_COLUMNS = 64
 _SH_LIMIT = np.float32(1e6)

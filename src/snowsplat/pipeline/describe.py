@@ -10,10 +10,10 @@ import numpy as np
 
 from snowsplat.data.points_ply import read_points
 from snowsplat.formats import Format, GaussianArrays, ply
-from snowsplat.formats.lod import INDEX, LEVELS, read_index
+from snowsplat.formats.lod import LEVELS, read_index
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
-from snowsplat.pipeline.output.scene_paths import training_folder
+from snowsplat.pipeline.output.scene_paths import index_in, training_folder
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.training.core import checkpoint_file
 from snowsplat.util.errors import UserError
@@ -50,8 +50,7 @@ def describe(path: Path | str) -> dict[str, Any]:
         raise UserError(f"{path}: no such file or folder")
     if path.suffix == ".safetensors":
         return _checkpoint(path)
-    if (path / INDEX).is_file():
-        path = path / INDEX
+    path = index_in(path) or path
     if path.is_file():
         try:
             format = format_for_reading(path)

@@ -17,7 +17,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output import image_files
-from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around
+from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, index_in
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
@@ -196,6 +196,7 @@ class _Source:
 
 
 def _load(scene: Path, iteration: int | None, name: str) -> _Source:
+    scene = index_in(scene) or scene
     if scene.is_file():
         file = scene.with_name(f"{scene.stem}_{name}.mp4")
         folder, gaussians = folder_around(scene), read_gaussians(scene)
