@@ -7,9 +7,12 @@ write `GaussianArrays` with NumPy; torch is imported when these become `Gaussian
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.origin_file import read_origin, write_origin
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
 
 logger = logging.getLogger(__name__)
+
+_SAMPLE = 1 << 14  # Gaussians from which precision is estimated
 
 __all__ = [
     "FORMATS",
@@ -52,7 +57,29 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     if format.read is None:
         raise UserError(f"{path}: {format.name} files can be written, not read")
     scene = format.read(path)
+    _name_coarse_positions(path, scene)
     return scene if format.stores_origin else replace(scene, origin=read_origin(path))
+
+
+def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:
+    """Warn if the positions in a file are rounded by more than a tenth of a Gaussian.
+
+    float32 is coarse far away from 0; only a program that has the exact positions can mend this.
+    """
+    sample = scene.select(slice(None, None, len(scene.means) // _SAMPLE + 1))
+    sample = sample.select(sample.usable_rows())
+    if not len(sample.means):
+        return
+    farthest = float(np.abs(np.median(sample.means, 0)).max())
+    step = float(np.spacing(np.float32(farthest)))
+    if step > 0.1 * math.exp(min(80.0, float(np.median(sample.log_scales.max(1))))):
+        logger.warning(
+            "%s: its positions are rounded to steps of %.2g, because they are %.4g from 0; export "
+            "it nearer to 0, or as a PLY with doubles",
+            path,
+            step,
+            farthest,
+        )
 
 
 def read_gaussians(path: Path | str) -> Gaussians:

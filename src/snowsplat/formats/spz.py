@@ -19,6 +19,7 @@ and the compression. The layout was taken from github.com/nianticlabs/spz (MIT).
 """
 
 import logging
+import math
 import struct
 from pathlib import Path
 
@@ -180,9 +181,10 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     data = pack(header, [column.tobytes() for column in columns])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+    if len(means) and 2.0**-bits > 0.5 * math.exp(min(80.0, float(np.median(log_scales.max(1))))):
+        cut.note("positions", np.ones(len(means), bool), f"in steps of {2.0**-bits:.2g}")
     packing.cut_scales(cut, log_scales, *_SCALE_RANGE, step=1 / 32)
     cut.note("SH", (np.abs(sh_rest) > 1 + _SH_STEPS[1] / 128).any((1, 2)), "at most 1", rare=True)
-    cut.note("colours", (np.abs(_COLOR_STEP * sh_dc) > 128).any((1, 2)), rare=True)
     cut.report(_advice(log_scales))
 
 

@@ -13,6 +13,7 @@ import torch
 
 from snowsplat.formats import Format
 from snowsplat.formats.lod import LEVELS
+from snowsplat.formats.origin_file import origin_file
 from snowsplat.formats.spz import WRITTEN_VERSIONS
 from snowsplat.pipeline.decimate import Decimation, file_size, gaussians_to_keep, write_within
 from snowsplat.pipeline.observer import SILENT, Observer
@@ -186,13 +187,12 @@ def convert(
     if format.name == LEVELS:
         write = partial(write_levels, observer=observer)
 
+    written: list[Gaussians] = []
+
     def write_placed(path: Path, gaussians: Gaussians) -> None:
         # The scene is moved last: cameras and photos show it in its place.
-        moved = edits.placed(gaussians)
-        write(path, moved)
-        if any(moved.origin) and format.name != "glTF" and not georeferenced:
-            x, y, z = (f"{value:.15g}" for value in moved.origin)
-            logger.info("%s: positions are relative to the origin %s %s %s", target, x, y, z)
+        written[:] = [edits.placed(gaussians)]
+        write(path, *written)
 
     if size is not None:
         write_within(size, target, scene, write_placed, decimation)
@@ -201,7 +201,19 @@ def convert(
         write_placed(target, decimation.fitted(smaller, scene))
     else:
         write_placed(target, scene)
+    if any(written[0].origin) and format.name != "glTF" and not georeferenced:
+        x, y, z = (f"{value:.15g}" for value in written[0].origin)
+        observer.note(f"positions are relative to the origin {x} {y} {z}, {_noted(format, target)}")
+    if georeferenced and not any(written[0].origin):
+        observer.note("the scene has no origin; its positions are written as they are")
     return format
+
+
+def _noted(format: Format, target: Path) -> str:
+    """Where the origin of a written scene is stored."""
+    if format.read is None:
+        return "which the file cannot store"
+    return "which is noted in the file" if format.stores_origin else f"see {origin_file(target)}"
 
 
 def _decimation(
