@@ -23,7 +23,7 @@ from snowsplat.formats.registry import (
     format_for_writing,
     register_format,
 )
-from snowsplat.scene.origin import HERE
+from snowsplat.scene.origin import HERE, added
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -58,7 +58,9 @@ def read_arrays(path: Path | str) -> GaussianArrays:
         raise UserError(f"{path}: {format.name} files can be written, not read")
     scene = format.read(path)
     _name_coarse_positions(path, scene)
-    return scene if format.stores_origin else replace(scene, origin=read_origin(path))
+    if format.stores_origin:
+        return scene
+    return replace(scene, origin=added(scene.origin, read_origin(path)))
 
 
 def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:

@@ -106,7 +106,7 @@ def _splats(path: Path, content: Any) -> dict[Any, Any]:
 
 
 def _array(path: Path, tensor: Any) -> np.ndarray:
-    """A tensor as float32.
+    """A tensor as float32, or as float64 if it has doubles.
 
     Raises:
         Damaged: not a tensor of floats, or larger than the file.
@@ -118,7 +118,8 @@ def _array(path: Path, tensor: Any) -> np.ndarray:
         raise Damaged("its splats are not tensors of numbers")
     if tensor.numel() * tensor.element_size() > path.stat().st_size:
         raise Damaged("its tensors are larger than the file")
-    array: np.ndarray = tensor.detach().to(torch.float32).contiguous().numpy()
+    dtype = torch.float64 if tensor.dtype == torch.float64 else torch.float32
+    array: np.ndarray = tensor.detach().to(dtype).contiguous().numpy()
     return array
 
 
