@@ -109,21 +109,22 @@ def test_empty_files_and_noise(tmp_path, survives, format):
 
 
 @pytest.mark.parametrize("format", READ_AND_WRITTEN, ids=lambda format: format.name)
-def test_nonfinite_gaussians_are_skipped_with_a_warning(tmp_path, make_scene, caplog, format):
+def test_unusable_gaussians_are_left_out_with_a_warning(tmp_path, make_scene, caplog, format):
     if format.name == "PLY":
         pytest.skip("PLY stores non-finite values")
     scene = make_scene(20, 1)
     scene.means[3, 1] = torch.nan
     scene.log_scales[4, 0] = torch.inf
     scene.quats[5, 2] = torch.nan
-    scene.opacity_logits[6] = -torch.inf
+    scene.opacity_logits[6] = torch.nan
     scene.sh_rest[7, 1, 1] = torch.inf
     path = tmp_path / f"a{format.suffixes[0]}"
     write_gaussians(path, scene)
-    assert "5 Gaussians are not finite; skipped" in caplog.text
+    reasons = "positions of 1, scales of 1, rotations of 1, opacities of 1, colours of 1"
+    assert f"5 of 20 Gaussians are not finite ({reasons}); left out" in caplog.text
     read = read_gaussians(path)
     assert len(read) == 15
-    assert bool(read.finite_rows().all())
+    assert bool(read.usable_rows().all())
 
 
 @pytest.mark.parametrize("format", READ_AND_WRITTEN, ids=lambda format: format.name)

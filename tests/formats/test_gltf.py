@@ -1,5 +1,6 @@
 """glTF: lossless up to rounding; nodes place the splats; malicious JSON is a one-line error."""
 
+import base64
 import json
 import math
 import os
@@ -10,7 +11,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 
-from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.scene import edit
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 
@@ -280,7 +281,6 @@ BROKEN = {
         primitive(d)["attributes"].pop(f"{PREFIX}SH_DEGREE_1_COEF_{n}") for n in range(3)
     ],
     "triangles": lambda d: primitive(d).update(mode=4),
-    "another kernel": lambda d: extension(d).update(kernel="box"),
     "packed": lambda d: (
         primitive(d).update(attributes={"POSITION": 0}),
         extension(d).update(extensions={"KHR_gaussian_splatting_compression_spz_2": {}}),
@@ -338,6 +338,116 @@ def test_linear_colours_are_a_warning(tmp_path, seed, caplog):
     extension(document)["colorSpace"] = "lin_rec709_display"
     assert len(read_gaussians(assemble(tmp_path / "a.glb", document, binary))) == 30
     assert "read as sRGB" in caplog.text
+
+
+# Files of other writers
+
+
+def floats(document: dict, binary: bytearray, name: str) -> np.ndarray:
+    """The values of a float attribute, which can be changed in place."""
+    view = document["bufferViews"][
+        document["accessors"][primitive(document)["attributes"][name]]["bufferView"]
+    ]
+    return np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"])
+
+
+def test_negative_scales_are_logarithms(tmp_path, seed, caplog):
+    document, binary, scene = seed
+    changed = bytearray(binary)
+    values = floats(document, changed, PREFIX + "SCALE")
+    values[:] = np.log(values)
+    assert_same(read_gaussians(assemble(tmp_path / "a.glb", document, changed)), scene)
+    assert caplog.text.count("read as logarithms") == 1
+    # A rounding error below 0 in linear values does not change the meaning of the others.
+    caplog.clear()
+    changed = bytearray(binary)
+    floats(document, changed, PREFIX + "SCALE")[4] = -1e-7
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, changed))
+    torch.testing.assert_close(read.scales[2:], scene.scales[2:])
+    assert caplog.text == ""
+
+
+def test_logarithms_are_decided_for_all_primitives_together(tmp_path, seed):
+    """A primitive without negative values beside one with them, as in files of the draft."""
+    document, binary, _ = seed
+    changed = bytearray(binary)
+    values = floats(document, changed, PREFIX + "SCALE")
+    values[:] = 0.5
+    more = np.full(90, -0.5, "<f4").tobytes()
+    document["bufferViews"].append(
+        {"buffer": 0, "byteOffset": len(changed), "byteLength": len(more)}
+    )
+    document["buffers"][0]["byteLength"] += len(more)
+    document["accessors"].append(
+        {"bufferView": len(document["bufferViews"]) - 1, "componentType": 5126, "count": 30,
+         "type": "VEC3"}
+    )  # fmt: skip
+    second = json.loads(json.dumps(primitive(document)))
+    second["attributes"][PREFIX + "SCALE"] = len(document["accessors"]) - 1
+    document["meshes"][0]["primitives"].append(second)
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, bytes(changed) + more))
+    expected = torch.tensor([0.5, -0.5]).repeat_interleave(30)[:, None].expand(60, 3)
+    torch.testing.assert_close(read.log_scales, expected)
+
+
+def test_an_unknown_kernel_falls_back_to_the_ellipse(tmp_path, seed, caplog):
+    document, binary, scene = seed
+    extension(document)["kernel"] = "customShape"
+    document["meshes"][0]["primitives"] *= 3
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, binary))
+    assert_same(read.select(torch.arange(30)), scene)
+    assert caplog.text.count("'customShape' are read as ellipses") == 1
+
+
+def test_colours_without_sh_coefficients_are_those_of_color_0(tmp_path, seed, caplog):
+    document, binary, scene = seed
+    own = primitive(document)["attributes"]
+    primitive(document)["attributes"] = {k: v for k, v in own.items() if "SH_DEGREE" not in k}
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, binary))
+    assert read.sh_degree == 0
+    error = (read.base_colors - scene.base_colors.clamp(0, 1)).abs()
+    assert float(error.max()) < 0.03  # 8 bits in linear light are coarse where it is dark
+    assert float(error.median()) < 0.003
+    assert "COLOR_0" in caplog.text
+
+
+def test_json_with_data_in_files_and_data_uris(tmp_path, seed, one_line):
+    document, binary, scene = seed
+    buffer = document["buffers"][0]
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub/the data.bin").write_bytes(binary)
+    encoded = base64.b64encode(binary).decode()
+    for uri in ("sub/the%20data.bin", f"data:application/octet-stream;base64,{encoded}"):
+        buffer["uri"] = uri
+        path = tmp_path / "a.gltf"
+        path.write_text(json.dumps(document))
+        assert_same(read_gaussians(path), scene)
+        assert_same(read_gaussians(assemble(tmp_path / "a.glb", document, b"")), scene)
+    outside = tmp_path.parent / "outside.bin"
+    outside.write_bytes(binary)
+    for uri, expected in {
+        "../outside.bin": "outside of its folder",
+        str(outside): "outside of its folder",
+        "https://example.org/a.bin": "outside of its folder",
+        "file:///etc/passwd": "outside of its folder",
+        "missing.bin": "missing",
+        "data:;base64,*": "base64",
+        "data:text/plain,abc": "exceeds",
+        "sub": "missing",
+    }.items():
+        buffer["uri"] = uri
+        path.write_text(json.dumps(document))
+        assert expected in one_line(path)
+
+
+def test_a_node_far_from_0_keeps_the_precision(tmp_path, seed):
+    """Translations have float64, for example in tiles on a globe."""
+    document, binary, scene = seed
+    document["nodes"][0]["translation"] = [4_000_000.25, 5.5, -3_000_000.75]
+    read = read_arrays(assemble(tmp_path / "a.glb", document, binary))
+    world = scene.means.double().numpy() + np.array([4_000_000.25, -5.5, 3_000_000.75])
+    np.testing.assert_allclose(read.world_means(), world, rtol=0, atol=1e-5)
+    assert np.abs(read.means).max() < 100
 
 
 @settings(

@@ -239,11 +239,11 @@ def test_decompression_bombs(tmp_path, files, one_line):
 
 
 def test_the_number_of_members_is_limited(tmp_path, one_line):
-    """More than 1000 members are refused before the directory of the zip file is read."""
-    names = {f"{number}": b"" for number in range(1001)}
+    """A directory of the zip file of more than 1 MiB is refused before it is read."""
+    names = {f"{number}{'x' * 30_000}": b"" for number in range(36)}
     assert "implausible number of members" in one_line(bundle(tmp_path / "a.sog", names))
-    del names["0"]
-    assert "without 'meta.json'" in one_line(bundle(tmp_path / "a.sog", names))
+    names = dict(list(names.items())[:30])
+    assert "without a scene" in one_line(bundle(tmp_path / "a.sog", names))
 
 
 def test_the_size_of_a_folder_is_that_of_its_files(tmp_path, files):
@@ -274,7 +274,8 @@ def test_a_member_with_a_false_size(tmp_path, files, one_line):
 
 
 def test_not_a_scene(tmp_path, one_line):
-    assert "without 'meta.json'" in one_line(bundle(tmp_path / "a.sog", {"x": b""}))
+    assert "contains 'x'" in one_line(bundle(tmp_path / "a.sog", {"x": b""}))
+    assert "without 'meta.json'" in one_line(bundle(tmp_path / "a.sog", {"x.webp": b""}))
     (tmp_path / "b.sog").write_bytes(b"PK\x03\x04 and no more")
     assert "zip" in one_line(tmp_path / "b.sog")
     assert "meta.json" in one_line(bundle(tmp_path / "c.sog", {"meta.json": b"[]"}))

@@ -6,6 +6,7 @@ tests/nightly/fuzz_files.py does so for hours.
 
 from __future__ import annotations
 
+import base64
 import functools
 import gzip
 import io
@@ -238,6 +239,79 @@ def _make_glb_json(folder: Path) -> None:
     valid = (folder / "a.glb").read_bytes()
     (size,) = struct.unpack_from("<I", valid, 12)
     (folder / "a.glb").write_bytes(valid[20 : 20 + size])
+
+
+def _gltf_files(folder: Path, name: str) -> None:
+    """A glTF file in JSON, with its data in a file, and the same in a data URI."""
+    write_gaussians(folder / "valid.glb", make_scene(30, 1))
+    valid = (folder / "valid.glb").read_bytes()
+    (size,) = struct.unpack_from("<I", valid, 12)
+    document = json.loads(valid[20 : 20 + size])
+    (folder / "a.bin").write_bytes(valid[28 + size :])
+    inline = base64.b64encode(valid[28 + size :]).decode()
+    uri = "a.bin" if name == "file.gltf" else f"data:application/octet-stream;base64,{inline}"
+    document["buffers"][0]["uri"] = uri
+    (folder / name).write_text(json.dumps(document))
+
+
+def _variant_ply(folder: Path) -> None:
+    """Two scales, colours, a 3D filter, SH of degree 4, doubles, an origin."""
+    names = ["x", "y", "z", "red", "green", "blue", "opacity", "scale_0", "scale_1", "filter_3D"]
+    names += [f"rot_{i}" for i in range(4)] + [f"f_rest_{i}" for i in range(72)]
+    lines = ["ply", "format binary_little_endian 1.0", "comment origin 1000 2000.5 -3"]
+    lines += ["element vertex 9"]
+    lines += [f"property {'double' if name in 'xyz' else 'float'} {name}" for name in names]
+    random = np.random.default_rng(0)
+    rows = np.empty(9, [("xyz", "<f8", 3), ("others", "<f4", len(names) - 3)])
+    rows["xyz"] = random.random((9, 3)) + 500_000
+    rows["others"] = random.random((9, len(names) - 3))
+    head = "\n".join([*lines, "end_header", ""]).encode()
+    (folder / "a.ply").write_bytes(head + rows.tobytes())
+
+
+def _zipped(members: dict[str, bytes], damaged: str = "") -> Callable[[bytes], bytes]:
+    """Packs a zip file with one member replaced, with valid sizes and checksums."""
+
+    def pack(data: bytes) -> bytes:
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as bundle:
+            for name, content in (members | {damaged: data}).items():
+                bundle.writestr(name, content)
+        return packed.getvalue()
+
+    return pack
+
+
+@functools.cache
+def _ply() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write_gaussians(Path(folder) / "a.ply", make_scene(9, 1))
+        return (Path(folder) / "a.ply").read_bytes()
+
+
+_PLACE_OF_SPLAT = {"position": [1, 2, 3], "rotation": [0, 1, 0, 0], "scale": [2, 2, 2]}
+_PROJECT = json.dumps({"splats": [{**_PLACE_OF_SPLAT, "visible": True, "saturation": 1}]}).encode()
+
+
+def _zip_reader(name: str, file: str, valid: Callable[[], bytes], **more: Any) -> Reader:
+    return Reader(
+        name, file, lambda folder: (folder / file).write_bytes(valid()), _reads(file), **more
+    )
+
+
+def _gsplat(folder: Path) -> None:
+    parameters = zip(
+        ("means", "scales", "quats", "opacities", "sh0", "shN"),
+        make_scene(9, 1).parameters().values(),
+        strict=True,
+    )
+    torch.save({"step": 7, "splats": dict(parameters)}, folder / "ckpt_7_rank0.pt")
+
+
+def _make_origin(folder: Path) -> None:
+    scene = make_scene(9, 0)
+    scene.origin = (500_000.0, 0.5, -7.0)
+    write_gaussians(folder / "a.spz", scene)
 
 
 def _reads(file: str) -> Callable[[Path], Any]:
@@ -512,6 +586,28 @@ READERS: tuple[Reader, ...] = (
     Reader("scene sog, a folder", "meta.json", _sog_folder, _reads("meta.json"), json=True),
     Reader("levels of detail", INDEX, _make_levels, _reads(INDEX), json=True),
     Reader("scene glb, its JSON", "a.glb", _make_glb_json, _reads("a.glb"), True, _glb_json),
+    *(
+        Reader(
+            f"scene {name}",
+            name,
+            lambda folder, name=name: _gltf_files(folder, name),  # type: ignore[misc]
+            _reads(name),
+            json=True,
+        )
+        for name in ("file.gltf", "inline.gltf")
+    ),
+    Reader("scene a.ply of other trainers", "a.ply", _variant_ply, _reads("a.ply")),
+    _zip_reader("scene in a zip file", "a.zip", lambda: _zipped({}, "a.ply")(_ply())),
+    _zip_reader("scene in a zip file, its PLY", "a.zip", _ply, pack=_zipped({}, "a.ply")),
+    _zip_reader(
+        "scene ssproj, its document",
+        "a.ssproj",
+        lambda: _PROJECT,
+        json=True,
+        pack=lambda data: _zipped({"splat_0.ply": _ply()}, "document.json")(data),
+    ),
+    Reader("gsplat checkpoint", "ckpt_7_rank0.pt", _gsplat, _reads("ckpt_7_rank0.pt")),
+    Reader("origin of a scene", "a.spz.origin.json", _make_origin, _reads("a.spz"), json=True),
     Reader("points a.ply", "a.ply", _make_points, lambda folder: read_points(folder / "a.ply")),
     *(_dataset("colmap-bin", f"sparse/0/{part}.bin") for part in ("cameras", "images", "points3D")),
     *(_dataset("colmap-txt", f"sparse/0/{part}.txt") for part in ("cameras", "images", "points3D")),

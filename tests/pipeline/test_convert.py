@@ -1,14 +1,21 @@
 """`convert` and its edits from Python."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
-from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.formats.spz import spz_version
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.decimate import file_size, gaussians_to_keep
+from snowsplat.pipeline.videos import VideoSize, cameras_along
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.ply import open_table
 
 
 def test_number_of_gaussians_to_keep():
@@ -76,3 +83,56 @@ def test_versions_of_spz(tmp_path):
             convert(tmp_path / "a.ply", tmp_path / name, spz_version=version)
         assert error.value.setting == "spz_version"
         assert not (tmp_path / name).exists()
+
+
+UTM = (500_000.0, 5_400_000.0, 300.0)
+
+
+def test_a_georeferenced_scene(tmp_path, caplog):
+    """The origin survives every way through files; doubles have the positions in the world."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = ((300, 3), (300, 3), (300, 4), (300,), (300, 1, 3), (300, 0, 3))
+    tensors = [torch.randn(shape, generator=generator) for shape in shapes]
+    scene = Gaussians(*tensors, origin=UTM)
+    write_gaussians(tmp_path / "local.ply", scene)
+    world = scene.means.double().numpy() + np.array(UTM)
+    convert(tmp_path / "local.ply", tmp_path / "utm.ply", georeferenced=True)
+    columns = open_table(tmp_path / "utm.ply").columns
+    assert [columns[axis] for axis in "xyz"] == ["f8"] * 3
+    np.testing.assert_allclose(read_arrays(tmp_path / "utm.ply").world_means(), world, atol=1e-7)
+    # By way of a format without a place for the origin, of limited size, and back to 0.
+    convert(tmp_path / "utm.ply", tmp_path / "a.spz", Edits(decimate="5KB"))
+    assert read_arrays(tmp_path / "a.spz").origin == UTM
+    assert sorted(path.name for path in tmp_path.glob("*.json")) == ["a.spz.origin.json"]
+    back = Edits(translate=tuple(-x for x in UTM))
+    convert(tmp_path / "utm.ply", tmp_path / "a.spz", back, overwrite=True)
+    assert not list(tmp_path.glob("*.json"))
+    at_0 = read_arrays(tmp_path / "a.spz")
+    assert at_0.origin == (0.0, 0.0, 0.0)
+    np.testing.assert_allclose(at_0.means, scene.means, atol=2e-4)
+    with pytest.raises(UserError, match="no doubles"):
+        convert(tmp_path / "utm.ply", tmp_path / "b.sog", georeferenced=True)
+    write_gaussians(tmp_path / "plain.ply", replace(scene, origin=(0.0, 0.0, 0.0)))
+    convert([tmp_path / "utm.ply", tmp_path / "plain.ply"], tmp_path / "both.ply")
+    assert "do they have the same frame?" in caplog.text
+
+
+def test_cameras_of_a_file_may_be_in_the_world(tmp_path):
+    """Both kinds of coordinates give the same path."""
+    scene = Gaussians(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(0)),
+        *(torch.zeros(shape) for shape in ((50, 3), (50, 4), (50,), (50, 1, 3), (50, 0, 3))),
+        origin=UTM,
+    )
+    pose = torch.tensor([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 4]], dtype=torch.float64)
+    local = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, pose)
+    world = local.seen_from((-UTM[0], -UTM[1], -UTM[2]))
+    paths = []
+    for name, camera in (("local", local), ("world", world)):
+        other = camera.seen_from((1.0, 0.0, 0.0))
+        write_cameras(tmp_path / f"{name}.json", [("a", camera), ("b", other)])
+        size = VideoSize(None, None)
+        paths.append(cameras_along(str(tmp_path / f"{name}.json"), scene, None, 3, size))
+    for a, b in zip(*paths, strict=True):
+        torch.testing.assert_close(a.cam_from_world, b.cam_from_world, rtol=0, atol=1e-6)
+        assert float(a.position.norm()) < 10

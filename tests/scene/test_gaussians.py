@@ -119,7 +119,7 @@ def test_random_in_bounds_is_inside_and_repeatable():
         assert torch.equal(tensor, b.parameters()[name])
 
 
-def test_finite_rows():
+def test_usable_rows():
     gaussians = Gaussians(
         torch.zeros(4, 3),
         torch.zeros(4, 3),
@@ -129,9 +129,11 @@ def test_finite_rows():
         torch.zeros(4, 0, 3),
     )
     gaussians.quats[1, 3] = torch.nan
-    gaussians.opacity_logits[2] = torch.inf
-    assert gaussians.finite_rows().tolist() == [True, False, False, True]
-    assert gaussians.select(torch.arange(0)).finite_rows().tolist() == []
+    gaussians.log_scales[2, 0] = torch.inf
+    gaussians.opacity_logits[3], gaussians.opacity_logits[0] = torch.inf, -torch.inf
+    gaussians.log_scales[3, 1] = -torch.inf
+    assert gaussians.usable_rows().tolist() == [True, False, False, True]
+    assert gaussians.select(torch.arange(0)).usable_rows().tolist() == []
 
 
 def test_select_in_place_is_select():

@@ -172,4 +172,4 @@ def test_small_and_unusual_scenes():
     equal.opacity_logits[::2] = -30.0
     (one,) = simplify(equal, 1).means
     torch.testing.assert_close(one, equal.means[0])
-    assert bool(simplify(equal, 7).finite_rows().all())
+    assert bool(simplify(equal, 7).usable_rows().all())

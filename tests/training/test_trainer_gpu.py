@@ -130,7 +130,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         runner = trainer.runner
         runner.capacity = ops.Capacity(5000, on_device(torch.zeros(1, dtype=torch.int64)))
         runner._required = runner.capacity.required
-        runner._nonfinite_rows = on_device(runner._nonfinite_rows)
+        runner._nonusable_rows = on_device(runner._nonusable_rows)
         view = replace(
             view,
             camera=replace(view.camera, cam_from_world=on_device(view.camera.cam_from_world)),
@@ -162,7 +162,7 @@ def test_training_on_a_gpu(dataset: Dataset, config: TrainConfig) -> None:
     torch.testing.assert_close(losses(trainer, 9), expected, rtol=tolerance, atol=0)
     trainer.run()
     assert trainer.gaussians.means.device.type == "cuda"
-    assert bool(trainer.gaussians.finite_rows().all())
+    assert bool(trainer.gaussians.usable_rows().all())
     again = Trainer(dataset, config, device=device)
     again.load_state({name: tensor.cpu() for name, tensor in trainer.state_tensors().items()})
     assert len(again.gaussians) == len(trainer.gaussians)

@@ -46,14 +46,14 @@ class Convert:
       If there are several scenes, they are merged first. Then the edits are
       applied in this order: --crop, --sh-degree, --decimate, --rotate, --scale,
       --translate. Coordinates are in the frame of PLY files: x right, y down, z
-      forward.
+      forward. They are those in the world, also for a scene far away from 0.
       --decimate is better with an output folder than with a scene file: the
       result is then trained to look like the whole scene from its cameras.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()
     """One or more scenes, followed by the file to write. A scene is a file of any format, an output
-    folder, of which the last scene is used, or a folder with a lod-meta.json."""
+    folder, of which the last scene is used, or a folder with a lod-meta.json or a SOG meta.json."""
     sh_degree: Annotated[int | None, flag("N", default="that of the scene")] = None
     """Reduce the spherical harmonics (view-dependent colour) to this degree, 0 to 3."""
     crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
@@ -71,6 +71,9 @@ class Convert:
     spz_version: Annotated[Literal[2, 3, 4] | None, flag("{2,3,4}", default="3")] = None
     """Version of an .spz file: 2 for older viewers, with coarser rotations; 4 for the newest
     viewers, faster to load."""
+    georeferenced: Annotated[bool, switch()] = False
+    """Write positions in the world, as doubles (.ply), for a scene that is far away from 0. Without
+    it, they are relative to the origin that is noted in the file or beside it."""
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
 
@@ -96,6 +99,7 @@ class Convert:
                 edits,
                 dataset=self.refine,
                 spz_version=self.spz_version,
+                georeferenced=self.georeferenced,
                 overwrite=self.overwrite,
                 observer=observer,
             )

@@ -82,4 +82,6 @@ def _text(value: Any) -> str:
             if any(isinstance(v, list) for v in value)
             else (" ".join(map(_text, value)) or "none")
         )
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):  # large numbers are coordinates, for example of UTM
+        return f"{value:.5g}" if abs(value) < 1e5 else f"{value:.12g}"
+    return str(value)

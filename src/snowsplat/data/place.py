@@ -31,14 +31,9 @@ def moved_to_origin(
     origin = origin_of(known)
     if origin == HERE:
         return list(posed), _float32(points), origin
-    offset = torch.tensor(origin, dtype=torch.float64)
-    moved = []
-    for image in posed:
-        pose = image.camera.cam_from_world.clone()
-        pose[:, 3] += pose[:, :3] @ offset
-        moved.append(replace(image, camera=replace(image.camera, cam_from_world=pose)))
+    moved = [replace(image, camera=image.camera.seen_from(origin)) for image in posed]
     if points is not None:
-        points = Points(points.xyz.double() - offset, points.rgb)
+        points = Points(points.xyz.double() - torch.tensor(origin, dtype=torch.float64), points.rgb)
     return moved, _float32(points), origin
 
 

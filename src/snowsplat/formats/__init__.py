@@ -7,10 +7,15 @@ write `GaussianArrays` with NumPy; torch is imported when these become `Gaussian
 from __future__ import annotations
 
 import logging
+import math
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from snowsplat.formats.gaussian_arrays import GaussianArrays
+from snowsplat.formats.origin_file import read_origin, write_origin
 from snowsplat.formats.registry import (
     FORMATS,
     Format,
@@ -18,12 +23,15 @@ from snowsplat.formats.registry import (
     format_for_writing,
     register_format,
 )
+from snowsplat.scene.origin import HERE, added
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
 
 logger = logging.getLogger(__name__)
+
+_SAMPLE = 1 << 14  # Gaussians from which precision is estimated
 
 __all__ = [
     "FORMATS",
@@ -48,7 +56,32 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     format = format_for_reading(path)
     if format.read is None:
         raise UserError(f"{path}: {format.name} files can be written, not read")
-    return format.read(path)
+    scene = format.read(path)
+    _name_coarse_positions(path, scene)
+    if format.stores_origin:
+        return scene
+    return replace(scene, origin=added(scene.origin, read_origin(path)))
+
+
+def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:
+    """Warn if the positions in a file are rounded by more than a tenth of a Gaussian.
+
+    float32 is coarse far away from 0; only a program that has the exact positions can mend this.
+    """
+    sample = scene.select(slice(None, None, len(scene.means) // _SAMPLE + 1))
+    sample = sample.select(sample.usable_rows())
+    if not len(sample.means):
+        return
+    farthest = float(np.abs(np.median(sample.means, 0)).max())
+    step = float(np.spacing(np.float32(farthest)))
+    if step > 0.1 * math.exp(min(80.0, float(np.median(sample.log_scales.max(1))))):
+        logger.warning(
+            "%s: its positions are rounded to steps of %.2g, because they are %.4g from 0; export "
+            "it nearer to 0, or as a PLY with doubles",
+            path,
+            step,
+            farthest,
+        )
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
@@ -56,8 +89,14 @@ def read_gaussians(path: Path | str) -> Gaussians:
     return read_arrays(path).to_gaussians()
 
 
-def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+def write_gaussians(path: Path | str, gaussians: Gaussians, **options: Any) -> None:
     """Write a scene file atomically, in the format that the suffix of its name selects.
+
+    The origin of a scene that has one is in the file or, if the format cannot store it, in
+    NAME.origin.json beside it.
+
+    Args:
+        options: of the function that writes the format, such as ``version`` of `write_spz`.
 
     Raises:
         UserError: the suffix belongs to no format that can be written.
@@ -66,7 +105,9 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     path = Path(path)
     format = format_for_writing(path)
     assert format.write is not None
-    format.write(path, GaussianArrays.from_gaussians(gaussians))
+    format.write(path, GaussianArrays.from_gaussians(gaussians), **options)
+    if not format.stores_origin:
+        write_origin(path, gaussians.origin if format.read else HERE)
     if gaussians.antialiased and not format.marks_antialiased:
         logger.warning(
             "%s: the scene is antialiased, but %s files cannot say so: viewers will show fine "

@@ -19,13 +19,14 @@ those of the uncompressed PLY. The layout was taken from
 github.com/playcanvas/splat-transform (MIT).
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.ply import is_antialiased, mode_comments
+from snowsplat.formats.ply import is_antialiased, origin_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -51,14 +52,17 @@ def is_compressed_ply(head: bytes) -> bool:
 
 
 @np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
-def read_compressed_ply(path: Path | str) -> GaussianArrays:
+def read_compressed_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     """Read a scene of any SH degree.
+
+    Args:
+        data: see `open_table`.
 
     Raises:
         UserError: the file cannot be read, is damaged or truncated, or is another kind of PLY file.
     """
     path = Path(path)
-    vertices, chunks = open_table(path), open_table(path, "chunk")
+    vertices, chunks = open_table(path, data=data), open_table(path, "chunk", data)
     missing = [n for n in _WORDS if vertices.columns.get(n) != "u4"]
     missing += [n for n in _GEOMETRY_BOUNDS if n not in chunks.columns]
     if missing:
@@ -81,24 +85,25 @@ def read_compressed_ply(path: Path | str) -> GaussianArrays:
         np.float32(2)
     )
     steps = _largest_integers(_XYZ)
-    return decoded(
+    scene = decoded(
         path,
-        _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), steps),
+        _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), steps).astype("f4"),
         _dequantize(bounds[:, 6:9], bounds[:, 9:], _fields(words[:, 2], _XYZ), steps),
         packing.from_largest_of_four(largest, others),
         packing.opacity_logits(rgba[:, 3]),
         (_dequantize(colors[:, :3], colors[:, 3:], rgba[:, :3], 255)[:, None] - 0.5) / SH_C0,
-        _read_sh(path, vertices),
+        _read_sh(path, vertices, data),
         antialiased=is_antialiased(vertices.comments),
     )
+    return replace(scene, origin=origin_in(vertices.comments))
 
 
-def _read_sh(path: Path, vertices: PlyTable) -> np.ndarray:
+def _read_sh(path: Path, vertices: PlyTable, data: bytes | None) -> np.ndarray:
     """sh_rest (N, K, 3); K = 0 if the file has no ``sh`` element."""
     n = vertices.count
     if "sh" not in vertices.elements:
         return np.zeros((n, 0, 3), np.float32)
-    table = open_table(path, "sh")
+    table = open_table(path, "sh", data)
     k = len(table.columns) // 3
     names = [f"f_rest_{i}" for i in range(3 * k)]
     if k not in SH_REST_COUNTS or list(table.columns) != names or table.count != n:
@@ -165,6 +170,9 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     order = packing.spatial_order(packable.means)
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packable.select(order)
     n, k = sh_rest.shape[:2]
+    cut = packing.Cut(path, "compressed PLY", n)
+    packing.cut_scales(cut, log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT, step=0)
+    cut.note("SH", (np.abs(sh_rest) > _SH_LIMIT).any((1, 2)), "at most 4", rare=True)
     log_scales = np.clip(log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
     colors = 0.5 + SH_C0 * sh_dc[:, 0]
 
@@ -189,7 +197,8 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     if k:
         elements.append(("sh", n, [("uchar", f"f_rest_{i}") for i in range(3 * k)]))
     limits = np.concatenate(bounds, 1).astype("<f4")
-    head = header_of(elements, mode_comments(gaussians.antialiased))
+    head = header_of(elements, scene_comments(gaussians.antialiased, gaussians.origin))
+    cut.report(".ply keeps them")
     return [head, limits.tobytes(), words.tobytes(), sh.tobytes()]
 
 

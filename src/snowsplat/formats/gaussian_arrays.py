@@ -14,17 +14,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from snowsplat.scene.origin import HERE, Origin, origin_of
+
 if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
 
 logger = logging.getLogger(__name__)
+
+_SAMPLE = 1 << 16  # Gaussians from which the usual size is estimated
 
 
 @dataclass(frozen=True, eq=False)  # `==` of arrays has no truth value
 class GaussianArrays:
     """N Gaussians: the parameters of `snowsplat.Gaussians` as float32 arrays, in its order.
 
-    ``antialiased``: see `snowsplat.Gaussians`. Iterating yields the six arrays.
+    ``antialiased`` and ``origin``: see `snowsplat.Gaussians`. Iterating yields the six arrays.
     """
 
     means: np.ndarray  # (N, 3) world units
@@ -34,6 +38,7 @@ class GaussianArrays:
     sh_dc: np.ndarray  # (N, 1, 3)
     sh_rest: np.ndarray  # (N, K, 3), K = 0, 3, 8 or 15
     antialiased: bool = field(default=False, kw_only=True)
+    origin: Origin = field(default=HERE, kw_only=True)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         yield from (self.means, self.log_scales, self.quats)
@@ -46,7 +51,7 @@ class GaussianArrays:
         """
         tensors = gaussians.parameters().values()
         arrays = (tensor.detach().cpu().float().numpy() for tensor in tensors)
-        return cls(*arrays, antialiased=gaussians.antialiased)
+        return cls(*arrays, antialiased=gaussians.antialiased, origin=gaussians.origin)
 
     @classmethod
     def empty(cls, rest: int = 0) -> GaussianArrays:
@@ -58,14 +63,15 @@ class GaussianArrays:
     def cat(parts: Sequence[GaussianArrays]) -> GaussianArrays:
         """All rows of ``parts`` in order, at the highest SH degree among them.
 
-        They are marked as the first part.
+        They are marked as the first part, whose origin is that of all.
         """
         parts = parts or [GaussianArrays.empty()]
         most = max(part.sh_rest.shape[1] for part in parts)
         rest = [np.pad(p.sh_rest, ((0, 0), (0, most - p.sh_rest.shape[1]), (0, 0))) for p in parts]
         padded = [replace(part, sh_rest=each) for part, each in zip(parts, rest, strict=True)]
-        columns = (np.concatenate(arrays) for arrays in zip(*padded, strict=True))
-        return GaussianArrays(*columns, antialiased=parts[0].antialiased)
+        moved = [part.seen_from(parts[0].origin) for part in padded]
+        columns = (np.concatenate(arrays) for arrays in zip(*moved, strict=True))
+        return parts[0]._with(*columns)
 
     def to_gaussians(self) -> Gaussians:
         """As tensors on the CPU, which share memory with the arrays."""
@@ -73,35 +79,82 @@ class GaussianArrays:
 
         from snowsplat.scene.gaussians import Gaussians
 
-        return Gaussians(*map(torch.from_numpy, self), antialiased=self.antialiased)
+        tensors = map(torch.from_numpy, self)
+        return Gaussians(*tensors, antialiased=self.antialiased, origin=self.origin)
 
     def select(self, index: np.ndarray | slice) -> GaussianArrays:
         """The rows ``index``: (M,) integers in any order, an (N,) bool mask, or a slice."""
-        return GaussianArrays(*(array[index] for array in self), antialiased=self.antialiased)
+        return self._with(*(array[index] for array in self))
 
-    def finite_rows(self) -> np.ndarray:
-        """(N,) bool: Gaussians whose parameters are all finite."""
-        finite = np.ones(len(self.means), bool)
-        for array in self:
-            finite &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-        return finite
+    def world_means(self) -> np.ndarray:
+        """(N, 3) float64: the positions in the world."""
+        return self.means.astype(np.float64) + self.origin
+
+    def seen_from(self, origin: Origin) -> GaussianArrays:
+        """The same Gaussians in the world, with positions relative to another origin."""
+        if origin == self.origin:
+            return self
+        means = (self.world_means() - origin).astype(np.float32)
+        return replace(self, means=means, origin=origin)
+
+    def usable_rows(self) -> np.ndarray:
+        """(N,) bool: see `snowsplat.Gaussians.usable_rows`."""
+        return ~np.any(list(self._unusable().values()), axis=0)
+
+    def _unusable(self) -> dict[str, np.ndarray]:
+        """(N,) bool by what is wrong."""
+        rows = {
+            "positions": ~np.isfinite(self.means).all(1),
+            "scales": (np.isnan(self.log_scales) | (self.log_scales == np.inf)).any(1),
+            "rotations": ~np.isfinite(self.quats).all(1),
+            "opacities": np.isnan(self.opacity_logits),
+        }
+        sh = np.isfinite(self.sh_dc).all((1, 2)) & np.isfinite(self.sh_rest).all((1, 2))
+        return rows | {"colours": ~sh}
+
+    def _with(self, *arrays: np.ndarray) -> GaussianArrays:
+        return GaussianArrays(*arrays, antialiased=self.antialiased, origin=self.origin)
 
 
 def decoded(path: Path, *arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
-    """The six arrays read from ``path``, as float32; rows that are not finite are skipped."""
-    as_float32 = (np.array(array, np.float32) for array in arrays)
-    return skip_nonfinite(path, GaussianArrays(*as_float32, antialiased=antialiased))
+    """The six arrays read from ``path``, as float32; rows that are not usable are left out.
+
+    Positions in float64 are stored relative to an origin if float32 would lose precision.
+    """
+    return without_unusable(path, placed(*arrays, antialiased=antialiased))
 
 
-def skip_nonfinite(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
-    """The Gaussians whose parameters are all finite; logs a warning if ``path`` has others."""
+def placed(*arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
+    """The six arrays as float32. Positions in float64 get an origin if they need one."""
+    means, log_scales, *others = arrays
+    origin = HERE
+    if means.dtype == np.float64:
+        sizes = log_scales[:: -(-len(log_scales) // _SAMPLE) or 1]
+        size = float(np.exp(np.median(sizes))) if sizes.size else 0.0
+        origin = origin_of(means, size)
+        means = means - origin if any(origin) else means
+    as_float32 = (np.array(array, np.float32) for array in (means, log_scales, *others))
+    return GaussianArrays(*as_float32, antialiased=antialiased, origin=origin)
+
+
+def without_unusable(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
+    """The usable Gaussians; a warning names ``path``, the number of the others, and the reason."""
+    problem = unusable(gaussians)
+    if problem is None:
+        return gaussians
+    logger.warning("%s: %s; left out", path, problem)
+    return gaussians.select(gaussians.usable_rows())
+
+
+def unusable(gaussians: GaussianArrays) -> str | None:
+    """How many Gaussians are not usable, and why, as text; None if all are."""
     # In most files all values are finite. Then all sums are finite, which is a much faster test.
     with np.errstate(all="ignore"):
         if all(np.isfinite(array.sum()) for array in gaussians):
-            return gaussians
-    finite = gaussians.finite_rows()
-    count = int((~finite).sum())
+            return None
+    reasons = {what: int(rows.sum()) for what, rows in gaussians._unusable().items()}
+    count = int((~gaussians.usable_rows()).sum())
     if not count:
-        return gaussians
-    logger.warning("%s: %d Gaussians are not finite; skipped", path, count)
-    return gaussians.select(finite)
+        return None
+    found = ", ".join(f"{what} of {n:,}" for what, n in reasons.items() if n)
+    return f"{count:,} of {len(gaussians.means):,} Gaussians are not finite ({found})"

@@ -1,20 +1,25 @@
-"""The GLB container: the JSON and the binary chunk, accessors as arrays, nodes as matrices.
+"""The containers of glTF, `.glb` and `.gltf`: buffers, accessors as arrays, nodes as matrices.
 
-Sizes in the JSON are compared with the size of the binary chunk before memory is allocated.
+Sizes in the JSON are compared with the size of the buffers before memory is allocated. A buffer is
+the binary chunk of the file, a data URI, or a file inside of the folder of the JSON.
 Specification: Khronos, glTF 2.0, sections 3.6 and 4.4.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import struct
 from collections import deque
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
-from snowsplat.util.safe_json import parse_json
+from snowsplat.util.safe_json import inside, is_file, parse_json, quoted
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -34,13 +39,74 @@ class Damaged(Exception):
     """The file is damaged or not supported. The caller adds the path to the message."""
 
 
-def unpack(data: bytes) -> tuple[dict[str, Any], memoryview]:
-    """The JSON and the binary chunk (empty if there is none).
+class Document:
+    """A glTF file: its JSON, and its buffers, which are read when they are needed.
+
+    Attributes:
+        json: the JSON object.
+        size: bytes of the file and of the buffers that were read so far.
+    """
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        """Raises: Damaged: neither GLB 2 nor JSON, or chunks that exceed the file."""
+        self._folder = path.parent
+        self._buffers: dict[str | None, memoryview] = {}
+        text = data
+        if data[:4] == MAGIC:
+            text, self._buffers[None] = _chunks(data)
+        try:
+            document = parse_json(text)
+        except ValueError:
+            document = None
+        if not isinstance(document, dict):
+            raise Damaged("its JSON is invalid")
+        self.json: dict[str, Any] = document
+        self.size = len(data)
+
+    def buffer(self, index: int) -> memoryview:
+        """The content of a buffer.
+
+        Raises:
+            Damaged: it is missing, cannot be read, or is outside of the folder.
+            KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
+        """
+        uri = _item(self.json, "buffers", index).get("uri")
+        if uri is None and index != 0:
+            raise Damaged(f"its buffer {index} has no data")
+        if uri not in self._buffers:
+            content = self._read(uri)
+            self.size += len(content)
+            self._buffers[uri] = memoryview(content)
+        return self._buffers[uri]
+
+    def _read(self, uri: str | None) -> bytes:
+        if uri is None:
+            return b""
+        if uri.startswith("data:"):
+            head, _, text = uri.partition(",")
+            try:
+                return base64.b64decode(text, validate=True) if head.endswith(";base64") else b""
+            except (binascii.Error, ValueError):
+                raise Damaged("one of its data URIs is not base64") from None
+        name = unquote(uri)
+        path = None if "://" in name else inside(self._folder, name)
+        if path is None:
+            raise Damaged(f"it refers to {quoted(name)}, which is outside of its folder")
+        if not is_file(path):
+            raise Damaged(f"its data file {quoted(name)} is missing")
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise Damaged(f"{quoted(name)} cannot be read ({error.strerror or error})") from None
+
+
+def _chunks(data: bytes) -> tuple[bytes, memoryview]:
+    """The JSON text and the binary chunk (empty if there is none) of a GLB file.
 
     Raises:
-        Damaged: not GLB 2, chunks that exceed the file, or invalid JSON.
+        Damaged: not GLB 2, or chunks that exceed the file.
     """
-    if len(data) < 20 or data[:4] != MAGIC:
+    if len(data) < 20:
         raise Damaged("not a GLB file")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
@@ -56,14 +122,8 @@ def unpack(data: bytes) -> tuple[dict[str, Any], memoryview]:
         position += 8 + size
     if not chunks or chunks[0][0] != _JSON:
         raise Damaged("its first chunk is not JSON")
-    try:
-        document = parse_json(bytes(chunks[0][1]))
-    except ValueError:
-        document = None
-    if not isinstance(document, dict):
-        raise Damaged("its JSON is invalid")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _BIN else memoryview(b"")
-    return document, binary
+    return bytes(chunks[0][1]), binary
 
 
 def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:
@@ -79,30 +139,28 @@ def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:
             yield array.tobytes()
 
 
-def accessor(document: dict[str, Any], binary: memoryview, index: int, kind: str) -> np.ndarray:
-    """The (count, width) float32 values of an accessor of type ``kind`` (SCALAR, VEC3, VEC4).
+def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
+    """The (count, width) float32 values of an accessor whose type is one of ``kinds``, as "VEC3".
 
     Raises:
-        Damaged: another type, or data outside of the binary chunk.
+        Damaged: another type, or data outside of its buffer.
         KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
     """
-    entry = _item(document, "accessors", index)
-    if entry["type"] != kind or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
+    entry = _item(document.json, "accessors", index)
+    if entry["type"] not in kinds or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
         raise Damaged(f"its accessor {index} does not have the type of its attribute")
     code, divisor = _COMPONENTS[entry["componentType"]]
-    dtype, width, count = np.dtype(code), _WIDTHS[kind], _non_negative(entry["count"])
-    view = _item(document, "bufferViews", entry["bufferView"])
-    buffer = _item(document, "buffers", view["buffer"])
-    if view["buffer"] != 0 or "uri" in buffer:
-        raise Damaged("its data is in another file, which is not supported")
+    dtype, width, count = np.dtype(code), _WIDTHS[entry["type"]], _non_negative(entry["count"])
+    view = _item(document.json, "bufferViews", entry["bufferView"])
+    data = document.buffer(view["buffer"])
     row = width * dtype.itemsize
     stride = _non_negative(view.get("byteStride", row))
     start, length = _non_negative(view.get("byteOffset", 0)), _non_negative(view["byteLength"])
     offset = _non_negative(entry.get("byteOffset", 0))
     needed = offset + (stride * (count - 1) + row if count else 0)
-    if stride < row or needed > length or start + length > len(binary):
+    if stride < row or needed > length or start + length > len(data):
         raise Damaged(f"its accessor {index} exceeds the file")
-    values = np.ndarray((count, width), dtype, binary, start + offset, (stride, dtype.itemsize))
+    values = np.ndarray((count, width), dtype, data, start + offset, (stride, dtype.itemsize))
     result = values.astype(np.float32)
     if entry.get("normalized", False) and divisor != 1.0:
         # The most negative integer also means -1.

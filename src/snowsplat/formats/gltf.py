@@ -1,4 +1,6 @@
-"""glTF files (`.glb`) with the extension KHR_gaussian_splatting, in full precision.
+"""glTF files with the extension KHR_gaussian_splatting, in full precision.
+
+`.glb` files are read and written, `.gltf` files, whose data may be in files beside them, are read.
 
 The splats are a primitive of points with one accessor per attribute: POSITION; ROTATION,
 quaternions xyzw; SCALE, the standard deviations themselves; OPACITY in 0 … 1; SH_DEGREE_l_COEF_n,
@@ -6,12 +8,14 @@ with the basis and order of our renderer. COLOR_0 lets programs without the exte
 points. A Gaussian of SH degree 3 takes about 236 bytes.
 
 The frame of glTF is x right, y up, z towards the viewer: our frame, rotated by 180° about x.
-Readers must apply the transforms of the nodes, which place the splats in the scene. Specification:
+Readers must apply the transforms of the nodes, which place the splats in the scene. Numbers in the
+JSON have float64: the translation of the node is the `scene.origin` of the splats. Specification:
 Khronos, github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. It has no
 mark for antialiased scenes.
 """
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +24,7 @@ import numpy as np
 from snowsplat.formats import glb, packing
 from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.glb import Damaged
+from snowsplat.formats.glb import Damaged, Document
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -32,11 +36,13 @@ EXTENSION = "KHR_gaussian_splatting"
 #: Extensions that a file may require.
 _UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization"}
 _SPACES = ("srgb_rec709_display", "lin_rec709_display")
+_ROUNDING = 1e-3  # of the largest scale
 _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colour
 _MOST_COPIES = 8  # maximum number of copies of the splats, by nodes that share a mesh
 _MOST_PRIMITIVES = 1 << 20  # maximum number of primitives of all nodes
 _MOST_PARTS = 1 << 12  # maximum number of primitives with splats
 _OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
+_LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
 _GLB_LIMIT = (1 << 32) - 1
 _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
 
@@ -46,8 +52,13 @@ def is_glb(head: bytes) -> bool:
     return head.startswith(glb.MAGIC)
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
-def read_glb(path: Path | str) -> GaussianArrays:
+def is_gltf(head: bytes) -> bool:
+    """Whether a file that begins with ``head`` is a glTF file in JSON, with splats."""
+    return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{") and EXTENSION.encode() in head
+
+
+@np.errstate(all="ignore")  # unusable Gaussians are left out at the end
+def read_gltf(path: Path | str) -> GaussianArrays:
     """Read all splats of the scene, placed by their nodes, as one set of Gaussians.
 
     Raises:
@@ -57,33 +68,46 @@ def read_glb(path: Path | str) -> GaussianArrays:
     path = Path(path)
     data = packing.read_file(path)
     try:
-        document, binary = glb.unpack(data)
-        unknown = set(document.get("extensionsRequired", [])) - _UNDERSTOOD
+        document = glb.Document(path, data)
+        unknown = set(document.json.get("extensionsRequired", [])) - _UNDERSTOOD
         if unknown:
             raise Damaged(f"it needs {sorted(map(str, unknown))[0][:60]}, which is not supported")
-        parts = _parts(path, document, binary, _MOST_COPIES * len(data) // _LEAST_BYTES)
-        if not parts and EXTENSION not in document.get("extensionsUsed", []):
-            raise UserError(f"{path}: a GLB file without Gaussian splats ({EXTENSION})")
+        notes: set[str] = set()
+        parts = _parts(document, notes)
+        if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
+            raise UserError(f"{path}: a glTF file without Gaussian splats ({EXTENSION})")
+        if _are_logarithms([part.log_scales for part, _ in parts]):
+            notes.add(
+                "SCALE has negative values, so it is read as logarithms, as in the draft of "
+                f"{EXTENSION}"
+            )
+        else:
+            parts = [(_with_logarithms(part), matrix) for part, matrix in parts]
+        placed = [_transform(part, matrix) for part, matrix in parts]
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
         raise UserError(f"{path}: its JSON is not valid glTF; copy or export it again") from None
-    scene = GaussianArrays.cat(parts)
+    for note in sorted(notes):
+        logger.warning("%s: %s", path, note)
+    scene = GaussianArrays.cat(placed)
     means, quats, sh_rest = flip_axes(scene.means, scene.quats, scene.sh_rest, UP_BACK)
+    if any(any(part.origin) for part in placed):
+        means = np.concatenate([part.world_means() for part in placed]) * UP_BACK
     return decoded(path, means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
 
 
-def _parts(
-    path: Path, document: dict[str, Any], binary: memoryview, most: int
-) -> list[GaussianArrays]:
-    """The splats of each primitive that has splats, in the frame of the glTF scene.
+def _parts(document: Document, notes: set[str]) -> list[tuple[GaussianArrays, np.ndarray]]:
+    """The splats of each primitive that has splats, and ``world_from_mesh`` (4, 4).
+
+    The log scales are SCALE as it is stored; ``notes`` gets what is not read as it is meant.
 
     Raises:
-        Damaged: more than ``most`` splats, or another violation of the specification.
+        Damaged: more splats than the file can have, or another violation of the specification.
     """
-    parts: list[GaussianArrays] = []
-    seen = 0
-    for mesh, world_from_mesh in glb.meshes(document):
+    parts: list[tuple[GaussianArrays, np.ndarray]] = []
+    seen = count = 0
+    for mesh, world_from_mesh in glb.meshes(document.json):
         seen += len(mesh["primitives"])
         if seen > _MOST_PRIMITIVES:
             raise Damaged(f"it has more than {_MOST_PRIMITIVES} primitives")
@@ -91,30 +115,49 @@ def _parts(
             extension = primitive.get("extensions", {}).get(EXTENSION)
             if extension is None:
                 continue
-            _check(path, primitive, extension)
-            part = _splats(document, binary, primitive["attributes"])
-            most -= len(part.means)
-            if most < 0 or len(parts) >= _MOST_PARTS:
+            _check(primitive, extension, notes)
+            part = _splats(document, primitive["attributes"], notes)
+            count += len(part.means)
+            if count > _MOST_COPIES * document.size // _LEAST_BYTES or len(parts) >= _MOST_PARTS:
                 raise Damaged("its nodes repeat the splats too often")
-            parts.append(_transform(part, world_from_mesh))
+            parts.append((part, world_from_mesh))
     return parts
 
 
-def _check(path: Path, primitive: dict[str, Any], extension: dict[str, Any]) -> None:
+def _check(primitive: dict[str, Any], extension: dict[str, Any], notes: set[str]) -> None:
     if primitive.get("mode", 4) != _POINTS:
         raise Damaged("its splats are not points")
-    if extension.get("kernel", "ellipse") != "ellipse":
-        raise Damaged(f"its splats have the kernel {quoted(extension['kernel'])}, not ellipse")
     if not any(name.startswith(f"{EXTENSION}:") for name in primitive["attributes"]):
         packed = ", ".join(map(str, extension.get("extensions", {}))) or "an unknown method"
         raise Damaged(f"its splats are compressed by {packed[:60]}, which is not supported")
+    kernel = extension.get("kernel", "ellipse")
+    if kernel != "ellipse":
+        notes.add(f"splats of the unknown kernel {quoted(kernel)} are read as ellipses")
     space = extension.get("colorSpace", _SPACES[0])
     if space != _SPACES[0]:
-        logger.warning("%s: colours of %s are read as sRGB", path, str(space)[:40])
+        notes.add(f"colours of {str(space)[:40]} are read as sRGB")
+
+
+def _are_logarithms(scales: list[np.ndarray]) -> bool:
+    """Whether the SCALE of all primitives together is logarithms: it has negative values.
+
+    Standard deviations are never negative; those of a draft of the extension, logarithms, usually
+    are. Negative values of less than 0.1% of the largest one are taken for rounding errors.
+    """
+    values = [part[np.isfinite(part)] for part in scales]
+    low = min((float(part.min(initial=0)) for part in values), default=0.0)
+    high = max((float(part.max(initial=0)) for part in values), default=0.0)
+    return low < -_ROUNDING * high
+
+
+def _with_logarithms(part: GaussianArrays) -> GaussianArrays:
+    return replace(part, log_scales=packing.log_scales(part.log_scales))
 
 
 def _transform(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
     """The splats in the frame of the scene; ``world_from_mesh`` is (4, 4).
+
+    Positions are relative to an origin: float32 may not be able to store the translation.
 
     Raises:
         Damaged: not a similarity.
@@ -127,29 +170,30 @@ def _transform(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArr
         raise Damaged("one of its nodes flattens its splats")
     if scale.max() > 1.0001 * scale.min():
         raise Damaged("one of its nodes scales its splats by different factors per axis")
-    import torch
+    x, y, z = world_from_mesh[:3, 3].tolist()
+    if not np.array_equal(matrix, np.eye(3)):
+        import torch
 
-    from snowsplat.scene.edit import transform
-    from snowsplat.scene.geometry import Similarity
+        from snowsplat.scene.edit import transform
+        from snowsplat.scene.geometry import Similarity
 
-    try:
-        similarity = Similarity(
-            float(scale.mean()),
-            torch.from_numpy(matrix / scale),
-            torch.from_numpy(world_from_mesh[:3, 3].copy()),
-        )
-    except ValueError:
-        raise Damaged("one of its nodes shears or mirrors its splats") from None
-    return GaussianArrays.from_gaussians(transform(part.to_gaussians(), similarity))
+        try:
+            turn = Similarity(
+                float(scale.mean()),
+                torch.from_numpy(matrix / scale),
+                torch.zeros(3, dtype=torch.float64),
+            )
+        except ValueError:
+            raise Damaged("one of its nodes shears or mirrors its splats") from None
+        part = GaussianArrays.from_gaussians(transform(part.to_gaussians(), turn))
+    return replace(part, origin=(x, y, z))
 
 
-def _splats(
-    document: dict[str, Any], binary: memoryview, attributes: dict[str, Any]
-) -> GaussianArrays:
-    """The splats of a primitive, in the frame of its mesh."""
+def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> GaussianArrays:
+    """The splats of a primitive, in the frame of its mesh; the log scales are SCALE as stored."""
 
-    def read(name: str, kind: str = "VEC3") -> np.ndarray:
-        return glb.accessor(document, binary, attributes[name], kind)
+    def read(name: str, *kinds: str) -> np.ndarray:
+        return glb.accessor(document, attributes[name], *(kinds or ("VEC3",)))
 
     means = read("POSITION")
     quats = read(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]]
@@ -158,12 +202,16 @@ def _splats(
     opacity = np.clip(opacity, *_OPACITY_RANGE)
     names = _coefficients(3)
     present = [name for name in names if name in attributes]
-    if present != names[: len(present)] or len(present) - 1 not in SH_REST_COUNTS:
+    if not present and "COLOR_0" in attributes:
+        notes.add("it has no SH coefficients; the colours are those of COLOR_0")
+        sh = [(_display(read("COLOR_0", "VEC3", "VEC4")[:, :3]) - 0.5) / SH_C0]
+    elif present != names[: len(present)] or len(present) - 1 not in SH_REST_COUNTS:
         raise Damaged(f"its {len(present)} SH coefficients do not match an SH degree")
-    sh = [read(name) for name in present]
+    else:
+        sh = [read(name) for name in present]
     arrays = (
         means,
-        packing.log_scales(read(f"{EXTENSION}:SCALE")),
+        read(f"{EXTENSION}:SCALE"),
         quats,
         np.log(opacity / (1 - opacity)),
         sh[0][:, None],
@@ -172,6 +220,17 @@ def _splats(
     if len({len(array) for array in (*arrays, *sh)}) != 1:
         raise Damaged("its attributes have different lengths")
     return GaussianArrays(*(np.ascontiguousarray(array, np.float32) for array in arrays))
+
+
+def _display(linear: np.ndarray) -> np.ndarray:
+    """Colours of linear light, as COLOR_0 in glTF, encoded as sRGB; the inverse of `_linear`."""
+    power = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, power)
+
+
+def _linear(color: np.ndarray) -> np.ndarray:
+    """Colours in sRGB, 0 … 1, as linear light."""
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def _coefficients(degree: int) -> list[str]:
@@ -195,12 +254,13 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
     means, quats, sh_rest = flip_axes(means, quats, sh_rest, UP_BACK)
     opacity = (1 / (1 + np.exp(-opacity_logits))).astype("<f4")
-    largest = np.finfo(np.float32).max
+    cut = packing.Cut(path, "glTF", len(means))
+    packing.cut_scales(cut, log_scales, *_LOG_SCALES, step=0)
     attributes: dict[str, np.ndarray] = {
         "POSITION": means,
         "COLOR_0": _point_colors(sh_dc, opacity),
         f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": np.minimum(np.exp(log_scales), largest),
+        f"{EXTENSION}:SCALE": np.exp(np.clip(log_scales, *_LOG_SCALES)),
         f"{EXTENSION}:OPACITY": opacity[:, None],
     }
     sh = np.concatenate([sh_dc, sh_rest], 1)
@@ -215,12 +275,16 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "snowsplat"}}
     document["extensionsUsed"] = [EXTENSION]
     if len(means):
-        document |= _contents(list(attributes), arrays)
+        x, y, z = gaussians.origin
+        document |= _contents(list(attributes), arrays, (x, -y, -z))
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(glb.pack(document, arrays))
+    cut.report(".ply keeps them")
 
 
-def _contents(names: list[str], arrays: list[np.ndarray]) -> dict[str, Any]:
+def _contents(
+    names: list[str], arrays: list[np.ndarray], translation: tuple[float, float, float]
+) -> dict[str, Any]:
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     offset = 0
@@ -255,7 +319,13 @@ def _contents(names: list[str], arrays: list[np.ndarray]) -> dict[str, Any]:
     return {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "splats"}],
+        "nodes": [
+            {
+                "mesh": 0,
+                "name": "splats",
+                **({"translation": list(translation)} if any(translation) else {}),
+            }
+        ],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -266,5 +336,4 @@ def _contents(names: list[str], arrays: list[np.ndarray]) -> dict[str, Any]:
 def _point_colors(sh_dc: np.ndarray, opacity: np.ndarray) -> np.ndarray:
     """(N, 4) uint8 RGBA: the colour without its view-dependent part, in linear light as in glTF."""
     color = np.clip(0.5 + SH_C0 * sh_dc[:, 0], 0, 1)
-    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-    return packing.to_bytes(255 * np.concatenate([linear, opacity[:, None]], 1))
+    return packing.to_bytes(255 * np.concatenate([_linear(color), opacity[:, None]], 1))

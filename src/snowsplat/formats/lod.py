@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.formats.gaussian_arrays import GaussianArrays, skip_nonfinite
+from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.sog import read_stored, sog_files
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import inside, quoted, read_json
@@ -95,7 +95,7 @@ def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
     parts = [_rows(index.files[file], runs[file]) for file in sorted(runs)]
     if index.environment is not None:
         parts.append(read_stored(index.environment))
-    return skip_nonfinite(path, GaussianArrays.cat(parts))
+    return without_unusable(path, GaussianArrays.cat(parts))
 
 
 def read_index(path: Path) -> LodIndex:

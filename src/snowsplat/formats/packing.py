@@ -4,17 +4,27 @@ Arrays are NumPy, float32 unless stated otherwise, one row per Gaussian, with th
 fields of `GaussianArrays`.
 """
 
+import logging
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from snowsplat.formats.gaussian_arrays import GaussianArrays, skip_nonfinite
+from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.scene.sh_constants import SH_C0
 from snowsplat.util.errors import UserError
 
+logger = logging.getLogger(__name__)
+
 #: A file of any size may declare this many Gaussians.
 ALWAYS_ALLOWED = 1 << 16
+#: The logit of a fully opaque Gaussian: its opacity is 1 in float32.
+OPAQUE_LOGIT = 30.0
+#: Logarithm of the thickness of a flat Gaussian relative to its other axes.
+FLAT = float(np.log(1e-4))
+_RARE = 0.001  # share of Gaussians, see `Cut`
 _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no logarithm
 
 
@@ -48,13 +58,100 @@ def check_count(path: Path, count: int, file_size: int) -> None:
 
 
 def packable(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
-    """The Gaussians that a compact format can store, with unit quaternions.
+    """The usable Gaussians with finite values and unit quaternions, as compact formats need them.
 
-    No compact format can store non-finite values: those Gaussians are skipped, with a warning that
-    names ``path``. The zero quaternion becomes the identity.
+    Gaussians that are not usable are left out, with a warning that names ``path``. The opacities 0
+    and 1 get finite logits, flat axes a scale that is small enough (`flat_log_scales`). The zero
+    quaternion becomes the identity.
     """
-    finite = skip_nonfinite(path, gaussians)
-    return replace(finite, quats=unit_quats(finite.quats))
+    usable = without_unusable(path, gaussians)
+    return replace(
+        usable,
+        log_scales=flat_log_scales(usable.log_scales),
+        quats=unit_quats(usable.quats),
+        opacity_logits=np.nan_to_num(
+            usable.opacity_logits, posinf=OPAQUE_LOGIT, neginf=-OPAQUE_LOGIT
+        ),
+    )
+
+
+class Cut:
+    """What a format cannot hold of a scene, for one line after writing."""
+
+    def __init__(self, path: Path, format: str, count: int) -> None:
+        self._path, self._format, self._count = path, format, count
+        self._found: list[str] = []
+
+    def note(self, what: str, rows: Any, details: str = "", *, rare: bool = False) -> None:
+        """Note values that were cut.
+
+        Args:
+            what: the kind of values.
+            rows: (N,) bool: the Gaussians with such values.
+            details: the values, and what they became.
+            rare: the values hardly change the picture if less than 0.1% of the Gaussians have them;
+                then they are not named.
+        """
+        count = int(np.count_nonzero(rows))
+        if count > (_RARE * self._count if rare else 0):
+            self._found.append(f"{what} of {count:,}{f' ({details})' if details else ''}")
+
+    def report(self, advice: str) -> None:
+        """Log what was noted, and what to do."""
+        if self._found:
+            logger.warning(
+                "%s: cut to the range of %s: %s of %s Gaussians; %s",
+                self._path,
+                self._format,
+                ", ".join(self._found),
+                f"{self._count:,}",
+                advice,
+            )
+
+
+def cut_scales(cut: Cut, log_scales: np.ndarray, low: float, high: float, step: float) -> None:
+    """Note the log scales (N, 3) beyond ``low`` … ``high`` that change the picture.
+
+    A thin axis may become thicker without a visible change, as long as the Gaussian stays ten times
+    as long. ``step``: the usual rounding, which does not count.
+    """
+    if not len(log_scales):
+        return
+    longest = log_scales.max(1)
+    largest, smallest = float(np.exp(longest.max())), float(np.exp(longest.min()))
+    details = f"up to {largest:.4g}, at most {math.exp(high):.4g}"
+    cut.note("the large scales", longest > high + step, details)
+    thick = (log_scales.min(1) < low - step) & (longest < low + math.log(10))
+    details = f"down to {smallest:.4g}, at least {math.exp(low):.4g}"
+    cut.note("the small scales", thick, details, rare=True)
+
+
+def fitting_factor(log_scales: np.ndarray, low: float, high: float) -> float | None:
+    """The factor next to 1 that brings all scales between ``low`` and ``high``; None: none does.
+
+    A power of ten if one fits.
+    """
+    longest = log_scales.max(1)
+    least = low + math.log(10) - float(np.quantile(longest, _RARE))
+    most = high - float(longest.max())
+    if least > most:
+        return None
+    nearest = min(max(0.0, least), most)
+    tens = (math.ceil if nearest > 0 else math.floor)(nearest / math.log(10)) * math.log(10)
+    return float(f"{math.exp(tens if least <= tens <= most else nearest):.3g}")
+
+
+def flat_log_scales(log_scales: np.ndarray) -> np.ndarray:
+    """(N, 3) finite: −inf, of a flat axis, becomes 10⁻⁴ of the thinnest other axis.
+
+    A Gaussian without any other axis, a point, gets axes of 1e-12.
+    """
+    flat = log_scales == -np.inf
+    if not flat.any():
+        return log_scales
+    thinnest = np.where(flat, np.inf, log_scales).min(1, keepdims=True)
+    thin = np.where(thinnest == np.inf, np.log(_SMALLEST_SCALE), thinnest + FLAT)
+    return np.where(flat, thin, log_scales).astype(np.float32)
 
 
 def spatial_order(means: np.ndarray) -> np.ndarray:

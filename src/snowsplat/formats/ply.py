@@ -1,4 +1,4 @@
-"""PLY files: scenes in the layout of the 3DGS reference implementation.
+"""PLY files: scenes in the layout of the 3DGS reference implementation, and its relatives.
 
 A scene of SH degree 3 has 62 float properties per Gaussian, in this order: x y z, nx ny nz (zeros),
 f_dc_0..2, f_rest_0..44, opacity, scale_0..2, rot_0..3. Values are the optimised parameters, before
@@ -7,19 +7,31 @@ length. f_rest is channel-major: all K coefficients of red, then of green, then 
 of `GaussianArrays` is (N, K, 3)). Lower degrees have fewer f_rest properties.
 
 A comment in the header says how an antialiased scene is rendered: "SplatRenderMode: mip", which
-Brush introduced. Postshot writes "antialiased 1" or "postshot.anti_aliasing=1".
+Brush introduced. Postshot writes "antialiased 1" or "postshot.anti_aliasing=1". The comment
+"origin X Y Z" has the `scene.origin` of a scene that is far away from 0.
+
+Other trainers write the same layout with differences that are understood: SH of degree 4 and higher
+(gsplat, 3DGRUT), two scales (2D Gaussian splatting), filter_3D (Mip-Splatting), and red, green,
+blue in place of f_dc.
 """
 
+import logging
+import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.scene.sh_constants import SH_REST_COUNTS
+from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, unusable
+from snowsplat.formats.packing import FLAT
+from snowsplat.scene.origin import HERE, Origin, added, stored_origin
+from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.ply import PlyTable, header, open_table
+
+logger = logging.getLogger(__name__)
 
 _WRITE_ROWS = 1 << 14
 
@@ -31,7 +43,9 @@ def _rest_names(count: int) -> list[str]:
 _MEANS = ["x", "y", "z"]
 _NORMALS = ["nx", "ny", "nz"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_RGB = ["red", "green", "blue"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
+_FILTER = "filter_3D"
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 #: Comments in lower case, and whether the scene is antialiased.
 _MODES = {
@@ -42,7 +56,9 @@ _MODES = {
     "postshot.anti_aliasing=1": True,
     "postshot.anti_aliasing=0": False,
 }
-_REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
+_REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS]
+_ORIGIN = "origin "
+_HIGHEST_DEGREE = 10
 
 
 def is_ply(head: bytes) -> bool:
@@ -52,56 +68,134 @@ def is_ply(head: bytes) -> bool:
 
 def is_scene(table: PlyTable) -> bool:
     """Whether the table has the columns of Gaussians; if not, it may be a point cloud."""
-    return all(name in table.columns for name in _REQUIRED)
+    return not _missing(table)
 
 
-def read_ply(path: Path | str) -> GaussianArrays:
-    """Read a scene of any SH degree.
+def _missing(table: PlyTable) -> list[str]:
+    """The required columns that the table does not have. Colours can replace f_dc."""
+    colored = all(name in table.columns for name in _RGB)
+    missing = [name for name in _REQUIRED if name not in table.columns]
+    return [name for name in missing if not (colored and name in _DC)]
 
-    The properties may have any order and any type. Unknown properties are ignored. Values are not
-    changed: NaN and infinity are read as they are.
+
+def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
+    """Read a scene of any SH degree; coefficients beyond degree 3 are ignored.
+
+    The properties may have any order and any type. Unknown properties are ignored. NaN and infinity
+    are read as they are. Two scales are a flat Gaussian. The 3D filter of Mip-Splatting becomes
+    part of scales and opacities (equation 9 of Yu et al. 2024).
+
+    Args:
+        data: see `open_table`.
 
     Raises:
         UserError: the file is missing, damaged, truncated, or a PLY file without Gaussians.
     """
-    table = open_table(path)
-    if not is_scene(table):
-        missing = [name for name in _REQUIRED if name not in table.columns]
+    table = open_table(path, data=data)
+    if missing := _missing(table):
         shown = ", ".join(missing[:4]) + (", …" if len(missing) > 4 else "")
         raise UserError(f"{path}: a PLY file without 3D Gaussians; missing properties: {shown}")
-    rest = [name for name in table.columns if name.startswith("f_rest_")]
-    if (
-        len(rest) % 3
-        or len(rest) // 3 not in SH_REST_COUNTS
-        or set(rest) != set(_rest_names(len(rest) // 3))
-    ):
-        raise UserError(
-            f"{path}: {len(rest)} f_rest properties do not match an SH degree; "
-            "expected 0, 9, 24 or 45, numbered from 0"
-        )
-    k = len(rest) // 3
+    stored = _rest_count(table)
+    k = min(stored, SH_REST_COUNTS[-1])
+    if k < stored:
+        degree = math.isqrt(stored + 1) - 1
+        logger.warning("%s: SH degree %d is reduced to 3", path, degree)
 
     n = table.count
-    means = np.empty((n, 3), np.float32)
+    exact = any(table.columns[name] == "f8" for name in _MEANS) or table.format == "ascii"
+    means = np.empty((n, 3), np.float64 if exact else np.float32)
     log_scales = np.empty((n, 3), np.float32)
     quats = np.empty((n, 4), np.float32)
     opacity_logits = np.empty(n, np.float32)
     sh_dc = np.empty((n, 1, 3), np.float32)
     sh_rest = np.empty((n, k, 3), np.float32)
+    filters = np.empty(n, np.float32)
+    colored = any(name not in table.columns for name in _DC)
+    scales = [name for name in _SCALES if name in table.columns]
     columns: list[tuple[str, np.ndarray]] = [
         *zip(_MEANS, means.T, strict=True),
-        *zip(_DC, sh_dc[:, 0].T, strict=True),
+        *zip(_RGB if colored else _DC, sh_dc[:, 0].T, strict=True),
         ("opacity", opacity_logits),
-        *zip(_SCALES, log_scales.T, strict=True),
+        *zip(scales, log_scales.T, strict=False),
         *zip(_QUATS, quats.T, strict=True),
-        *zip(_rest_names(k), (sh_rest[:, i, c] for c in range(3) for i in range(k)), strict=True),
+        *((f"f_rest_{c * stored + i}", sh_rest[:, i, c]) for c in range(3) for i in range(k)),
+        *([(_FILTER, filters)] if _FILTER in table.columns else []),
     ]
     with np.errstate(over="ignore", invalid="ignore"):  # doubles beyond float32 become infinity
         for start, rows in table.rows():
             for name, target in columns:
                 target[start : start + len(rows)] = rows[name]
-    arrays = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
-    return GaussianArrays(*arrays, antialiased=is_antialiased(table.comments))
+        if len(scales) < 3:
+            log_scales[:, 2] = log_scales[:, :2].min(1) + FLAT
+            logger.info("%s: two scales per Gaussian (2DGS); read as flat Gaussians", path)
+        if colored:
+            sh_dc = (sh_dc / _white(table, sh_dc) - 0.5) / SH_C0
+            logger.info("%s: colours (red, green, blue) without f_dc", path)
+        if _FILTER in table.columns:
+            log_scales, opacity_logits = _filtered(log_scales, opacity_logits, filters)
+            logger.info("%s: its filter_3D (Mip-Splatting) is applied to scales, opacities", path)
+        arrays = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
+        scene = placed(*arrays, antialiased=is_antialiased(table.comments))
+    if problem := unusable(scene):
+        logger.warning("%s: %s; they are not shown", path, problem)
+    return replace(scene, origin=added(scene.origin, origin_in(table.comments)))
+
+
+def _rest_count(table: PlyTable) -> int:
+    """K of the f_rest properties of a file; may be that of a degree above 3.
+
+    Raises:
+        UserError: their number or their names do not match an SH degree.
+    """
+    rest = [name for name in table.columns if name.startswith("f_rest_")]
+    counts = [(degree + 1) ** 2 - 1 for degree in range(_HIGHEST_DEGREE + 1)]
+    if (
+        len(rest) % 3
+        or len(rest) // 3 not in counts
+        or set(rest) != set(_rest_names(len(rest) // 3))
+    ):
+        raise UserError(
+            f"{table.path}: {len(rest)} f_rest properties do not match an SH degree; "
+            "expected 0, 9, 24, 45 or 72, numbered from 0"
+        )
+    return len(rest) // 3
+
+
+def _white(table: PlyTable, colors: np.ndarray) -> float:
+    """The value of white: 1 or 255 for floating-point colours, else the largest integer."""
+    code = table.columns[_RGB[0]]
+    if code[0] == "f":
+        return 255.0 if np.nanmax(colors, initial=0) > 1.5 else 1.0
+    return 65535.0 if code == "u2" else 255.0
+
+
+def _filtered(
+    log_scales: np.ndarray, logits: np.ndarray, filters: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log scales and logits with the 3D filter f: s' = √(s² + f²), o' = o · √(det S² / det S'²)."""
+    logs = log_scales.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        wider = np.logaddexp(2 * logs, 2 * np.log(np.abs(filters.astype(np.float64)))[:, None]) / 2
+    fainter = np.where(wider == logs, 0, logs - wider).sum(1)  # log of the factor of the opacity
+    # logit(c σ(x)) = log c − log(1 − c + exp(−x))
+    with np.errstate(divide="ignore", over="ignore"):
+        result = fainter - np.log(-np.expm1(fainter) + np.exp(-logits.astype(np.float64)))
+    unchanged = fainter == 0
+    return wider, np.where(unchanged, logits, result)
+
+
+def origin_in(comments: Sequence[str]) -> Origin:
+    """The origin that the last such comment has; `HERE` without one."""
+    for line in reversed(comments):
+        if line.startswith(_ORIGIN):
+            words = line.split()[1:]
+            try:
+                origin = stored_origin([float(word) for word in words])
+            except ValueError:
+                continue
+            if origin is not None:
+                return origin
+    return HERE
 
 
 def is_antialiased(comments: Sequence[str]) -> bool:
@@ -110,19 +204,36 @@ def is_antialiased(comments: Sequence[str]) -> bool:
     return bool(marks) and marks[-1]
 
 
-def mode_comments(antialiased: bool) -> list[str]:
-    """The comments of a header for `is_antialiased`; a scene in the usual mode needs none."""
-    return ["SplatRenderMode: mip"] if antialiased else []
+def scene_comments(antialiased: bool, origin: Origin) -> list[str]:
+    """The comments of a header for `is_antialiased` and `origin_in`; most scenes need none."""
+    mode = ["SplatRenderMode: mip"] if antialiased else []
+    return mode + ([_ORIGIN + " ".join(map(repr, origin))] if any(origin) else [])
 
 
-def write_ply(path: Path | str, gaussians: GaussianArrays) -> None:
+def write_ply(path: Path | str, gaussians: GaussianArrays, *, georeferenced: bool = False) -> None:
     """Write the layout above, binary little-endian, atomically.
+
+    Args:
+        georeferenced: write the positions in the world, as doubles if the scene has an origin.
 
     Raises:
         OSError: the folder is missing or not writable, or the disk is full.
     """
     count, rest = len(gaussians.means), gaussians.sh_rest.shape[1]
-    write_ply_parts(path, count, rest, [gaussians], antialiased=gaussians.antialiased)
+    if not (georeferenced and any(gaussians.origin)):
+        antialiased, origin = gaussians.antialiased, gaussians.origin
+        write_ply_parts(path, count, rest, [gaussians], antialiased=antialiased, origin=origin)
+        return
+    names = _names(rest)
+    kinds = [("double" if name in _MEANS else "float", name) for name in names]
+    row = np.dtype([("means", "<f8", 3), ("others", "<f4", len(names) - 3)])
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(header(count, kinds, scene_comments(gaussians.antialiased, HERE)))
+        for start in range(0, count, _WRITE_ROWS):
+            part = gaussians.select(slice(start, start + _WRITE_ROWS))
+            rows = np.empty(len(part.means), row)
+            rows["means"], rows["others"] = part.world_means(), _table(part, rest)[:, 3:]
+            file.write(rows.tobytes())
 
 
 def write_ply_parts(
@@ -132,6 +243,7 @@ def write_ply_parts(
     parts: Iterable[GaussianArrays],
     *,
     antialiased: bool,
+    origin: Origin = HERE,
 ) -> None:
     """`write_ply` for a scene that does not fit into the memory: its parts one after the other.
 
@@ -139,21 +251,26 @@ def write_ply_parts(
         count: number of Gaussians of all parts.
         rest: K, the number of SH coefficients beyond the constant one; parts may have fewer.
         antialiased: whether the scene is marked as `Gaussians.antialiased`.
+        origin: that of all parts.
 
     Raises:
         OSError: see `write_ply`.
     """
-    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
+    names = _names(rest)
     written = 0
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         properties = [("float", name) for name in names]
-        file.write(header(count, properties, mode_comments(antialiased)))
+        file.write(header(count, properties, scene_comments(antialiased, origin)))
         for part in parts:
             for start in range(0, len(part.means), _WRITE_ROWS):
                 rows = part.select(slice(start, start + _WRITE_ROWS))
                 file.write(_table(rows, rest).tobytes())
             written += len(part.means)
         assert written == count
+
+
+def _names(rest: int) -> list[str]:
+    return [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
 
 
 def _table(gaussians: GaussianArrays, rest: int) -> np.ndarray:

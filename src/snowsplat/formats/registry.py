@@ -10,13 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from snowsplat.formats.archive import is_archive, read_archive
 from snowsplat.formats.compressed_ply import (
     is_compressed_ply,
     read_compressed_ply,
     write_compressed_ply,
 )
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.gltf import is_glb, read_glb, write_glb
+from snowsplat.formats.gltf import is_glb, is_gltf, read_gltf, write_glb
+from snowsplat.formats.gsplat_checkpoint import is_checkpoint, read_checkpoint
 from snowsplat.formats.ksplat import read_ksplat
 from snowsplat.formats.lod import INDEX, LEVELS, is_lod, lod_bytes, read_lod
 from snowsplat.formats.lod_writer import write_lod
@@ -40,10 +42,11 @@ class Format:
         recognises: whether a file with these first 16,384 bytes (fewer if it is shorter) has this
             format; None for a format without a signature.
         read: None for a format that cannot be read.
-        write: None for a format that cannot be written.
+        write: takes a path and `GaussianArrays`; None for a format that cannot be written.
         loses: a description, for users, of the data that a scene loses in this format.
         marks_antialiased: whether a file can say that its scene is antialiased, see `Gaussians`.
         version: the version of a file that ``recognises`` accepts, if the format has several.
+        stores_origin: whether a file has the `scene.origin`; if not, it is in a file beside it.
         bytes: the size of a scene; None: the scene is a single file, whose size is taken.
     """
 
@@ -51,10 +54,11 @@ class Format:
     suffixes: tuple[str, ...]
     recognises: Callable[[bytes], bool] | None
     read: Callable[[Path], GaussianArrays] | None
-    write: Callable[[Path, GaussianArrays], None] | None
+    write: Callable[..., None] | None
     loses: str
     marks_antialiased: bool
     version: Callable[[Path], str] | None = None
+    stores_origin: bool = False
     bytes: Callable[[Path], int] | None = None
 
     def size(self, path: Path) -> int:
@@ -72,6 +76,7 @@ FORMATS: list[Format] = [
         write_compressed_ply,
         "precision: positions and scales have 10 to 11 bits, rotations 10, all other values 8",
         True,
+        stores_origin=True,
     ),
     Format(
         "PLY",
@@ -81,6 +86,7 @@ FORMATS: list[Format] = [
         write_ply,
         "nothing",
         True,
+        stores_origin=True,
     ),
     Format(
         "SPZ",
@@ -93,6 +99,25 @@ FORMATS: list[Format] = [
         spz_version,
     ),
     Format(
+        "gsplat checkpoint",
+        (".pt",),
+        is_checkpoint,
+        read_checkpoint,
+        None,
+        "nothing",
+        False,
+    ),
+    Format(
+        "zip file",
+        (".zip", ".ssproj", ".usdz"),
+        is_archive,
+        read_archive,
+        None,
+        "nothing that the file in it has",
+        True,
+        stores_origin=True,
+    ),
+    Format(
         "SOG",
         (".sog",),
         is_sog,
@@ -101,6 +126,7 @@ FORMATS: list[Format] = [
         "precision: positions have 16 bits, all other values 8; SH are rows of a palette",
         True,
         sog_version,
+        stores_origin=True,
     ),
     Format(
         LEVELS,
@@ -110,17 +136,30 @@ FORMATS: list[Format] = [
         write_lod,
         "precision: positions have 16 bits, all other values 8; SH are rows of palettes",
         True,
+        stores_origin=True,
         bytes=lod_bytes,
     ),
     Format(
         "glTF",
         (".glb",),
         is_glb,
-        read_glb,
+        read_gltf,
         write_glb,
         "nothing except for rounding",
         False,
         lambda _: "2, KHR_gaussian_splatting",
+        stores_origin=True,
+    ),
+    Format(
+        "glTF in JSON",
+        (".gltf",),
+        is_gltf,
+        read_gltf,
+        None,
+        "nothing except for rounding",
+        False,
+        lambda _: "2, KHR_gaussian_splatting",
+        stores_origin=True,
     ),
     Format(
         "splat",

@@ -16,6 +16,7 @@ which has these images:
   codebook.
 
 The entry "model" of `meta.json` is "antialiased" for an antialiased scene; other scenes have none.
+The entry "origin" of "asset", ours, is the `scene.origin` of a scene that is far away from 0.
 
 Version 1 has evenly spaced levels between mins and maxs instead of codebooks. A scene of version 1
 is usually a folder; `read_sog` takes the path of its `meta.json`. The coordinate frame is that of
@@ -25,7 +26,7 @@ the PLY files. Specification: developer.playcanvas.com, "The SOG Format".
 import io
 import json
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,15 @@ from PIL import Image
 
 from snowsplat.formats import packing
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
-from snowsplat.formats.gaussian_arrays import GaussianArrays, skip_nonfinite
+from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, without_unusable
 from snowsplat.formats.sog_container import Bundle, Damaged
+from snowsplat.scene.origin import HERE, added, stored_origin
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
+#: The name of the description of a scene, in a zip file or a folder.
+META = "meta.json"
 _PALETTE_LIMIT = 1 << 16  # labels have 16 bits
 _PALETTE_COLUMNS = 64
 _SH_LIMIT = np.float32(1e6)
@@ -61,7 +65,7 @@ def read_sog(path: Path | str) -> GaussianArrays:
         UserError: the file cannot be read, is damaged, or declares an implausible number of
             Gaussians.
     """
-    return skip_nonfinite(Path(path), read_stored(path))
+    return without_unusable(Path(path), read_stored(path))
 
 
 @np.errstate(all="ignore")
@@ -73,11 +77,13 @@ def read_stored(path: Path | str) -> GaussianArrays:
             layout = _layout(files.meta())
             packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
             arrays = _decode(files, layout)
-            antialiased = files.meta().get("model") == "antialiased"
+            meta = files.meta()
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
-    as_float32 = (np.array(array, np.float32) for array in arrays)
-    return GaussianArrays(*as_float32, antialiased=antialiased)
+    scene = placed(*arrays, antialiased=meta.get("model") == "antialiased")
+    asset = meta.get("asset")
+    stored = stored_origin(asset.get("origin")) if isinstance(asset, dict) else None
+    return replace(scene, origin=added(scene.origin, stored or HERE))
 
 
 def sog_files(path: Path) -> list[Path]:
@@ -248,7 +254,10 @@ def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
     }
     meta: dict[str, Any] = {
         "version": 2,
-        "asset": {"generator": "snowsplat"},
+        "asset": {
+            "generator": "snowsplat",
+            **({"origin": list(gaussians.origin)} if any(gaussians.origin) else {}),
+        },
         "count": n,
         **({"model": "antialiased"} if gaussians.antialiased else {}),
         "means": {

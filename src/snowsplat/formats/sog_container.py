@@ -7,9 +7,6 @@ trusted: a name in a zip file is never used as a path, and a file outside of the
 from __future__ import annotations
 
 import io
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,17 +14,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from snowsplat.formats.zip_members import Damaged, ZipMembers
 from snowsplat.util.safe_json import is_file, parse_json, quoted
 
-_MOST_MEMBERS = 1000
-# Maximum size of an unpacked member: _MOST_INFLATION times its packed size, plus _INFLATION_FREE
-# bytes. WebP images are already compressed, so the zip compression hardly reduces them.
+# WebP images are already compressed, so the zip compression hardly reduces them.
 _MOST_INFLATION = 4
-_INFLATION_FREE = 1 << 20
-
-
-class Damaged(Exception):
-    """The scene is damaged. The caller adds the path to the message."""
 
 
 class Bundle:
@@ -35,24 +26,24 @@ class Bundle:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._meta = self._file(path)
-        self.size = len(self._meta)
-        self._zip: zipfile.ZipFile | None = None
-        if self._meta.startswith(b"PK"):
-            # Python creates an object for each entry, ten times as large as the entry.
-            if self._meta.count(b"PK\x01\x02") > _MOST_MEMBERS:
-                raise Damaged("a zip file with an implausible number of members")
-            try:
-                self._zip = zipfile.ZipFile(io.BytesIO(self._meta))
-            except (ValueError, EOFError, struct.error, NotImplementedError, zipfile.BadZipFile):
-                raise Damaged("not a readable zip file") from None
+        self._zip: ZipMembers | None = None
+        try:
+            if not is_file(path):  # reading a pipe may never end
+                raise Damaged(f"{quoted(path.name)} is missing or not a file")
+            with open(path, "rb") as file:
+                zipped = file.read(2) == b"PK"
+            self.size = path.stat().st_size
+        except OSError as error:
+            raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
+        if zipped:
+            self._zip = ZipMembers(path)
 
     def __enter__(self) -> Bundle:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._zip is not None:
-            self._zip.close()
+            self._zip.__exit__()
 
     def meta(self) -> dict[str, Any]:
         """The content of `meta.json`.
@@ -60,7 +51,7 @@ class Bundle:
         Raises:
             Damaged: it is missing, or not a JSON object.
         """
-        data = self._member("meta.json") if self._zip else self._meta
+        data = self._member("meta.json") if self._zip else self._file(self._path)
         try:
             meta = parse_json(data)
         except ValueError:
@@ -102,29 +93,7 @@ class Bundle:
 
     def _member(self, name: str) -> bytes:
         assert self._zip is not None
-        try:
-            info = self._zip.getinfo(name)
-        except KeyError:
-            raise Damaged(f"a zip file without {name!r}") from None
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise Damaged(f"its {name} has a compression method that SOG does not use")
-        if info.file_size > _MOST_INFLATION * min(info.compress_size, self.size) + _INFLATION_FREE:
-            raise Damaged(f"its {name} would unpack to {info.file_size} bytes")
-        try:
-            with self._zip.open(info) as member:
-                # read() without a size would unpack everything, whatever size is declared.
-                return member.read(info.file_size)
-        except (
-            OSError,
-            ValueError,
-            RuntimeError,
-            OverflowError,  # an offset larger than that of any file
-            EOFError,
-            struct.error,
-            zipfile.BadZipFile,
-            zlib.error,
-        ):
-            raise Damaged(f"its {name} is damaged") from None
+        return self._zip.read(name, _MOST_INFLATION)
 
     def _file(self, path: Path) -> bytes:
         try:

@@ -69,3 +69,6 @@ def write_splat(path: Path | str, gaussians: GaussianArrays) -> None:
     rows["quats"] = packing.to_bytes(128 + 128 * quats[order])
     with atomic_path(path) as temporary:
         temporary.write_bytes(rows.tobytes())
+    cut = packing.Cut(path, "splat", len(means))
+    packing.cut_scales(cut, log_scales, -_LOG_LIMIT, _LOG_LIMIT, step=0)
+    cut.report(".ply keeps them")

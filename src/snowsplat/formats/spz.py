@@ -19,6 +19,7 @@ and the compression. The layout was taken from github.com/nianticlabs/spz (MIT).
 """
 
 import logging
+import math
 import struct
 from pathlib import Path
 
@@ -56,6 +57,7 @@ _HALF_TURNS = np.array(
     [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]], dtype=np.float32
 )
 _COLOR_STEP = 0.15 * 255
+_SCALE_RANGE = (-10.0, 255 / 16 - 10)  # logarithms
 # SH bytes are rounded to multiples of these (degree 1, higher degrees), so that they compress
 # better. Niantic's implementation uses 8 and 16, which lower the PSNR of a trained scene by more
 # than 1 dB. 2 and 4 lower it by 0.1 dB, and the file is 1.5 times as large.
@@ -164,8 +166,9 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
     means, quats, sh_rest = flip_axes(means, quats, sh_rest, UP_BACK)
     bits = _fractional_bits(means)
+    cut = packing.Cut(path, "SPZ", len(means))
     columns = [
-        _pack_positions(path, means, bits),
+        _pack_positions(cut, means, bits),
         packing.opacity_bytes(opacity_logits),
         packing.to_bytes(127.5 + _COLOR_STEP * sh_dc),
         packing.to_bytes(16 * (log_scales + 10)),
@@ -178,6 +181,18 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     data = pack(header, [column.tobytes() for column in columns])
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+    if len(means) and 2.0**-bits > 0.5 * math.exp(min(80.0, float(np.median(log_scales.max(1))))):
+        cut.note("positions", np.ones(len(means), bool), f"in steps of {2.0**-bits:.2g}")
+    packing.cut_scales(cut, log_scales, *_SCALE_RANGE, step=1 / 32)
+    cut.note("SH", (np.abs(sh_rest) > 1 + _SH_STEPS[1] / 128).any((1, 2)), "at most 1", rare=True)
+    cut.report(_advice(log_scales))
+
+
+def _advice(log_scales: np.ndarray) -> str:
+    """What to do if a scene does not fit: another unit of length, or another format."""
+    factor = packing.fitting_factor(log_scales, *_SCALE_RANGE) if len(log_scales) else None
+    others = ".ply, .glb or .sog keep them"
+    return others if factor in (None, 1) else f"scaled by {factor:g}, all scales fit; {others}"
 
 
 def _fractional_bits(means: np.ndarray) -> int:
@@ -195,17 +210,10 @@ def _fractional_bits(means: np.ndarray) -> int:
     return max(min(max(12, wanted), max(possible, wanted - 3), 24), 0)
 
 
-def _pack_positions(path: Path, means: np.ndarray, bits: int) -> np.ndarray:
+def _pack_positions(cut: packing.Cut, means: np.ndarray, bits: int) -> np.ndarray:
     limit = (1 << 23) - 1
     steps = np.rint(means.astype(np.float64) * (1 << bits))
-    outliers = int((np.abs(steps) > limit).any(1).sum())
-    if outliers:
-        logger.warning(
-            "%s: %d Gaussians exceed the range of .spz; their coordinates are clamped to ±%.6g",
-            path,
-            outliers,
-            limit / (1 << bits),
-        )
+    cut.note("positions", (np.abs(steps) > limit).any(1), f"at most {limit / (1 << bits):.6g}")
     fixed = np.clip(steps, -limit, limit)
     return fixed.astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from snowsplat.formats import Format, GaussianArrays
+from snowsplat.formats import Format
 from snowsplat.formats.lod import LEVELS
-from snowsplat.formats.spz import WRITTEN_VERSIONS, write_spz
+from snowsplat.formats.origin_file import origin_file
+from snowsplat.formats.spz import WRITTEN_VERSIONS
 from snowsplat.pipeline.decimate import Decimation, file_size, gaussians_to_keep, write_within
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
@@ -94,9 +95,9 @@ class Edits:
         return scene
 
     def placed(self, scene: Gaussians) -> Gaussians:
-        """The rotated, scaled and translated scene; ``scene`` is unchanged."""
+        """The rotated, scaled and translated scene, in float64; ``scene`` is unchanged."""
         transform = self.transform()
-        return edit.transform(scene, transform) if transform else scene
+        return edit.transform_world(scene, transform) if transform else scene
 
     def transform(self) -> Similarity | None:
         """Rotation, scale and translation of these edits as one transform; None: no change."""
@@ -118,6 +119,7 @@ def convert(
     *,
     dataset: Path | str | None = None,
     spz_version: int | None = None,
+    georeferenced: bool = False,
     overwrite: bool = False,
     observer: Observer = SILENT,
 ) -> Format:
@@ -130,6 +132,8 @@ def convert(
         edits: changes to the merged scene; default: none.
         dataset: with ``decimate``: train the result for a moment on the photos of this dataset.
         spz_version: the version of an .spz file, 2 to 4; default: 3.
+        georeferenced: write positions in the world instead of relative to the origin of a scene
+            that is far away from 0, see `scene.origin`.
         overwrite: replace ``target``.
 
     Returns:
@@ -137,7 +141,8 @@ def convert(
 
     Raises:
         UserError: a missing or damaged scene, an unknown format, ``target`` exists, or
-            ``spz_version`` is no version, or given for another format.
+            ``spz_version`` is no version, or given for another format; ``georeferenced`` and a
+            format without doubles.
         OSError: ``target`` cannot be written.
     """
     target, edits = Path(target), edits or Edits()
@@ -150,6 +155,10 @@ def convert(
         raise SettingError("spz_version", f"is for .spz files, and {target.name} is {format.name}")
     if spz_version is not None and spz_version not in WRITTEN_VERSIONS:
         raise SettingError("spz_version", f"{spz_version} cannot be written; use 2, 3 or 4")
+    if georeferenced and format.name not in ("PLY", "glTF"):
+        raise SettingError(
+            "georeferenced", f"{format.name} files have no doubles; write .ply or .glb"
+        )
     size = file_size(edits.decimate)
     if format.name == LEVELS and size is not None:
         raise SettingError("decimate", "a size is that of one file; use a number or a share")
@@ -161,18 +170,29 @@ def convert(
         logger.warning(
             "%s: only some of the scenes are antialiased; all are marked as the first one", target
         )
+    if len({any(part.origin) for part in parts}) > 1:
+        logger.warning(
+            "%s: some of the scenes have an origin far away from 0, others have none; do they have "
+            "the same frame?",
+            target,
+        )
     scene = edits.reduced(edit.merge(parts))
-    write = write_gaussians
+    write: Callable[[Path, Gaussians], None] = write_gaussians
     if spz_version is not None:
-        write = partial(_write_spz, version=spz_version)
+        write = partial(write_gaussians, version=spz_version)
+    if georeferenced and format.name == "PLY":  # glTF files always have the place in the world
+        write = partial(write_gaussians, georeferenced=True)
     if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
         write = partial(_write_page, source=files[0])
     if format.name == LEVELS:
         write = partial(write_levels, observer=observer)
 
+    written: list[Gaussians] = []
+
     def write_placed(path: Path, gaussians: Gaussians) -> None:
         # The scene is moved last: cameras and photos show it in its place.
-        write(path, edits.placed(gaussians))
+        written[:] = [edits.placed(gaussians)]
+        write(path, *written)
 
     if size is not None:
         write_within(size, target, scene, write_placed, decimation)
@@ -181,7 +201,19 @@ def convert(
         write_placed(target, decimation.fitted(smaller, scene))
     else:
         write_placed(target, scene)
+    if any(written[0].origin) and format.name != "glTF" and not georeferenced:
+        x, y, z = (f"{value:.15g}" for value in written[0].origin)
+        observer.note(f"positions are relative to the origin {x} {y} {z}, {_noted(format, target)}")
+    if georeferenced and not any(written[0].origin):
+        observer.note("the scene has no origin; its positions are written as they are")
     return format
+
+
+def _noted(format: Format, target: Path) -> str:
+    """Where the origin of a written scene is stored."""
+    if format.read is None:
+        return "which the file cannot store"
+    return "which is noted in the file" if format.stores_origin else f"see {origin_file(target)}"
 
 
 def _decimation(
@@ -204,10 +236,6 @@ def _decimation(
     photos, background = photos_of(scenes[0], Path(dataset))
     refined = partial(refine, dataset=photos, background=background, observer=observer)
     return Decimation([view.camera for view in photos.train], refined=refined)
-
-
-def _write_spz(target: Path, scene: Gaussians, version: int) -> None:
-    write_spz(target, GaussianArrays.from_gaussians(scene), version)
 
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:

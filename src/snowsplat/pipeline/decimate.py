@@ -9,9 +9,11 @@ from pathlib import Path
 
 import torch
 
+from snowsplat.formats.origin_file import read_origin, write_origin
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.origin import HERE
 from snowsplat.scene.simplify import simplify
 from snowsplat.training.core.distillation import distill
 from snowsplat.training.core.progress import Progress
@@ -83,7 +85,7 @@ class Decimation:
 
         self.observer.steps_begin(0, _STEPS)
         try:
-            whole = scene.select(scene.finite_rows())
+            whole = scene.select(scene.usable_rows())
             color = torch.tensor(self.background)
             return distill(smaller, whole, self.cameras, color, _STEPS, report)
         finally:
@@ -122,5 +124,7 @@ def write_within(
             if not count:
                 raise SettingError("decimate", f"no scene fits into {size:,} bytes; use more")
             path.replace(temporary)
+            write_origin(target, read_origin(path))
         finally:
             path.unlink(missing_ok=True)
+            write_origin(path, HERE)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from snowsplat.data.points_ply import read_points
 from snowsplat.formats import Format, GaussianArrays, ply
-from snowsplat.formats.lod import INDEX, LEVELS, read_index
+from snowsplat.formats.lod import LEVELS, read_index
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
-from snowsplat.pipeline.output.scene_paths import training_folder
+from snowsplat.pipeline.output.scene_paths import index_in, training_folder
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.sfm.ingest.archive import files_in, is_zip
 from snowsplat.training.core import checkpoint_file
@@ -31,7 +31,7 @@ def describe(path: Path | str) -> dict[str, Any]:
     The key "kind" has one of these values; the other keys depend on it:
 
     - "scene": format, number of Gaussians, bounds, and percentiles of opacity and scale. ``path``
-      may also be a folder with a `lod-meta.json`.
+      may also be a folder with a `lod-meta.json` or a SOG `meta.json`.
     - "point cloud": number of points, bounds.
     - "checkpoint": step, configuration, shapes of the tensors. The checksums are verified.
     - "output folder": dataset, scenes, checkpoints, metrics, and a description of the last scene.
@@ -41,7 +41,8 @@ def describe(path: Path | str) -> dict[str, Any]:
     - "dataset": number and sizes of the photos, focal lengths, number of points, extent, and
       what is impossible or doubtful about the cameras.
 
-    Bounds and lengths are in world units, in the frame of the file. torch is imported only for
+    Bounds and lengths are in world units, in the frame of the file, relative to the "origin" of a
+    scene that has one (`scene.origin`). torch is imported only for
     datasets, photos and videos.
 
     Raises:
@@ -52,12 +53,9 @@ def describe(path: Path | str) -> dict[str, Any]:
         raise UserError(f"{path}: no such file or folder")
     if path.suffix == ".safetensors":
         return _checkpoint(path)
-    if (path / INDEX).is_file():
-        path = path / INDEX
-    if is_zip(path) and not any(name.endswith(_ROOT_OF_SOG) for name in files_in(path)):
-        from snowsplat.pipeline.describe_photos import describe_zip  # pycolmap and torch
-
-        return describe_zip(path)
+    path = index_in(path) or path
+    if is_zip(path) and _has_photos(path):
+        return _zip(path)
     if path.is_file():
         try:
             format = format_for_reading(path)
@@ -90,21 +88,23 @@ def _scene(path: Path, format: Format) -> dict[str, Any]:
 
 
 def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
-    finite = gaussians.select(gaussians.finite_rows())
-    count, finite_count = len(gaussians.means), len(finite.means)
+    usable = gaussians.select(gaussians.usable_rows())
+    count, usable_count = len(gaussians.means), len(usable.means)
     facts: dict[str, Any] = {
         "gaussians": count,
         "sh_degree": SH_REST_COUNTS.index(gaussians.sh_rest.shape[1]),
         "antialiased": gaussians.antialiased,
         "bytes_in_memory": sum(array.nbytes for array in gaussians),
     }
-    if finite_count < count:
-        facts["not_finite"] = count - finite_count
-    if finite_count:
+    if any(gaussians.origin):
+        facts["origin"] = list(gaussians.origin)
+    if usable_count < count:
+        facts["not_finite"] = count - usable_count
+    if usable_count:
         with np.errstate(over="ignore"):
-            opacities = 1 / (1 + np.exp(-finite.opacity_logits))
-            scales = np.exp(finite.log_scales)
-        facts |= _bounds(finite.means)
+            opacities = 1 / (1 + np.exp(-usable.opacity_logits))
+            scales = np.exp(usable.log_scales)
+        facts |= _bounds(usable.means)
         facts["opacity"] = _percentiles(opacities)
         facts["scale"] = _percentiles(scales.max(1))
         ratio = scales.max(1) / scales.min(1).clip(1e-12)
@@ -179,6 +179,27 @@ def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
     except UserError:
         raise otherwise from None
     return describe_photos(sources)
+
+
+def _has_photos(path: Path) -> bool:
+    """Whether a zip file has photos or videos, and is not a SOG scene."""
+    from snowsplat.sfm.ingest.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES  # torch
+
+    names = files_in(path)
+    if any(name.endswith(_ROOT_OF_SOG) for name in names):
+        return False
+    suffixes = {PurePosixPath(name).suffix.lower() for name in names}
+    return bool(suffixes & (PHOTO_SUFFIXES | VIDEO_SUFFIXES))
+
+
+def _zip(path: Path) -> dict[str, Any]:
+    """The scene in a zip file that may also have pictures of it; otherwise, its photos."""
+    from snowsplat.pipeline.describe_photos import describe_zip  # pycolmap and torch
+
+    try:
+        return _scene(path, format_for_reading(path))
+    except UserError:
+        return describe_zip(path)
 
 
 def _is_export(path: Path) -> bool:

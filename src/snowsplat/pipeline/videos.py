@@ -19,7 +19,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output import image_files
-from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around
+from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, index_in
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
@@ -241,6 +241,7 @@ class _Source:
 
 
 def _load(scene: Path, iteration: int | None, name: str) -> _Source:
+    scene = index_in(scene) or scene
     if scene.is_file():
         file = scene.with_name(f"{scene.stem}_{name}.mp4")
         folder, gaussians = folder_around(scene), read_gaussians(scene)
@@ -277,6 +278,7 @@ def cameras_along(
                 "path", f"{path} is unknown; use {known} or a file of cameras (.json)"
             )
         _, keys = read_cameras(Path(path))
+        keys = _in_frame_of(gaussians, keys)
         distance = trajectory.viewing_distance(keys, gaussians.means)
         cameras = trajectory.key_path(keys, frames, distance)
     elif trained is not None:
@@ -298,6 +300,15 @@ def cameras_along(
         )
     width, height = size.for_camera(cameras[0])
     return [trajectory.resized(camera, width, height) for camera in cameras]
+
+
+def _in_frame_of(gaussians: Gaussians, cameras: list[Camera]) -> list[Camera]:
+    """Cameras relative to the origin of the scene. In the world they are nearer to it than to 0."""
+    middle = torch.stack([camera.position for camera in cameras]).mean(0)
+    origin = torch.tensor(gaussians.origin, dtype=middle.dtype)
+    if (middle - origin).norm() >= middle.norm():
+        return cameras
+    return [camera.seen_from(gaussians.origin) for camera in cameras]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -114,7 +115,9 @@ class NewestScene:
             return read_gaussians(path)
         saved = checkpoint.load(path)
         part = "gaussians."
-        own = {n[len(part) :]: t for n, t in saved.tensors.items() if n.startswith(part)}
+        own: dict[str, Any] = {
+            n[len(part) :]: t for n, t in saved.tensors.items() if n.startswith(part)
+        }
         try:
             antialiased = saved.meta.get("training", {}).get("antialias", False)
             return Gaussians(**own, antialiased=bool(antialiased))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.scene.near_plane import NEAR
+from snowsplat.scene.origin import Origin
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +82,14 @@ class Camera:
     def to(self, device: torch.device) -> Camera:
         """This camera with its pose on ``device``, as rendering on that device needs it."""
         return dataclasses.replace(self, cam_from_world=self.cam_from_world.to(device))
+
+    def seen_from(self, origin: Origin) -> Camera:
+        """The same camera in a world frame whose 0 is at ``origin`` in this one."""
+        pose = self.cam_from_world
+        moved = pose[:, 3] + pose[:, :3] @ torch.tensor(
+            origin, dtype=pose.dtype, device=pose.device
+        )
+        return dataclasses.replace(self, cam_from_world=torch.cat([pose[:, :3], moved[:, None]], 1))
 
     def downscaled(self, factor: int) -> Camera:
         """The camera of the image that `ImageLoader.get` returns with ``downscale=factor``."""

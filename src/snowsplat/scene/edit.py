@@ -12,6 +12,7 @@ from torch import Tensor
 from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
+from snowsplat.scene.origin import HERE, Origin, origin_of
 
 # Directions on the sphere for `sh_rotation`. 16 determine degree 3; more are better conditioned.
 _DIRECTIONS = 64
@@ -20,7 +21,8 @@ _DIRECTIONS = 64
 def transform(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     """The scene in a new world frame; ``similarity`` maps the old frame to the new one.
 
-    Means, covariances and the view-dependent colours (SH) are transformed.
+    Means, covariances and the view-dependent colours (SH) are transformed. The new frame has no
+    origin in a larger one, see `transform_world` for scenes that have one.
     """
     dtype = gaussians.means.dtype
     turn = quat_from_rotation(similarity.rotation).to(dtype)
@@ -33,7 +35,36 @@ def transform(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
         log_scales=gaussians.log_scales + math.log(similarity.scale),
         quats=quat_product(turn, quats),
         sh_rest=_rotate_sh(gaussians.sh_rest, similarity.rotation),
+        origin=HERE,
     )
+
+
+def transform_world(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+    """`transform` for positions in the world, which are the means plus the origin of the scene.
+
+    They are computed in float64; the result has an origin if float32 would lose precision.
+    """
+    world = similarity.apply(_world(gaussians))
+    size = float(gaussians.log_scales.median().exp()) * similarity.scale if len(world) else 0.0
+    origin = origin_of(world.numpy(), size)
+    means = (world - torch.tensor(origin, dtype=torch.float64)).to(gaussians.means.dtype)
+    return replace(transform(gaussians, similarity), means=means, origin=origin)
+
+
+def _world(gaussians: Gaussians) -> Tensor:
+    """(N, 3) float64: the positions in the world."""
+    origin = torch.tensor(gaussians.origin, dtype=torch.float64)
+    return gaussians.means.to(torch.float64) + origin
+
+
+def seen_from(gaussians: Gaussians, origin: Origin) -> Gaussians:
+    """The same Gaussians in the world, with positions relative to another origin."""
+    if gaussians.origin == origin:
+        return gaussians
+    means = (_world(gaussians) - torch.tensor(origin, dtype=torch.float64)).to(
+        gaussians.means.dtype
+    )
+    return replace(gaussians, means=means, origin=origin)
 
 
 def sh_rotation(rotation: Tensor, degree: int) -> list[Tensor]:
@@ -66,21 +97,25 @@ def crop(gaussians: Gaussians, box: Tensor) -> Gaussians:
 
     Args:
         gaussians: N Gaussians.
-        box: (2, 3) lower and upper corner in the world frame.
+        box: (2, 3) lower and upper corner in the world.
     """
-    low, high = box.to(gaussians.means.dtype)
+    origin = torch.tensor(gaussians.origin, dtype=torch.float64)
+    low, high = (box.to(torch.float64) - origin).to(gaussians.means.dtype)
     return gaussians.select(((gaussians.means >= low) & (gaussians.means <= high)).all(1))
 
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
     """All rows of ``parts`` (at least one) in order, with the highest SH degree of the parts.
 
+    They keep their places in the world; the origin of the first part is that of all.
     A single part is returned as it is: a copy of a large scene would need much memory.
     """
     if len(parts) == 1:
         return parts[0]
     degree = max(part.sh_degree for part in parts)
-    return Gaussians.cat([with_sh_degree(part, degree) for part in parts])
+    return Gaussians.cat(
+        [seen_from(with_sh_degree(part, degree), parts[0].origin) for part in parts]
+    )
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.ops.scratch import take_rows
+from snowsplat.scene.origin import HERE, Origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 
 
@@ -41,6 +42,8 @@ class Gaussians:
     Attributes:
         antialiased: whether the Gaussians were trained for the 2D mip filter, and must be rendered
             with it: see `ops.project`. Scene files call this mode "mip" or "antialiased".
+        origin: what is added to the means to get positions in the world, see `scene.origin`.
+            Rendering and training do not use it: cameras are relative to the origin, too.
 
     Raises:
         ValueError: shapes, dtypes or devices do not match.
@@ -53,6 +56,7 @@ class Gaussians:
     sh_dc: Tensor
     sh_rest: Tensor
     antialiased: bool = field(default=False, kw_only=True)
+    origin: Origin = field(default=HERE, kw_only=True)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -120,13 +124,16 @@ class Gaussians:
 
     # Sets of Gaussians
 
-    def finite_rows(self) -> Tensor:
-        """(N,) bool: whether all parameters of a Gaussian are finite."""
-        finite = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
-        for parameter in self.parameters().values():
-            values = parameter if parameter.ndim > 1 else parameter[:, None]
-            finite &= values.isfinite().flatten(1).all(dim=1)
-        return finite
+    def usable_rows(self) -> Tensor:
+        """(N,) bool: whether a Gaussian can be shown.
+
+        Infinite opacity logits are the opacities 0 and 1, and the log scale −inf is a flat axis.
+        All other infinite values, and NaN, have no meaning.
+        """
+        usable = ~self.opacity_logits.isnan() & (self.log_scales < torch.inf).all(dim=1)
+        for finite in (self.means, self.quats, self.sh_dc, self.sh_rest):
+            usable &= finite.isfinite().flatten(1).all(dim=1)
+        return usable
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Apply one function to every parameter tensor."""
@@ -135,7 +142,7 @@ class Gaussians:
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
         """Other Gaussians, by the names of `parameters`, that are rendered as these."""
         tensors = (parameters[name] for name in self.parameters())
-        return Gaussians(*tensors, antialiased=self.antialiased)
+        return Gaussians(*tensors, antialiased=self.antialiased, origin=self.origin)
 
     def select(self, index: Tensor) -> Gaussians:
         """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""
@@ -154,7 +161,7 @@ class Gaussians:
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
         """The rows of all ``parts`` in order; needs at least one part, and equal SH degrees.
 
-        They are rendered as the first part.
+        They are rendered as the first part. Their origins must be equal.
         """
         rows = [part.parameters() for part in parts]
         return parts[0].with_parameters({n: torch.cat([r[n] for r in rows]) for n in rows[0]})

@@ -45,8 +45,9 @@ def origin_of(points: np.ndarray, size: float = 0.0) -> Origin:
     if not len(sample):
         return HERE
     low, middle, high = np.quantile(sample, [0.25, 0.5, 0.75], axis=0)
-    extent = max(2.0 * float((high - low).max()), _OF_SIZE / _PRECISION * size)
-    if not 0 < extent < math.inf or np.abs(middle).max() * _HALF_STEP <= _PRECISION * extent:
+    extent = 2.0 * float((high - low).max()) or size  # one point has the extent of what is there
+    accepted = max(_PRECISION * extent, _OF_SIZE * size)
+    if not 0 < extent < math.inf or np.abs(middle).max() * _HALF_STEP <= accepted:
         return HERE
     step = 10.0 ** math.floor(math.log10(extent))
     x, y, z = (round(value / step) * step for value in middle.tolist())

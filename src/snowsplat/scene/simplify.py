@@ -16,8 +16,9 @@ another orientation, so two neighbours that are on different sides of a border m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -40,6 +41,10 @@ _CHUNK = 1 << 15
 _TURN = rotation_from_quat(torch.tensor([[0.9, 0.25, -0.31, 0.17]], dtype=torch.float64))[0]
 # Largest opacity of a merged Gaussian: its logit is finite.
 _MAX_OPACITY = 0.9999
+# What replaces an infinite logit, and −inf as the logarithm of a scale, relative to the others.
+_LARGEST_LOGIT = 12.0
+_FLAT = math.log(1e-4)
+_LEAST_LOG_SCALE = -27.0
 _TINY = torch.finfo(torch.float64).tiny
 
 
@@ -62,7 +67,8 @@ def simplify(
     not merged do not change.
 
     Args:
-        gaussians: N Gaussians on the CPU. Those that are not finite are removed first.
+        gaussians: N Gaussians on the CPU. Those that are not usable are removed first, and infinite
+            logits of opacities become finite, because the result may be trained.
         count: how many to keep. If it is at least N, the result is ``gaussians``.
         cameras: the cameras of the photos, see `sight`. They make the result better.
         farther: the factor by which a pixel becomes larger where two Gaussians are merged. 1: the
@@ -77,7 +83,7 @@ def simplify(
         return gaussians
     if count <= 0:
         return gaussians.select(torch.empty(0, dtype=torch.int64))
-    gaussians = gaussians.select(gaussians.finite_rows())
+    gaussians = _trainable(gaussians.select(gaussians.usable_rows()))
     mixture, turn = _Mixture.from_gaussians(gaussians, cameras), torch.eye(3, dtype=torch.float64)
     while len(mixture) > count:
         mixture = mixture.select(morton_order(mixture.means.T @ turn))
@@ -85,6 +91,15 @@ def simplify(
         mixture = _merge(mixture, *_cheapest_pairs(_costs(mixture), surplus), farther)
         turn = turn @ _TURN
     return mixture.gaussians(gaussians)
+
+
+def _trainable(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians with finite parameters: opacities in (0, 1), flat axes of a small size."""
+    logits = gaussians.opacity_logits.nan_to_num(posinf=_LARGEST_LOGIT, neginf=-_LARGEST_LOGIT)
+    scales = gaussians.log_scales
+    least = scales.amax(dim=1, keepdim=True).clamp_min(_LEAST_LOG_SCALE) + _FLAT
+    log_scales = torch.where(scales == -torch.inf, least, scales)
+    return replace(gaussians, opacity_logits=logits, log_scales=log_scales)
 
 
 @dataclass
@@ -167,7 +182,8 @@ class _Mixture:
         }
         dtype = original.means.dtype
         kept = original.select(self.origins[self.origins >= 0])
-        return kept.append(Gaussians(**{n: v.to(dtype).contiguous() for n, v in values.items()}))
+        made = original.with_parameters({n: v.to(dtype).contiguous() for n, v in values.items()})
+        return kept.append(made)
 
 
 def _costs(mixture: _Mixture) -> Tensor:

@@ -6,6 +6,7 @@ the header, it checks that the file is large enough. So damaged and malicious fi
 one-line error.
 """
 
+import io
 import os
 import warnings
 from collections.abc import Iterator, Sequence
@@ -64,7 +65,7 @@ class PlyTable:
     Invariant: the file is large enough for ``count`` rows; for ASCII, for rows of minimal size.
     """
 
-    path: Path
+    path: Path  # for messages, and the file to read if there is no ``data``
     format: str  # a key of `_BYTE_ORDERS`
     count: int  # number of rows
     columns: dict[str, str]  # name -> numpy type code, in the order of the file
@@ -72,16 +73,24 @@ class PlyTable:
     comments: tuple[str, ...]  # of the header, without the word "comment"; words are single-spaced
     _before: list[_Element]  # the elements before this one
     _data_start: int  # size of the header in bytes
+    _data: bytes | None = None  # the content, if it is not in a file of its own
 
     def rows(self) -> Iterator[tuple[int, np.ndarray]]:
         """The rows in blocks: pairs (index of the first row, structured array of the columns).
+
+        The columns have their declared types; in ASCII files, all floating-point columns are
+        float64.
 
         Raises:
             UserError: the file ends early, or an ASCII value is not a number.
         """
         order = _BYTE_ORDERS[self.format]
-        dtype = np.dtype([(name, order + code) for name, code in self.columns.items()])
-        with open(self.path, "rb") as file:
+        # A text may have more digits than the declared type, and often has.
+        codes = {"f4": "f8"} if self.format == "ascii" else {}
+        dtype = np.dtype(
+            [(name, order + codes.get(code, code)) for name, code in self.columns.items()]
+        )
+        with _open(self.path, self._data) as file:
             file.seek(self._data_start)
             chunk = max(1, _CHUNK_BYTES // max(1, dtype.itemsize))  # there may be no columns
             if self.format != "ascii":
@@ -96,10 +105,10 @@ class PlyTable:
                 yield start, read(file, dtype, min(chunk, self.count - start))
 
     def _read_binary(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
-        rows = np.fromfile(file, dtype, count)
-        if len(rows) < count:
+        data = file.read(count * dtype.itemsize)
+        if len(data) < count * dtype.itemsize:
             raise self._truncated()
-        return rows
+        return np.frombuffer(data, dtype) if dtype.itemsize else np.empty(count, dtype)
 
     def _read_ascii(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
         limit = _LINE_LIMIT + _NUMBER_LIMIT * len(self.columns)
@@ -139,16 +148,25 @@ def _truncated(path: Path) -> UserError:
     return UserError(f"{path}: the PLY file ends before its last row; copy or export it again")
 
 
-def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
+def _open(path: Path, data: bytes | None) -> BinaryIO:
+    return open(path, "rb") if data is None else io.BytesIO(data)
+
+
+def open_table(path: Path | str, element: str = "vertex", data: bytes | None = None) -> PlyTable:
     """Read the header of a PLY file and check that the file is large enough for ``element``.
+
+    Args:
+        data: the content of the file, if it is not at ``path`` but, for example, inside of a zip
+            file; then ``path`` is for messages.
 
     Raises:
         UserError: the file is missing, truncated, or not a PLY file, or its header is invalid.
     """
     path = Path(path)
     try:
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
+        with _open(path, data) as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
             lines = _header_lines(path, file)
             data_start = file.tell()
     except OSError as error:
@@ -178,7 +196,7 @@ def open_table(path: Path | str, element: str = "vertex") -> PlyTable:
         raise _truncated(path)
     comments = tuple(" ".join(words[1:]) for words in lines if words[0] == "comment")
     layout = (path, format, wanted.count, wanted.properties, tuple(names), comments)
-    return PlyTable(*layout, before, data_start)
+    return PlyTable(*layout, before, data_start, data)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:

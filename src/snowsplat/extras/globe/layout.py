@@ -85,7 +85,7 @@ def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arra
         UserError: no Gaussians are left.
     """
     gaussians = gaussians.detach()
-    usable = gaussians.finite_rows() & (gaussians.opacities > _MIN_OPACITY)
+    usable = gaussians.usable_rows() & (gaussians.opacities > _MIN_OPACITY)
     gaussians = gaussians.select(usable)
     if not len(gaussians):
         raise UserError("the scene has no visible Gaussians; there is nothing to put into a globe")

@@ -9,8 +9,11 @@ import filecmp
 from pathlib import Path
 
 from snowsplat.formats.lod import INDEX
+from snowsplat.formats.sog import META, is_sog
 from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
 from snowsplat.util.errors import UserError
+
+_HEAD_BYTES = 16_384
 
 
 def existing_folder(path: Path) -> OutputFolder:
@@ -26,18 +29,32 @@ def training_folder(path: Path) -> OutputFolder:
     return made if made.scenes() and not folder.scenes() else folder
 
 
+def index_in(folder: Path) -> Path | None:
+    """The file that describes the scene of which ``folder`` consists: `lod-meta.json`, or the
+    `meta.json` of SOG; None if there is none."""
+    if (folder / INDEX).is_file():
+        return folder / INDEX
+    sog = folder / META
+    if sog.is_file():
+        with open(sog, "rb") as file:
+            if is_sog(file.read(_HEAD_BYTES)):
+                return sog
+    return None
+
+
 def scene_file(path: Path) -> Path:
     """``path`` itself if it is a file, or the scene in the folder ``path``.
 
-    That is its levels of detail if it has a `lod-meta.json`, else the last scene of the training.
+    That is its levels of detail if it has a `lod-meta.json`, its SOG scene if it has a `meta.json`,
+    else the last scene of the training.
 
     Raises:
         UserError: a folder without a scene.
     """
     if not path.is_dir():
         return path
-    if (path / INDEX).is_file():
-        return path / INDEX
+    if index := index_in(path):
+        return index
     folder = training_folder(path)
     scenes = folder.scenes()
     if not scenes:

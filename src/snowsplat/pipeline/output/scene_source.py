@@ -7,10 +7,14 @@ from pathlib import Path
 
 from snowsplat.data import Dataset
 from snowsplat.formats import read_gaussians
-from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, training_folder
+from snowsplat.pipeline.output.scene_paths import (
+    existing_folder,
+    folder_around,
+    index_in,
+    training_folder,
+)
 from snowsplat.pipeline.run.refined_cameras import with_refined
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
@@ -121,8 +125,7 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
     path = Path(path)
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
-    if (path / INDEX).is_file():
-        path = path / INDEX
+    path = index_in(path) or path
     if path.is_dir():
         folder = training_folder(path)
         found, gaussians = folder.read_scene(iteration)

@@ -1,0 +1,105 @@
+"""The members of an untrusted zip file, unpacked in memory, never to the disk."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+from snowsplat.util.safe_json import is_file, quoted
+
+# Largest directory in bytes. Python creates an object for each entry, ten times as large as it.
+_DIRECTORY_LIMIT = 1 << 20
+_BLOCK = 1 << 16
+# Maximum size of an unpacked member: a factor times its packed size, plus this many bytes.
+_INFLATION_FREE = 1 << 20
+
+
+class Damaged(Exception):
+    """The file is damaged. The caller adds the path to the message."""
+
+
+class ZipMembers:
+    """The members of a zip file. A context manager."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises: Damaged: not a zip file, or one with an implausible directory."""
+        try:
+            if not is_file(path):  # reading a pipe may never end
+                raise Damaged(f"{quoted(path.name)} is missing or not a file")
+            self._file = _InBlocks(path)
+        except OSError as error:
+            raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
+        try:
+            self._zip = zipfile.ZipFile(self._file)
+        except (
+            ValueError,
+            EOFError,
+            OSError,
+            struct.error,
+            NotImplementedError,
+            zipfile.BadZipFile,
+        ):
+            raise Damaged("not a readable zip file") from None
+
+    def __enter__(self) -> ZipMembers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._zip.close()
+        self._file.close()
+
+    def names(self) -> list[str]:
+        """The names of all members. They are not safe as paths."""
+        return self._zip.namelist()
+
+    def read(self, name: str, inflation: int) -> bytes:
+        """The content of a member, at most ``inflation`` times as large as it is packed.
+
+        Raises:
+            Damaged: it is missing, damaged, or larger than that.
+        """
+        try:
+            info = self._zip.getinfo(name)
+        except KeyError:
+            raise Damaged(f"a zip file without {quoted(name)}") from None
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise Damaged(f"its {quoted(name)} has an unknown compression method; unzip it")
+        packed = min(info.compress_size, self._file.size)
+        if info.file_size > inflation * packed + _INFLATION_FREE:
+            raise Damaged(f"its {quoted(name)} would unpack to {info.file_size} bytes")
+        try:
+            content = bytearray()
+            with self._zip.open(info) as member:
+                # read() without a size would unpack everything, whatever size is declared.
+                while block := member.read(min(_BLOCK, info.file_size - len(content))):
+                    content += block
+            return bytes(content)
+        except (
+            OSError,
+            ValueError,
+            RuntimeError,
+            OverflowError,  # an offset larger than that of any file
+            EOFError,
+            struct.error,
+            NotImplementedError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ):
+            raise Damaged(f"its {quoted(name)} is damaged") from None
+
+
+class _InBlocks(io.FileIO):
+    """A file that refuses to read much at once: `zipfile` reads a directory of any size."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.size = path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        wanted = self.size - self.tell() if size is None or size < 0 else size
+        if wanted > _DIRECTORY_LIMIT:
+            raise Damaged("a zip file with an implausible number of members")
+        return super().read(size)
