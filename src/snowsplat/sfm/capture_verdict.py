@@ -56,7 +56,8 @@ def capture_verdict(
             the cameras, as clauses for users.
         problems: photos that are blurred, too dark or too bright, and what is wrong.
     """
-    photos = len(sfm["registered"])  # a photo of a wide lens becomes several images
+    # A photo of a wide lens becomes several images.
+    photos = min(len(sfm["registered"]), len(coverage.names))
     reasons = [
         *_lost(sfm),
         *_distances(coverage),

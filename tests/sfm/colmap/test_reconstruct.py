@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress
+from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.colmap.options import SfmOptions
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.progress import silent
@@ -42,6 +43,23 @@ def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registe
 def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
     progress = WorkerProgress(silent, lambda *table: None)
     job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, progress)
-    job.attempts = [SimpleNamespace(registered=n, agreement=share) for n, share in attempts]
+    job.attempts = [
+        SimpleNamespace(registered=n, agreement=share, error=1.0, lens=Lens())
+        for n, share in attempts
+    ]
     assert job._good(SimpleNamespace(usable=10)) == good
     assert job._best() is job.attempts[best]
+
+
+def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
+    job = PoseEstimation(
+        Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent, lambda *table: None)
+    )
+    fisheye = Lens(fisheyes=frozenset([1]))
+    job.attempts = [
+        SimpleNamespace(registered=9, agreement=0.95, error=0.24, lens=fisheye),
+        SimpleNamespace(registered=10, agreement=0.99, error=0.62, lens=Lens()),
+    ]
+    assert job._best() is job.attempts[0]
+    job.attempts[1].error = 0.25
+    assert job._best() is job.attempts[1]
