@@ -187,7 +187,7 @@ class Run:
         for part in parts:
             part.prepare(self)
         first = self.shards.scattered(self._first())
-        self.gaussians = replace(first, antialiased=config.antialias)
+        self.gaussians = replace(first, antialiased=config.antialias, origin=self.dataset.origin)
         # A regulariser acts on all Gaussians, not only on those that a view shows.
         self.optimizer = Adam(
             self.gaussians,
