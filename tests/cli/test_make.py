@@ -244,10 +244,8 @@ def test_the_inputs_are_searched_once(refused, dataset, tmp_path, monkeypatch, m
     for name in ("view_00.png", "view_01.png"):
         shutil.copyfile(dataset / "images" / name, few / name)
     searched = []
-    search = sources._files_below
-    monkeypatch.setattr(
-        sources, "_files_below", lambda root, *a: searched.append(root) or search(root, *a)
-    )
+    search = sources._search
+    monkeypatch.setattr(sources, "_search", lambda root: searched.append(root) or search(root))
     assert "2 usable images" in refused("make", few, "-o", tmp_path / "out", *minutes)
     assert searched == [few]
 

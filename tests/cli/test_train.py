@@ -48,7 +48,7 @@ def test_the_output_folder(run, dataset, tmp_path):
     cameras = json.loads((out / "cameras.json").read_text())
     assert len(cameras) == 9
     assert cameras[0].keys() == {
-        *("id", "img_name", "width", "height", "position", "rotation", "fx", "fy"),
+        *("id", "img_name", "width", "height", "position", "rotation", "fx", "fy", "near"),
     }
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["iteration"] == 30

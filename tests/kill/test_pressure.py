@@ -224,12 +224,12 @@ def test_a_training_run_whose_photos_are_removed(zygote, place, dataset):
     command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
     assert zygote.run(command).code == 0
     before = {name: digest(out / name) for name in names_in(out)}
-    (mine / "images").rename(mine / "moved")
+    (mine / "images").rename(place / "moved")
     ended = zygote.run(["train", "-o", out, "--resume", "--iterations", 60, *CPU])
     refused(ended, rf"{mine}/images")
     assert {name: digest(out / name) for name in names_in(out)} == before
 
-    (mine / "moved").rename(mine / "images")
+    (place / "moved").rename(mine / "images")
     begun = (place / "two" / "config.json").exists
     ended = zygote.run(
         ["train", mine, "-o", place / "two", "--iterations", 40, *CPU],

@@ -130,7 +130,7 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
         runner = trainer.runner
         runner.capacity = ops.Capacity(5000, on_device(torch.zeros(1, dtype=torch.int64)))
         runner._required = runner.capacity.required
-        runner._nonusable_rows = on_device(runner._nonusable_rows)
+        runner._nonfinite_rows = on_device(runner._nonfinite_rows)
         view = replace(
             view,
             camera=replace(view.camera, cam_from_world=on_device(view.camera.cam_from_world)),

@@ -111,7 +111,7 @@ SUBCOMMANDS: dict[str, Subcommand] = dict(
         ),
         _own(
             "info",
-            "Describe a scene, a point cloud, a dataset, a checkpoint or an output folder.",
+            "Describe photos, a video, a dataset, a scene, a checkpoint or an output folder.",
             "PATH",
             "describe a file or a folder",
         ),

@@ -49,6 +49,7 @@ logger = logging.getLogger(__name__)
 _DIVISORS = (2, 4, 8)
 _MASKS = 8  # of a camera that are examined for an image circle
 _CIRCLE = 0.95  # radius of an image circle / distance of the corner of a photo, at most
+_FULL = 0.9  # share of the pixels in an image circle that are used in some photo, at least
 _BYTES_PER_PIXEL = 50  # peak memory per photo, reached while it is resized
 # Options for saving each format, without a loss that affects training.
 _SAVING: dict[str, dict[str, Any]] = {
@@ -182,24 +183,30 @@ def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[L
     """
     lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     try:
-        views = lens_views(lens, None if camera.is_spherical() else _circle(camera, masks))
+        views = lens_views(lens, _circle(camera, masks) if _is_fisheye(camera) else None)
     except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
         return ()
     return () if views[0].rotation is None else views
+
+
+def _is_fisheye(camera: pycolmap.Camera) -> bool:
+    return not (camera.is_spherical() or camera.is_perspective_pinhole())
 
 
 def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
     """The radius in pixels, around the principal point, outside of which all is masked; or None."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     radius = np.hypot(x - camera.principal_point_x, y - camera.principal_point_y)
-    reach = 0.0
+    reach, inside = 0.0, np.zeros(radius.shape, bool)
     for path in masks[:: max(1, len(masks) // _MASKS)]:
         with open_image(path, ["PNG"]) as mask:
             used = np.asarray(mask.convert("L")) >= 128
         if used.shape != radius.shape or not used.any():
             return None
-        reach = max(reach, float(radius[used].max()))
-    return reach if 0 < reach < _CIRCLE * radius.max() else None
+        reach, inside = max(reach, float(radius[used].max())), inside | used
+    # The masks of something in the middle of the photos are no image circle: they do not fill it.
+    is_full = inside[radius < reach].mean() >= _FULL
+    return reach if 0 < reach < _CIRCLE * radius.max() and is_full else None
 
 
 def _pinhole(camera: pycolmap.Camera) -> Pinhole:

@@ -76,7 +76,7 @@ def test_points_are_projected_as_by_the_program(case, tmp_path):
         assert image.path.is_file()
         assert np.abs(pixels(image) - expected[image.path.name]).max() < 1e-6
     if points is not None:
-        assert torch.allclose(points.xyz, torch.from_numpy(POINTS).float(), atol=1e-5)
+        assert torch.allclose(points.xyz.float(), torch.from_numpy(POINTS).float(), atol=1e-5)
     assert f"{len(NAMES)} of" in description
 
 
@@ -95,7 +95,7 @@ def test_points_in_the_frame_of_the_chunk_are_moved_to_the_world(tmp_path):
     exports.painted_photos(tmp_path / "images")
     _, points, _ = read(tmp_path)
     assert points is not None
-    assert torch.allclose(points.xyz, torch.from_numpy(POINTS).float(), atol=1e-5)
+    assert torch.allclose(points.xyz.float(), torch.from_numpy(POINTS).float(), atol=1e-5)
 
 
 def test_points_in_another_frame_are_not_used(tmp_path, caplog):

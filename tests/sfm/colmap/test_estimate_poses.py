@@ -164,6 +164,8 @@ def test_unknown_camera_model(tmp_path, pictures):
 @pytest.mark.parametrize("camera_model", CAMERA_MODELS)
 def test_camera_models_are_known_to_colmap(camera_model):
     camera = pycolmap.Camera.create_from_model_name(1, camera_model, 500.0, 640, 480)
+    if camera.is_spherical():  # becomes several views
+        return
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     assert pinhole.model_name == "PINHOLE"
 

@@ -16,6 +16,7 @@ from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.density.mcmc import (
     NOISE_SHARPNESS,
+    USUAL_EXTENT,
     McmcDensity,
     McmcDensityControl,
     shared_opacity,
@@ -277,6 +278,7 @@ def test_regularisers_are_the_gradients_of_mean_opacity_and_scale():
     leaves = gaussians.clone()
     leaves.opacity_logits.requires_grad_()
     leaves.log_scales.requires_grad_()
-    (0.02 * leaves.opacities.mean() + 0.03 * leaves.scales.mean()).backward()
+    scale_weight = 0.03 * USUAL_EXTENT / control.extent
+    (0.02 * leaves.opacities.mean() + scale_weight * leaves.scales.mean()).backward()
     torch.testing.assert_close(gaussians.opacity_logits.grad, leaves.opacity_logits.grad)
     torch.testing.assert_close(gaussians.log_scales.grad, leaves.log_scales.grad)
