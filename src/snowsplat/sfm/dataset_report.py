@@ -31,7 +31,13 @@ _MAX_THUMBNAILS = 24  # evenly spaced over the photos
 _THUMBNAIL_HEIGHT = 110  # pixels
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
 
-_FOCAL_FROM = {"exif": "from EXIF, refined", "guessed": "estimated from the photos"}
+# By `focal_from` and `focal_held` of a camera; earlier versions did not have the latter.
+_FOCAL_FROM = {
+    ("exif", False): "from EXIF, refined",
+    ("exif", True): "from EXIF; the photos do not determine it",
+    ("guessed", False): "estimated from the photos",
+    ("guessed", True): "a usual one; the photos do not determine it",
+}
 _STAGES = {"photos": "reading photos", "poses": "estimating poses", "images": "undistorting"}
 
 _STYLE = """
@@ -255,6 +261,10 @@ def _thumbnail(path: Path) -> Image.Image:
     return small
 
 
+def _focal_from(camera: dict[str, Any]) -> str:
+    return _FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))]
+
+
 def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     rows = []
     for camera in sfm["cameras"]:
@@ -272,7 +282,7 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
             [
                 str(camera["images"]),
                 f"{width} × {height}",
-                f"{focal:.0f} px ({angle:.0f}°), {_FOCAL_FROM[camera['focal_from']]}",
+                f"{focal:.0f} px ({angle:.0f}°), {_focal_from(camera)}",
                 f"{camera['model']} <span class='soft'>{parameters}</span>",
             ]
         )

@@ -59,8 +59,8 @@ class SfmResult:
     # Pixels of the photos in input/, mean over the points that at least three photos see.
     reprojection_error: float
     sub_models: list[int]  # number of photos of each model, largest first
-    # For each camera: model, width, height, params, focal_from ("exif" or "guessed") and images,
-    # the number of photos.
+    # For each camera: model, width, height, params, focal_from ("exif" or "guessed"), focal_held
+    # (whether the focal length was not refined), and images, the number of photos.
     cameras: list[dict[str, Any]]
     pairs: str  # how the pairs of photos to match were chosen, as text for users
     attempts: list[str]  # a description of each attempt, as text for users, in order

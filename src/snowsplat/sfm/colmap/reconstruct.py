@@ -178,7 +178,13 @@ class PoseEstimation:
             best.left_out,
         )
         result = result_of(
-            best.models, self.photos, reasons, best.matched.choice.description, self.log
+            best.models,
+            self.photos,
+            reasons,
+            best.matched.choice.description,
+            self.log,
+            exif=best.lens.exif,
+            held=best.mapping.held,
         )
         if best.matched.database == second:
             replace_database(self.folders.database, by=second)

@@ -21,10 +21,15 @@ def result_of(
     unregistered: dict[str, str],
     pairs: str,
     attempts: list[str],
+    exif: bool = True,
+    held: bool = False,
 ) -> SfmResult:
-    """Statistics of the first of ``models`` (at least one, the largest first)."""
+    """Statistics of the first of ``models`` (at least one, the largest first).
+
+    ``exif``: the focal length in EXIF was used; ``held``: the focal length was not refined.
+    """
     model = models[0]
-    with_focal = {photo.name for photo in photos if photo.focal}
+    with_focal = {photo.name for photo in photos if photo.focal and exif}
     cameras = []
     for camera_id, camera in sorted(model.cameras.items()):
         taken = {n for n in names_in(model) if model.find_image_with_name(n).camera_id == camera_id}
@@ -36,6 +41,7 @@ def result_of(
                     "height": camera.height,
                     "params": [float(value) for value in camera.params],
                     "focal_from": "exif" if taken & with_focal else "guessed",
+                    "focal_held": held,
                     "images": len(taken),
                 }
             )
