@@ -8,6 +8,7 @@ them in UTF-8.
 import codecs
 import sys
 import unicodedata
+from contextlib import suppress
 from io import TextIOWrapper
 
 _ERRORS = "snowsplat-similar"  # the name of the error handler
@@ -20,9 +21,28 @@ _SIMILAR = {
     **dict.fromkeys("·•∙●", "*"),
     **dict.fromkeys("█▇▆▅▉▊▓", "#"),
     **dict.fromkeys("▄▃▂▁▋▌▍▎▏▒░", "-"),
-    **{"×": "x", "±": "+/-", "≤": "<=", "≥": ">=", "≈": "~", "≠": "!=", "∞": "inf", "√": "sqrt"},
-    **{"→": "->", "←": "<-", "↔": "<->", "↑": "^", "↓": "v", "✓": "ok", "✗": "x", "⚠": "!"},
-    **{"°": " deg", "µ": "u", "σ": "sigma", "Σ": "Sigma", "α": "alpha", "λ": "lambda"},
+    "×": "x",
+    "±": "+/-",
+    "≤": "<=",
+    "≥": ">=",
+    "≈": "~",
+    "≠": "!=",
+    "∞": "inf",
+    "√": "sqrt",
+    "→": "->",
+    "←": "<-",
+    "↔": "<->",
+    "↑": "^",
+    "↓": "v",
+    "✓": "ok",
+    "✗": "x",
+    "⚠": "!",
+    "°": " deg",
+    "µ": "u",
+    "σ": "sigma",
+    "Σ": "Sigma",
+    "α": "alpha",
+    "λ": "lambda",
 }
 
 
@@ -31,7 +51,9 @@ def accept_all_characters() -> None:
     codecs.register_error(_ERRORS, _replace)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # not in all notebooks; None without a terminal
-            stream.reconfigure(errors=_ERRORS)
+            # Python looks for the position in a file, which a redirected stream may not have.
+            with suppress(OSError):
+                stream.reconfigure(errors=_ERRORS)
 
 
 def similar(character: str) -> str:
