@@ -26,7 +26,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tests.browser import Browser, Page  # noqa: E402
-from tests.ports import unused_port  # noqa: E402
 
 PICTURES = Path(__file__).with_name("pictures")
 WIDTH, HEIGHT = 1280, 800
@@ -83,17 +82,19 @@ def shoot(page: Page, target: Path) -> None:
 @contextmanager
 def training(dataset: Path) -> Iterator[str]:
     """The address of the page of a training run, which ends with the context."""
-    port = unused_port()
     with TemporaryDirectory() as folder:
         out = Path(folder) / "table"  # the page shows this name
         command = [sys.executable, "-m", "snowsplat", "train", str(dataset), "-o", str(out)]
-        command += ["--eval", "--view", "--port", str(port)]
+        command += ["--eval", "--view"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
+            url = ""
             for line in process.stdout:  # until the page is ready
+                if line.startswith("watch it in a browser: "):
+                    url = line.split()[-1]
                 if line.startswith("step"):
                     break
-            yield f"http://127.0.0.1:{port}"
+            yield url
             process.terminate()
 
 

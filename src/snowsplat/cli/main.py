@@ -22,6 +22,7 @@ import tyro
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
 from snowsplat.cli.subcommands import SUBCOMMANDS, description, load_subcommand
+from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
 
@@ -39,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns the exit code.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    accept_all_characters()
     _report_log_and_warnings_as_lines()
     try:
         return int(parse(arguments or ["--help"]).run())

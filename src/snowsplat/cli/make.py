@@ -13,7 +13,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
-from snowsplat.cli.page_flags import PageFlags
+from snowsplat.cli.page_flags import AllowHost, PageFlags
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
@@ -83,10 +83,11 @@ class Make:
     view: Annotated[bool, switch()] = False
     """Show the training in the browser, and afterwards the finished scene until Ctrl-C."""
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
-    """Port of the page: http://localhost:N."""
+    """Port of the page. Its URL, which is printed, contains a secret token."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL then
-    contains a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network."""
+    allow_host: AllowHost = ()
+    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""
@@ -101,7 +102,7 @@ class Make:
             exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
         )
-        page = PageFlags(self.port, self.host).page(self.view)
+        page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
         try:
             with TerminalObserver() as observer, page or nullcontext():
                 result = make(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
@@ -89,10 +90,10 @@ class TerminalObserver(Observer):
 
     def page_opened(self, viewer: NetworkViewer) -> None:
         print(f"watch it in a browser: {viewer.url}", flush=True)
-        if viewer.others is not None:
-            print(f"from other computers: {viewer.others}", flush=True)
+        for url in viewer.others:
+            print(f"from other computers: {url}", flush=True)
         if viewer.url.startswith(f"http://{LOCAL_HOST}:"):
-            port = viewer.url.rpartition(":")[2]
+            port = urlsplit(viewer.url).port
             print(f"from another computer: ssh -L {port}:localhost:{port} THIS_ONE", flush=True)
 
 

@@ -57,7 +57,7 @@ class Train(TrainFlags):
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
         from snowsplat.pipeline.train import resume, train
 
-        page = PageFlags(self.port, self.host).page(self.view)
+        page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
         with TerminalObserver(self.quiet) as observer, page or nullcontext():
             try:
                 if self.resume:

@@ -10,6 +10,7 @@ import tyro
 
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, ConfigFlags, RecipeName
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.page_flags import AllowHost
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -54,10 +55,11 @@ class JobFlags:
     """Show the training in the browser: the scene, curves of loss and PSNR, and a button to pause.
     After the training, the page stays open until Ctrl-C."""
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
-    """Port of the page: http://localhost:N."""
+    """Port of the page. Its URL, which is printed, contains a secret token."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL then
-    contains a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network."""
+    allow_host: AllowHost = ()
+    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
     """Memory limit of the training, for example 4GB. On a GPU, this is memory of the GPU; on the

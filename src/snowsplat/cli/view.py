@@ -19,6 +19,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.page_flags import AllowHost
 from snowsplat.util.errors import UserError
 
 
@@ -50,6 +51,8 @@ class View:
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     port: Annotated[int, flag("N", default="a free one")] = 0
     """Port to listen on."""
+    allow_host: AllowHost = ()
+    """Name of a proxy through which browsers open the page. Can be repeated."""
     no_browser: Annotated[bool, switch()] = False
     """Print the URL, but do not open a browser."""
 
@@ -58,20 +61,21 @@ class View:
         if self.path is None:
             raise UserError("view needs a scene; add a file or the output folder of a training run")
         from snowsplat.pipeline.view import viewed_scene
-        from snowsplat.viewer.hosts import ANY_HOST
         from snowsplat.viewer.web.server import StaticServer
 
         with (
             TerminalObserver() as observer,
             viewed_scene(self.path, self.iteration, observer) as scene,
             interrupts() as interrupted,
-            StaticServer(scene.files, scene.headers, self.host, self.port) as server,
+            StaticServer(
+                scene.files, scene.headers, self.host, self.port, self.allow_host
+            ) as server,
         ):
             print(f"{scene.file}: {scene.gaussians:,} Gaussians")
             print(server.url, flush=True)
-            if self.host in ANY_HOST:
-                print(f"from other computers: {server.url_at(socket.gethostname())}", flush=True)
-            elif over_ssh():
+            for url in server.others:
+                print(f"from other computers: {url}", flush=True)
+            if not server.others and over_ssh():
                 print(f"from your computer: {forwarding(server.port)}", flush=True)
             if not self.no_browser and has_screen():
                 open_browser(server.url)

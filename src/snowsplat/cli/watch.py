@@ -7,7 +7,7 @@ from typing import Annotated
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.observer import WatchObserver
-from snowsplat.cli.page_flags import PageFlags
+from snowsplat.cli.page_flags import AllowHost, PageFlags
 from snowsplat.cli.scene_flags import SceneFlags
 
 
@@ -26,17 +26,18 @@ class Watch(SceneFlags):
     """
 
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
-    """Port of the page: http://localhost:N."""
+    """Port of the page. Its URL, which is printed, contains a secret token."""
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network; the printed URL then
-    contains a secret token."""
+    """Address to listen on. 0.0.0.0 accepts connections from the network."""
+    allow_host: AllowHost = ()
+    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     def run(self) -> int:
         """Runs until Ctrl-C; returns the exit code, 0."""
         path = self.output_path()
         from snowsplat.pipeline.watch import watch
 
-        page = PageFlags(self.port, self.host).page()
+        page = PageFlags(self.port, self.host, self.allow_host).page()
         assert page is not None
         with WatchObserver() as observer, page:
             watch(

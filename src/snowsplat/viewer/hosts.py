@@ -8,38 +8,90 @@ the browser writes. So these headers reveal both attacks.
 from __future__ import annotations
 
 import ipaddress
+import logging
 import re
 import socket
+from collections.abc import Sequence
+
+from snowsplat.util.errors import SettingError
 
 #: The address at which only this machine can connect.
 LOCAL_HOST = "127.0.0.1"
 #: Hosts that stand for all addresses of this machine.
 ANY_HOST = ("", "0.0.0.0", "::")
+#: The answer to a request for the page without its token.
+NO_TOKEN = (
+    "This address is incomplete. Open the complete URL that snowsplat has printed in its terminal: "
+    "its path is a secret token.\n"
+)
+
+_REPORTED = 8  # unknown names that are reported; strangers can send any number of them
+_log = logging.getLogger(__name__)
 
 
-def is_own_host(header: str, listening: str) -> bool:
-    """Whether the Host header is a valid name of this machine for a server at ``listening``.
+class KnownHosts:
+    """The names at which a server may be asked for."""
 
-    The port is not compared, because it differs with SSH forwarding. A server on the loopback
-    interface accepts only loopback names. Other servers also accept all IP addresses, because DNS
-    rebinding needs a domain name.
-    """
-    match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d*)?", header.strip())
-    if match is None:
-        return False
-    name = match[1].strip("[]").rstrip(".").lower()
-    if name in ("localhost", listening.lower()):
-        return True
-    try:
-        address = ipaddress.ip_address(name)
-    except ValueError:
-        return not is_loopback(listening) and name in _names_of_this_machine()
-    return address.is_loopback or not is_loopback(listening)
+    def __init__(self, listening: str, allowed: Sequence[str] = ()) -> None:
+        """
+        Args:
+            listening: the address at which the server listens.
+            allowed: further names, such as that of a proxy; each may be several ones, separated by
+                commas.
 
+        Raises:
+            UserError: an allowed name is none.
+        """
+        self._listening = listening
+        self.allowed = [_valid(name) for names in allowed for name in names.split(",")]
+        self._reported: set[str] = set()
 
-def is_own_page(origin: str, host: str) -> bool:
-    """Whether, by the Origin and Host headers, the requesting page comes from this server."""
-    return origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
+    def include(self, header: str) -> bool:
+        """Whether the Host header is a valid name of this machine.
+
+        The port is not compared, because it differs with SSH forwarding. A server on the loopback
+        interface accepts only loopback names. Other servers also accept all IP addresses, because
+        DNS rebinding needs a domain name.
+        """
+        name = _name(header)
+        if name is None:
+            return False
+        if name in ("localhost", self._listening.lower(), *self.allowed):
+            return True
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return not is_loopback(self._listening) and name in _names_of_this_machine()
+        return address.is_loopback or not is_loopback(self._listening)
+
+    def include_page(self, origin: str, host: str) -> bool:
+        """Whether, by the Origin and Host headers, the requesting page comes from this server.
+
+        A proxy may replace the Host header, but not the Origin header. So the page also comes from
+        this server if its origin is an allowed name.
+        """
+        scheme, _, place = origin.lower().partition("://")
+        if scheme not in ("http", "https"):
+            return False
+        return place == host.lower() or _name(place) in self.allowed
+
+    def explain(self, header: str) -> str:
+        """The answer to a request with an unknown Host header; each name is logged once."""
+        name = _name(header)
+        if name is None:
+            return "The request has no valid Host header.\n"
+        if name not in self._reported and len(self._reported) < _REPORTED:
+            self._reported.add(name)
+            _log.warning(
+                "a browser asked for the page at the unknown name %s; if your proxy has this name, "
+                "start again with --allow-host %s",
+                name,
+                name,
+            )
+        return (
+            f"snowsplat does not know the name {name}, and shows nothing at unknown names.\n"
+            f"If this is the name of your proxy, start snowsplat again with --allow-host {name}\n"
+        )
 
 
 def is_loopback(host: str) -> bool:
@@ -48,6 +100,26 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host.lower() == "localhost"
+
+
+def _name(header: str) -> str | None:
+    """The host of a Host header, without the port and in lower case; None if it is malformed."""
+    match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]{1,253})(?::\d*)?", header.strip())
+    return match and match[1].strip("[]").rstrip(".").lower()
+
+
+def _valid(allowed: str) -> str:
+    try:
+        name = _name(allowed.strip().encode("idna").decode())
+    except UnicodeError:
+        name = None
+    if not name:
+        raise SettingError(
+            "allow_host",
+            f"{allowed!r} is not a host name; use that of the address in the browser, without "
+            "https:// and path",
+        )
+    return name
 
 
 def _names_of_this_machine() -> set[str]:

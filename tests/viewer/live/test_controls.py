@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ class Training:
 
     def __init__(self, dataset: Path, out: Path) -> None:
         port = unused_port()
-        self.url, self.lines, self.out = f"http://127.0.0.1:{port}", [], out
+        self.lines, self.out = [], out
         flags = ["--iterations", "500000", "--threads", "1", "--view", "--port", str(port)]
         command = ("-m", "snowsplat", "train", dataset, "-o", out, "--eval", *flags)
         self.process = popen(*command, stderr=subprocess.STDOUT)
@@ -43,6 +44,8 @@ class Training:
             line = self.process.stdout.readline()
             assert line, self.lines
             self.lines.append(line)
+            if line.startswith("watch it in a browser: "):
+                self.url = line.split()[-1]
 
     def interrupt(self) -> str:
         """Send Ctrl-C; returns the following output."""
@@ -319,4 +322,4 @@ def test_ctrl_c_while_paused_saves_and_closes(training, tab):
     assert "warning" not in out
     assert (training.out / f"point_cloud/iteration_{paused}/point_cloud.ply").is_file()
     tab.close()
-    assert free_port("127.0.0.1", int(training.url.rpartition(":")[2]))
+    assert free_port("127.0.0.1", urlsplit(training.url).port)

@@ -18,11 +18,11 @@ import pytest
 import viser
 from websockets.exceptions import InvalidMessage, InvalidStatus
 
+from snowsplat.viewer.hosts import NO_TOKEN
 from snowsplat.viewer.live.guard import (
     _BROWSERS,
     _PAGES,
     _WAITING,
-    Guard,
     ServerTimeLimit,
     is_valid_message,
 )
@@ -94,15 +94,36 @@ def refused(url: str, **options: object) -> int:
 )
 def test_foreign_hosts_are_rejected(local, host):
     """A foreign domain name may resolve to this machine (DNS rebinding)."""
-    assert status(get(local.url, "/", f"Host: {host}")) == 421
+    assert status(get(local.url, None, f"Host: {host}")) == 421
     upgrading = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
     upgrading += [f"Sec-WebSocket-Key: {'A' * 22}==", f"Sec-WebSocket-Protocol: {PROTOCOL}"]
-    assert status(get(local.url, "/", f"Host: {host}", *upgrading)) == 421
+    assert status(get(local.url, None, f"Host: {host}", *upgrading)) == 421
+
+
+def test_a_proxy_with_a_public_name(caplog):
+    running = start_server("127.0.0.1", None, "a scene", ["abc.example"])
+    running.open()
+    token = running.url.split("/")[3]
+    try:
+        assert running.others == [f"https://abc.example/{token}/"]
+        origin = "Origin: https://abc.example"
+        for host in ("abc.example", "127.0.0.1"):
+            assert status(get(running.url, f"/{token}/", f"Host: {host}", origin)) == 200
+        with Visitor(running.url, origin="https://abc.example") as visitor:
+            visitor.send_camera()
+        assert refused(running.url, origin="https://other.example") == 403
+        for _ in range(2):
+            answer = get(running.url, f"/{token}/", "Host: other.example")
+            assert status(answer) == 421
+            assert b"start snowsplat again with --allow-host other.example" in answer
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+    finally:
+        stop_server(running.server)
 
 
 def test_own_hosts_with_any_port(local):
     for host in ("localhost:9000", "127.0.0.1", "[::1]:1"):
-        assert status(get(local.url, "/", f"Host: {host}", f"Origin: http://{host}")) == 200
+        assert status(get(local.url, None, f"Host: {host}", f"Origin: http://{host}")) == 200
 
 
 @pytest.mark.parametrize(
@@ -116,7 +137,7 @@ def test_foreign_pages_are_rejected(local, origin):
     origin = origin.format(port=port(local), other=port(local) + 1)
     if origin:  # else the client sends none
         assert refused(local.url, origin=origin) == 403
-    assert status(get(local.url, "/", f"Origin: {origin}")) == 403
+    assert status(get(local.url, None, f"Origin: {origin}")) == 403
 
 
 def test_the_page_itself_is_accepted(local, shared):
@@ -125,14 +146,17 @@ def test_the_page_itself_is_accepted(local, shared):
         with Visitor(running.url, origin=f"http://{parts.netloc}") as visitor:
             visitor.send_camera()
             wait(lambda running=running: len(running.server.get_clients()) == 1)
-    assert local.others is None
-    assert local.url == f"http://127.0.0.1:{port(local)}"
+    assert local.others == []
 
 
-def test_other_machines_need_the_token(shared):
+@pytest.mark.parametrize("name", ["local", "shared"])
+def test_others_need_the_token(name, request):
+    """Other machines, and other users of this machine."""
+    shared = request.getfixturevalue(name)
     token = shared.url.split("/")[3]
     assert len(token) >= 20
-    assert shared.others == f"http://{socket.gethostname()}:{port(shared)}/{token}/"
+    if name == "shared":
+        assert shared.others == [f"http://{socket.gethostname()}:{port(shared)}/{token}/"]
     with_token = get(shared.url)
     assert status(with_token) == 200
     assert b"<html" in with_token
@@ -142,15 +166,14 @@ def test_other_machines_need_the_token(shared):
     for path in ("", "/" + token[:-1], f"/{token}x", f"/x/{token}", f"/{token.swapcase()}"):
         answer = get(root, (path or "/") + "/")
         assert status(answer) == 404, path
-        assert answer.endswith(b"\r\n\r\n"), path  # the response has no content
+        content = answer.partition(b"\r\n\r\n")[2].decode()
+        assert content == ("" if path else NO_TOKEN), path
         assert refused(root + path) == 404, path
     assert refused(f"{root}/%2e/{token}") == 404
     other = start_server("0.0.0.0", None, "a scene")
     assert status(get(other.url)) == 503  # rejected before it is opened
     stop_server(other.server)
     assert other.url.split("/")[3] != token
-    with pytest.raises(ValueError, match="needs a token"):
-        Guard("0.0.0.0", None)
 
 
 # Served files
@@ -178,7 +201,7 @@ def test_only_the_page_is_served(local, shared):
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "get"])
 def test_only_get_and_head(local, method):
-    assert status(get(local.url, "/", method=method)) in (0, 400, 405, 501)
+    assert status(get(local.url, None, method=method)) in (0, 400, 405, 501)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +223,7 @@ def test_only_get_and_head(local, method):
     ],
 )
 def test_ambiguous_requests_are_rejected(local, headers):
-    answer = get(local.url, "/", *headers)
+    answer = get(local.url, None, *headers)
     assert status(answer) in (0, 400, 413, 431)
     assert answer.count(b"HTTP/1.1") <= 1
     assert status(get(local.url)) == 200
@@ -208,7 +231,7 @@ def test_ambiguous_requests_are_rejected(local, headers):
 
 def test_the_page_cannot_be_framed_or_read_by_other_pages(local):
     connection = http.client.HTTPConnection("127.0.0.1", port(local))
-    connection.request("GET", "/")
+    connection.request("GET", urlsplit(local.url).path)
     headers = connection.getresponse().headers
     assert headers["Content-Security-Policy"] == "frame-ancestors 'self'"
     assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
@@ -415,7 +438,8 @@ def test_the_number_of_browsers_is_limited(local):
 
 def test_unread_page_downloads_are_limited(local):
     """Each unread download uses as much memory as the page."""
-    request = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port(local)}\r\n\r\n".encode()
+    place = urlsplit(local.url)
+    request = f"GET {place.path} HTTP/1.1\r\nHost: {place.netloc}\r\n\r\n".encode()
     assert status(ask(local.url, request)) == 200
     clients = []
     for _ in range(3 * _PAGES):

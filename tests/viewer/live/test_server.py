@@ -32,7 +32,7 @@ def test_a_page_is_served_and_the_port_is_released(capfd):
     running.open()
     server, url = running.server, running.url
     try:
-        assert url == f"http://127.0.0.1:{port}"
+        assert url.startswith(f"http://127.0.0.1:{port}/")
         with urllib.request.urlopen(url) as page:
             assert b"<html" in page.read(1000)
         with pytest.raises(UserError, match=f"port: {port} is in use"):
@@ -70,7 +70,7 @@ def test_another_process_takes_the_free_port_first(taken, monkeypatch):
     try:
         port = running.server.get_port()
         assert port != taken
-        assert running.url == f"http://127.0.0.1:{port}"
+        assert running.url.startswith(f"http://127.0.0.1:{port}/")
     finally:
         stop_server(running.server)
     with pytest.raises(UserError, match=f"port: {taken} is in use"):
@@ -84,7 +84,7 @@ def test_hosts_that_are_not_local(host):
 
 
 def test_urls_for_browsers():
-    assert address("0.0.0.0", 8080) == "http://localhost:8080"
-    assert address("::1", 9000) == "http://[::1]:9000"
-    assert address("studio", 9000) == "http://studio:9000"
+    assert address("0.0.0.0", 8080, "word") == "http://localhost:8080/word/"
+    assert address("::1", 9000, "word") == "http://[::1]:9000/word/"
+    assert address("studio", 9000, "word") == "http://studio:9000/word/"
     assert address("::", 8080, "word") == "http://localhost:8080/word/"

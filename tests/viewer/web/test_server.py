@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.hosts import is_own_host
+from snowsplat.viewer.hosts import NO_TOKEN, KnownHosts
 from snowsplat.viewer.web import server as static_server
 from snowsplat.viewer.web.served_file import FileOnDisk, ServedFile
 from snowsplat.viewer.web.server import StaticServer
@@ -138,7 +138,7 @@ def test_files_on_disk(tmp_path):
 def test_only_the_given_files_are_served(server):
     prefix = "/" + server.url.split("/", 3)[3]
     for path in (
-        *("/", "/scene.ply", "/favicon.ico", prefix[:-1], prefix[:-2] + "/", "//", "*"),
+        *("/scene.ply", "/favicon.ico", prefix[:-1], prefix[:-2] + "/", "*"),
         *(prefix + name for name in ("absent", "scene.ply/", ".", "..", "/", "SCENE.PLY", "%00")),
         *(prefix + up + "etc/passwd" for up in ("../" * 9, "..%2f" * 9, "%2e%2e/" * 9, "..\\" * 9)),
         *(prefix + name for name in ("%2Fetc%2Fpasswd", "//etc/passwd", "....//etc/passwd")),
@@ -162,7 +162,8 @@ def test_only_get_and_head(server, method):
 )
 def test_foreign_hosts_are_rejected(server, host):
     response, body = ask(server, Host=host)
-    assert (response.status, body) == (421, b"")
+    assert response.status == 421
+    assert body.startswith((b"snowsplat does not know the name", b"The request has no valid Host"))
 
 
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:1234", "127.0.0.1:5", "[::1]:99"])
@@ -172,13 +173,44 @@ def test_own_names_with_any_port(server, host):
 
 
 def test_hosts_if_other_machines_can_connect():
-    assert is_own_host("192.168.1.7:8080", "0.0.0.0")
-    assert is_own_host(f"{socket.gethostname()}:8080", "0.0.0.0")
-    assert is_own_host("[fe80::1]", "::")
-    assert is_own_host("box.lan", "box.lan")
-    assert not is_own_host("evil.example", "0.0.0.0")
-    assert not is_own_host(socket.gethostname() + ".evil.example", "0.0.0.0")
-    assert not is_own_host("192.168.1.7", "127.0.0.1")
+    assert KnownHosts("0.0.0.0").include("192.168.1.7:8080")
+    assert KnownHosts("0.0.0.0").include(f"{socket.gethostname()}:8080")
+    assert KnownHosts("::").include("[fe80::1]")
+    assert KnownHosts("box.lan").include("box.lan")
+    assert not KnownHosts("0.0.0.0").include("evil.example")
+    assert not KnownHosts("0.0.0.0").include(socket.gethostname() + ".evil.example")
+    assert not KnownHosts("127.0.0.1").include("192.168.1.7")
+
+
+def test_a_proxy_with_a_public_name(caplog):
+    public, inner = "abc-80.proxy.example", "scenes.example"
+    with StaticServer(FILES, POLICY, allow_host=[f"{public}, {inner.upper()}."]) as server:
+        assert server.others == [
+            server.url.replace(f"http://127.0.0.1:{server.port}", f"https://{name}")
+            for name in (public, inner)
+        ]
+        for headers in (
+            {"Host": public, "Origin": f"https://{public}"},
+            {"Host": f"{inner}:8443", "Origin": f"https://{inner}:8443"},
+            {"Host": "127.0.0.1", "Origin": f"https://{public}"},  # the proxy has replaced Host
+        ):
+            assert ask(server, **headers)[0].status == 200
+        assert ask(server, Host=public, Origin="https://evil.example")[0].status == 403
+        assert ask(server, Host=f"{public}.evil.example")[0].status == 421
+        caplog.clear()
+        for _ in range(2):
+            body = ask(server, Host="other.example:80")[1].decode()
+            assert "start snowsplat again with --allow-host other.example\n" in body
+        assert len(caplog.records) == 1
+        assert "--allow-host other.example" in caplog.text
+        for i in range(50):  # a stranger cannot fill the terminal
+            ask(server, Host=f"{i}.example")
+        assert len(caplog.records) < 10
+        assert ask(server, path="/")[1].decode() == NO_TOKEN
+    for wrong in ("https://abc.example/", "a b", "", "x,,y"):
+        with pytest.raises(UserError, match="allow_host: .* is not a host name"):
+            KnownHosts("127.0.0.1", [wrong])
+    assert KnownHosts("127.0.0.1", ["münchen.example"]).include("xn--mnchen-3ya.example")
 
 
 @pytest.mark.parametrize(

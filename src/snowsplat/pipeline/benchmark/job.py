@@ -121,7 +121,8 @@ def run(job: Job, device: str | None, threads: int | None) -> bool:
     request = json.dumps({"job": asdict(job), "device": device, "threads": threads})
     command = [sys.executable, "-m", "snowsplat.pipeline.benchmark.job"]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stderr=pipe, text=True) as process:
+    # The encoding of the streams may differ from that of the locale (PYTHONIOENCODING).
+    with subprocess.Popen(command, stdin=pipe, stderr=pipe, text=True, errors="replace") as process:
         assert process.stdin is not None
         assert process.stderr is not None
         process.stdin.write(request + "\n")

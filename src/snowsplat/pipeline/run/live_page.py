@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.viewer.hosts import LOCAL_HOST
+from snowsplat.viewer.hosts import LOCAL_HOST, KnownHosts
 from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.server import free_port
 from snowsplat.viewer.live.training import TrainingViewer
@@ -17,23 +17,28 @@ from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 
 class LivePage:
-    """A page at http://localhost:``port``; as a context manager, it closes the page at the end.
+    """A page at ``port`` of this machine; as a context manager, it closes the page at the end.
 
     with LivePage() as page:
         train("garden", "out/garden", page=page)
         page.show_result()
     """
 
-    def __init__(self, port: int | None = None, host: str | None = None) -> None:
+    def __init__(
+        self, port: int | None = None, host: str | None = None, allow_host: Sequence[str] = ()
+    ) -> None:
         """
         Args:
             port: None: 8080, or the next free one.
             host: address at which to listen; None: accept connections from this machine only.
+            allow_host: names of proxies; see `KnownHosts`.
 
         Raises:
-            UserError: the port is in use, or this machine cannot listen at ``host``.
+            UserError: the port is in use, this machine cannot listen at ``host``, or an allowed
+                name is none.
         """
-        self.port, self.host = port, host or LOCAL_HOST
+        self.port, self.host, self.allow_host = port, host or LOCAL_HOST, allow_host
+        KnownHosts(self.host, allow_host)
         self._viewer: NetworkViewer | None = None
         self._training: TrainingViewer | None = None
         self._trainer: Trainer | None = None
@@ -62,7 +67,14 @@ class LivePage:
         Raises:
             UserError: another process has opened the port since the constructor checked it.
         """
-        viewer = NetworkViewer(dataset, background, host=self.host, port=self.port, label=label)
+        viewer = NetworkViewer(
+            dataset,
+            background,
+            host=self.host,
+            port=self.port,
+            label=label,
+            allow_host=self.allow_host,
+        )
         self._viewer = viewer
         observer.page_opened(viewer)
         return viewer

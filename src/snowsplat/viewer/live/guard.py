@@ -3,8 +3,8 @@
 viser accepts every connection, trusts all messages and processes any number of them, in the process
 that trains. Therefore `Guard.serve` starts viser's server with additional checks:
 
-- The Host and Origin headers of a request must be those of this server. If other machines can
-  connect, the path must begin with a secret token.
+- The Host and Origin headers of a request must be those of this server. The path must begin with a
+  secret token: other users of this machine can connect, too.
 - The numbers of connections, page downloads and browsers are limited.
 - Messages must be of the four types that the page sends, with finite numbers. A connection that
   sends more messages than a page can send is closed. If a client does not read the data that the
@@ -42,7 +42,7 @@ from websockets.frames import CTRL_OPCODES, Frame
 from websockets.http11 import Request, Response
 from websockets.typing import Data
 
-from snowsplat.viewer.hosts import is_loopback, is_own_host, is_own_page
+from snowsplat.viewer.hosts import NO_TOKEN, KnownHosts
 
 # Maximum values:
 _WAITING = 96  # connections without a valid request; a new connection replaces the oldest one
@@ -62,7 +62,7 @@ _TICK = 0.05  # seconds between two measurements of the server's processor time
 _PROTOCOL = f"viser-v{viser.__version__}"
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",  # the URL may contain the token
+    "Referrer-Policy": "no-referrer",  # the URL contains the token
     "Cross-Origin-Resource-Policy": "same-origin",
     "Content-Security-Policy": "frame-ancestors 'self'",
 }
@@ -80,17 +80,11 @@ _listen = websockets.asyncio.server.serve
 class Guard:
     """The checks of one server."""
 
-    def __init__(self, host: str, token: str | None) -> None:
-        """
-        Args:
-            host: the address at which the server listens.
-            token: the first component of all paths; None: no token.
-        """
-        if token is None and not is_loopback(host):
-            raise ValueError(f"{host}: a server that other machines can reach needs a token")
+    def __init__(self, hosts: KnownHosts, token: str) -> None:
+        """``token``: the first component of all paths."""
         self.serves = False  # whether viser has started its server through `serve`
         self.is_open = False  # whether the scene is complete, so that browsers may connect
-        self._host, self._token = host, token
+        self._hosts, self._token = hosts, token.encode()
         self._waiting: dict[Connection, None] = {}  # oldest first
         self._pages: set[Connection] = set()
         self._browsers: set[Connection] = set()
@@ -132,9 +126,12 @@ class Guard:
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
         """A response that rejects the request. None: it is accepted; the token is removed."""
 
-        def refuse(status: http.HTTPStatus, *more: tuple[str, str]) -> Response:
-            headers = Headers([*more, ("Content-Length", "0"), ("Connection", "close")])
-            return Response(status, status.phrase, headers)
+        def refuse(status: http.HTTPStatus, *more: tuple[str, str], text: str = "") -> Response:
+            body = text.encode()
+            more += (("Content-Type", "text/plain; charset=utf-8"),) if text else ()
+            length = ("Content-Length", str(len(body)))
+            headers = Headers([*more, length, ("Connection", "close")])
+            return Response(status, status.phrase, headers, body)
 
         if not self.is_open:
             return refuse(http.HTTPStatus.SERVICE_UNAVAILABLE, ("Retry-After", "1"))
@@ -142,13 +139,15 @@ class Guard:
         if any(len(given) > 1 for given in values.values()) or not values["Host"]:
             return refuse(http.HTTPStatus.BAD_REQUEST)
         host = values["Host"][0]
-        if not is_own_host(host, self._host):
-            return refuse(http.HTTPStatus.MISDIRECTED_REQUEST)
-        if not all(is_own_page(origin, host) for origin in values["Origin"]):
+        if not self._hosts.include(host):
+            return refuse(http.HTTPStatus.MISDIRECTED_REQUEST, text=self._hosts.explain(host))
+        if not all(self._hosts.include_page(origin, host) for origin in values["Origin"]):
             return refuse(http.HTTPStatus.FORBIDDEN)
         path = self._path(request.path)
         if path is None or path not in self._paths:
-            return refuse(http.HTTPStatus.NOT_FOUND)
+            return refuse(
+                http.HTTPStatus.NOT_FOUND, text="" if request.path.strip("/") else NO_TOKEN
+            )
         request.path = path
         if not values["Upgrade"]:
             if len(self._pages) >= _PAGES:
@@ -164,11 +163,8 @@ class Guard:
     def _path(self, path: str) -> str | None:
         """The path without the token; None if the token is wrong. %-encoding is not decoded."""
         path = path.partition("?")[0]
-        if self._token is None:
-            return path
         given, _, rest = path.removeprefix("/").partition("/")
-        token = self._token.encode()
-        return f"/{rest}" if hmac.compare_digest(_bytes(given), token) else None
+        return f"/{rest}" if hmac.compare_digest(_bytes(given), self._token) else None
 
     def connected(self, connection: Connection) -> None:
         """Called when a connection is made."""

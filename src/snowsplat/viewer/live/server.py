@@ -8,14 +8,14 @@ import io
 import secrets
 import socket
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import viser
 import websockets.asyncio.server
 
 from snowsplat.util.errors import SettingError
-from snowsplat.viewer.hosts import ANY_HOST, is_loopback
+from snowsplat.viewer.hosts import ANY_HOST, KnownHosts
 from snowsplat.viewer.live.guard import Guard
 
 DEFAULT_PORT = 8080
@@ -35,12 +35,12 @@ class RunningServer:
     Attributes:
         url: the URL for browsers on this machine; if a host name was given, also for other
         machines.
-        others: the URL for other machines, if it is a different one.
+        others: the URLs for other machines, if they are different ones.
     """
 
     server: viser.ViserServer
     url: str
-    others: str | None
+    others: list[str]
     guard: Guard
 
     def open(self) -> None:
@@ -48,18 +48,22 @@ class RunningServer:
         self.guard.is_open = True
 
 
-def start_server(host: str, port: int | None, label: str) -> RunningServer:
+def start_server(
+    host: str, port: int | None, label: str, allow_host: Sequence[str] = ()
+) -> RunningServer:
     """Start a server at ``host`` and ``port``; without a port, at 8080 or the next free one.
 
     ``label`` is the title of the page. Browsers are rejected until `RunningServer.open` is called.
-    If other machines can connect, the URL contains a secret token.
+    The URL contains a secret token. ``allow_host``: the names of proxies; see `KnownHosts`.
 
     Raises:
-        UserError: the port is in use, or the host is not an address of this machine.
+        UserError: the port is in use, the host is not an address of this machine, or an allowed
+            name is none.
     """
+    hosts = KnownHosts(host, allow_host)
     free = free_port(host, port)
-    token = None if is_loopback(host) else secrets.token_urlsafe(16)
-    guard = Guard(host, token)
+    token = secrets.token_urlsafe(16)
+    guard = Guard(hosts, token)
     # viser prints a welcome message, and warns about browsers that have disconnected.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with contextlib.redirect_stdout(io.StringIO()), _guarded(guard):
@@ -71,7 +75,8 @@ def start_server(host: str, port: int | None, label: str) -> RunningServer:
     if port is not None and listens != port:
         stop_server(server)
         raise SettingError("port", f"{port} is in use; choose another, e.g. {port + 1}")
-    others = address(socket.gethostname(), listens, token) if host in ANY_HOST else None
+    others = [address(socket.gethostname(), listens, token)] if host in ANY_HOST else []
+    others += [f"https://{name}/{token}/" for name in hosts.allowed]
     return RunningServer(server, address(host, listens, token), others, guard)
 
 
@@ -92,11 +97,10 @@ def stop_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def address(host: str, port: int, token: str | None = None) -> str:
+def address(host: str, port: int, token: str) -> str:
     """The URL for browsers; ``host`` is the name or address of this machine."""
     shown = "localhost" if host in ANY_HOST else host
-    root = f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
-    return root if token is None else f"{root}/{token}/"
+    return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/{token}/"
 
 
 def free_port(host: str, port: int | None) -> int:

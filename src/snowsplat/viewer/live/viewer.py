@@ -68,7 +68,7 @@ class NetworkViewer:
     """A page at `url` that shows Gaussians.
 
     Attributes:
-        others: the address of the page for other machines, if it differs from `url`.
+        others: the addresses of the page for other machines, if they differ from `url`.
 
     Images are rendered only in the thread that calls `serve` or `show_newest`. So the Gaussians do
     not change during rendering, and no copy of them is needed.
@@ -82,6 +82,7 @@ class NetworkViewer:
         host: str = "127.0.0.1",
         port: int | None = None,
         label: str = "snowsplat",
+        allow_host: Sequence[str] = (),
     ) -> None:
         """
         Args:
@@ -90,6 +91,7 @@ class NetworkViewer:
             host: address at which to listen.
             port: None takes 8080, or the next free port.
             label: title of the page.
+            allow_host: names of proxies; see `snowsplat.viewer.hosts.KnownHosts`.
 
         Raises:
             UserError: the port is in use, or the host is not an address of this machine.
@@ -98,7 +100,7 @@ class NetworkViewer:
         self.background = torch.tensor(background, dtype=torch.float32)
         self._bounds = dataset.bounds
         self._near = (dataset.train or dataset.test)[0].camera.near
-        running = start_server(host, port, label)
+        running = start_server(host, port, label, allow_host)
         self.server, self.url, self.others = running.server, running.url, running.others
         set_theme(self.server.gui, dark=True)
         self._photos = Photos(

@@ -20,13 +20,13 @@ import socketserver
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from typing import Any, cast
 
 from snowsplat.util.errors import SettingError
-from snowsplat.viewer.hosts import ANY_HOST, is_own_host, is_own_page
+from snowsplat.viewer.hosts import ANY_HOST, NO_TOKEN, KnownHosts
 from snowsplat.viewer.web.served_file import Served
 
 # Seconds after which a connection is closed:
@@ -51,11 +51,12 @@ _log = logging.getLogger(__name__)
 class StaticServer:
     """Serves ``files`` by name ("" is the page itself) from its creation until `close`.
 
-    Every response has the additional ``headers``.
+    Every response has the additional ``headers``. ``allow_host``: names of proxies; see
+    `KnownHosts`.
 
     Raises:
         UserError: the port is in use or not permitted, or the host is not an address of this
-            machine.
+            machine; or an allowed name is none.
     """
 
     def __init__(
@@ -64,14 +65,16 @@ class StaticServer:
         headers: Mapping[str, str],
         host: str = "127.0.0.1",
         port: int = 0,
+        allow_host: Sequence[str] = (),
     ) -> None:
+        hosts = KnownHosts(host, allow_host)
         self.host = host
         self._token = secrets.token_urlsafe(16)
         self._server = _listen(host, port)
         self._server.prefix = f"/{self._token}/"
         self._server.files = dict(files)
         self._server.headers = dict(headers)
-        self._server.host = host
+        self._server.hosts = hosts
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
@@ -83,6 +86,13 @@ class StaticServer:
     def url(self) -> str:
         """The URL of the page, for a browser on this machine."""
         return self.url_at("127.0.0.1" if self.host in ANY_HOST else self.host)
+
+    @property
+    def others(self) -> list[str]:
+        """The URLs of the page for browsers on other machines, if they differ from `url`."""
+        named = [self.url_at(socket.gethostname())] if self.host in ANY_HOST else []
+        allowed = self._server.hosts.allowed
+        return named + [f"https://{name}/{self._token}/" for name in allowed]
 
     def url_at(self, host: str) -> str:
         """The URL of the page if this machine is called ``host``."""
@@ -111,7 +121,7 @@ class _Server(socketserver.ThreadingTCPServer):
     prefix: str
     files: dict[str, Served]
     headers: dict[str, str]
-    host: str
+    hosts: KnownHosts
 
     def __init__(self, *args: Any) -> None:
         self._lock = threading.Lock()
@@ -262,11 +272,16 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, with_body: bool) -> None:
         refusal = self._refusal()
         if refusal is not None:
-            self._send_empty(refusal)
+            text = ""
+            if refusal is HTTPStatus.MISDIRECTED_REQUEST:
+                text = self._web_server.hosts.explain(self.headers.get("Host", ""))
+            self._send_text(refusal, text, with_body)
             return
         file = self._file()
         if file is None:
-            self._send_empty(HTTPStatus.NOT_FOUND)
+            self._send_text(
+                HTTPStatus.NOT_FOUND, "" if self.path.strip("/") else NO_TOKEN, with_body
+            )
             return
         self._web_server.mark_verified(self.connection)
         common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
@@ -303,9 +318,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return HTTPStatus.BAD_REQUEST
         host = hosts[0] if hosts else ""
-        if not is_own_host(host, self._web_server.host):
+        if not self._web_server.hosts.include(host):
             return HTTPStatus.MISDIRECTED_REQUEST
-        if not all(is_own_page(origin, host) for origin in origins):
+        if not all(self._web_server.hosts.include_page(origin, host) for origin in origins):
             return HTTPStatus.FORBIDDEN
         return None
 
@@ -343,6 +358,13 @@ class _Handler(BaseHTTPRequestHandler):
     def _send_empty(self, status: HTTPStatus, headers: Mapping[str, str] | None = None) -> None:
         length = {} if status is HTTPStatus.NOT_MODIFIED else {"Content-Length": "0"}
         self._send_head(status, {**(headers or {}), **length})
+
+    def _send_text(self, status: HTTPStatus, text: str, with_body: bool) -> None:
+        body = text.encode()
+        kind = {"Content-Type": "text/plain; charset=utf-8"} if text else {}
+        self._send_head(status, {**kind, "Content-Length": str(len(body))})
+        if with_body:
+            self.wfile.write(body)
 
     def _send_head(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
         self.send_response(status)
