@@ -21,7 +21,10 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo in ``input/``, upright unless ``turned``, and its metadata. All fields can be stored as JSON."""
+    """A photo in ``input/``, upright unless ``turned``, and its metadata.
+
+    All fields can be stored as JSON.
+    """
 
     name: str  # path relative to input/, with "/"; unique
     source: str  # the original, as text for users: a path, or "walk.mp4 at 3.2 s"
