@@ -165,12 +165,14 @@ def _run(
     chosen_photos = options.gather
     if options.sfm.camera_model == PANORAMA_MODEL:
         chosen_photos = replace(chosen_photos, panoramas=True)
+    if options.skip_matching:
+        chosen_photos = replace(chosen_photos, as_stored=True)
 
     def gather_photos(report: Report) -> dict[str, Any]:
         return _gather(sources, folder, chosen_photos, report, in_place)
 
     chosen = asdict(chosen_photos)
-    for name, default in (("photos", None), ("panoramas", False)):
+    for name, default in (("photos", None), ("panoramas", False), ("as_stored", False)):
         if chosen[name] == default:  # earlier versions did not have these settings
             del chosen[name]
     stage(

@@ -251,6 +251,30 @@ def test_input_in_place_that_needs_a_change_is_rejected(kind, tmp_path):
     assert content(tmp_path) == before
 
 
+def test_photos_in_place_with_a_model_are_used_as_stored(tmp_path):
+    root = write_photos(tmp_path / "location" / "input", 3)
+    photo().save(root / "x.jpg", exif=exif({0x0112: 6}))
+    before = content(root)
+    made = gathered(root, tmp_path / "location", as_stored=True)
+    assert content(root) == before
+    assert [p.turned for p in made.photos] == [1, 1, 1, 6]
+    assert {(p.width, p.height) for p in made.photos} == {(WIDTH, HEIGHT)}
+
+
+def test_broken_links_are_named(tmp_path):
+    root = write_photos(tmp_path / "p", 3)
+    for name in ("x.jpg", "y.jpg", "notes.txt"):
+        (root / name).symlink_to(tmp_path / "missing" / name)
+    made = gathered(root, tmp_path / "out")
+    ((folder, reason),) = made.skipped
+    assert folder == str(root)
+    assert "missing: x.jpg and 1 more" in reason
+    for photo_file in root.glob("[0-9].jpg"):
+        photo_file.unlink()
+    with pytest.raises(UserError, match="has links to files that are missing: x.jpg"):
+        find_inputs([root])
+
+
 def write_all(folder, picture, count=5):
     folder.mkdir()
     for i in range(count):

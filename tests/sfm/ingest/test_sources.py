@@ -42,7 +42,10 @@ def test_symbolic_links_and_cycles(tmp_path):
     found = find_sources([root])
     expected = ["0.jpg", "1.jpg", "2.jpg", "linked/0.jpg", "linked/1.jpg", "linked/2.jpg"]
     assert [s.name for s in found.files] == expected
-    assert found.left_out == [(str(root / "one more.jpg"), "is the same picture as 0.jpg")]
+    assert found.left_out == [
+        (str(root), "has links to files that are missing: broken.jpg; copy the files here"),
+        (str(root / "one more.jpg"), "is the same picture as 0.jpg"),
+    ]
 
 
 def test_names_of_several_inputs_do_not_collide(tmp_path):

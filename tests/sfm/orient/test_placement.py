@@ -249,6 +249,16 @@ def test_sensors_that_contradict_the_poses_are_not_used(model_of):
     assert torch.allclose(found.rotation, placed(model_of, poses, [])[0].rotation)
 
 
+@pytest.mark.parametrize("sensors", [None, "phone"])
+@pytest.mark.parametrize(("turned", "degrees"), [(6, -90), (8, 90), (3, 180)])
+def test_photos_that_are_not_stored_upright(turned, degrees, sensors, model_of):
+    poses = walk()
+    photos = [replace(photo, turned=turned) for photo in photos_of(poses, sensors=sensors)]
+    found, _ = placed(model_of, rolled(poses, degrees), photos)
+    upright, _ = placed(model_of, poses, photos_of(poses, sensors=sensors))
+    assert torch.allclose(found.rotation, upright.rotation, atol=1e-6)
+
+
 def test_a_contradiction_with_the_way_of_holding_is_said(model_of):
     """All photos were turned by a quarter, and the orientation in EXIF was lost."""
     poses = rolled(walk(), 90)

@@ -67,7 +67,11 @@ def original_of(name: str, siblings: Iterable[str], *, divided: bool = True) -> 
     return None if match is None else among.get(match["original"])
 
 
-def files_below(root: Path, enter: Callable[[Path, list[str]], Iterable[str]]) -> list[str]:
+def files_below(
+    root: Path,
+    enter: Callable[[Path, list[str]], Iterable[str]],
+    broken: list[str] | None = None,
+) -> list[str]:
     """Files that are not hidden; relative to ``root``, with "/", in natural order.
 
     Links to folders are followed, but every folder is searched only once. Broken links are left
@@ -75,6 +79,7 @@ def files_below(root: Path, enter: Callable[[Path, list[str]], Iterable[str]]) -
 
     Args:
         enter: the subfolders of a folder to search, from the names of those that are not hidden.
+        broken: gets the broken links.
 
     Raises:
         OSError: a folder cannot be read.
@@ -94,11 +99,12 @@ def files_below(root: Path, enter: Callable[[Path, list[str]], Iterable[str]]) -
                 visited.add(real)
                 kept.append(name)
         subfolders[:] = kept  # os.walk then searches only these
-        found += [
-            (here / name).relative_to(root).as_posix()
-            for name in files
-            if not name.startswith(".") and (here / name).is_file()
-        ]
+        for name in (name for name in files if not name.startswith(".")):
+            path = here / name
+            if path.is_file():
+                found.append(path.relative_to(root).as_posix())
+            elif broken is not None and path.is_symlink():
+                broken.append(path.relative_to(root).as_posix())
         if len(found) > _MOST_FILES:
             break
     return sorted(found, key=natural_key)

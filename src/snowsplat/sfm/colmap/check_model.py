@@ -55,7 +55,9 @@ def _main(folder: str, limit: int) -> None:
     model.update_point_3d_errors()
     model.compute_mean_reprojection_error()
     for number in model.reg_image_ids():
-        model.cameras[model.images[number].camera_id].calibration_matrix()
+        camera = model.cameras[model.images[number].camera_id]
+        if not camera.is_spherical():  # a panorama has no such matrix
+            camera.calibration_matrix()
 
 
 if __name__ == "__main__":

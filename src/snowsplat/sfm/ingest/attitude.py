@@ -38,9 +38,9 @@ _STANDING = 0.7
 _APPLE_NOTE, _APPLE_ACCELERATION = b"Apple iOS\0", 8
 _SIGNED_RATIONAL = 10  # a type of TIFF: two integers of 32 bits
 
-# The axes x and y of the upright photo in those of the stored photo, by EXIF orientation. Mirrored
-# photos (2, 4, 5, 7) are not listed: no camera takes them.
-_UPRIGHT = {
+#: The axes x and y of the upright photo in those of the stored photo, by EXIF orientation. Mirrored
+#: photos (2, 4, 5, 7) are not listed: no camera takes them.
+UPRIGHT = {
     1: ((1, 0), (0, 1)),
     3: ((-1, 0), (0, -1)),
     6: ((0, -1), (1, 0)),
@@ -62,7 +62,7 @@ def read_attitude(
         xmp: the XMP packet; empty if there is none.
         orientation: EXIF value, 1 to 8, with which the photo was taken.
     """
-    if orientation not in _UPRIGHT:
+    if orientation not in UPRIGHT:
         return None
     gimbal = _gimbal(xmp)
     if gimbal is not None:
@@ -185,7 +185,7 @@ def _standing(up: np.ndarray) -> np.ndarray:
 
 def _upright(direction: np.ndarray, orientation: int) -> np.ndarray:
     """A direction in the frame of the stored photo, in that of the upright photo."""
-    x, y = np.array(_UPRIGHT[orientation]) @ direction[:2]
+    x, y = np.array(UPRIGHT[orientation]) @ direction[:2]
     return np.array([x, y, direction[2]])
 
 

@@ -54,17 +54,23 @@ def plan_photos(
     longest: int | None,
     skipped: list[tuple[str, str]],
     panoramas: bool = False,
+    as_stored: bool = False,
 ) -> list[Planned]:
     """Choose the name of each photo in ``input/``. Photos are sorted by this name.
 
     If two photos would have the same name, the one whose name need not change keeps it. Photos that
-    cannot be used are appended to ``skipped``, with the reason. ``panoramas``: all photos are 360°
-    panoramas, even if their metadata do not say so.
+    cannot be used are appended to ``skipped``, with the reason.
+
+    Args:
+        panoramas: all photos are 360° panoramas, even if their metadata do not say so.
+        as_stored: the pixels are used as stored; see `Header.as_stored`.
     """
     read = []
     for source in sources:
         try:
             header = read_header(source.path)
+            if as_stored:
+                header = header.as_stored()
             if panoramas:
                 header = _as_panorama(header)
         except Unusable as error:
@@ -193,6 +199,7 @@ def _write_photo(
         location_error=exif.location_error,
         attitude=None if around else exif.attitude,  # of the device, not of the picture
         panorama=around,
+        turned=header.turned,
     )
     return photo, None if used is None or source.mask is None else look_of(used)
 

@@ -60,6 +60,8 @@ class GatherOptions:
     # Maximum number of photos; they are evenly spread in the order of their names. None: all.
     photos: int | None = None
     panoramas: bool = False  # all photos and videos show all directions; False: if they say so
+    # Photos in place keep their pixels as stored, because a model of these exists.
+    as_stored: bool = False
 
 
 def find_inputs(inputs: Sequence[Path]) -> list[Path]:
@@ -77,8 +79,8 @@ def gather(
     """Fill ``input/`` of a dataset and, for masks and transparency, ``distorted/masks``.
 
     If one of ``inputs`` is ``input/`` itself, its photos are used in place and never changed. Then
-    all photos must be upright, in a format that COLMAP reads, and not larger than the requested
-    size.
+    all photos must be upright (unless ``as_stored``), in a format that COLMAP reads, and not larger
+    than the requested size.
 
     Photos of one folder form a group, which shares intrinsics, if they have the same size, camera
     and focal length in EXIF. Portrait and landscape photos of one phone are in different groups:
@@ -99,7 +101,9 @@ def gather(
         logger.warning("%s", note)
     skipped = list(sources.left_out)
     in_place = sources.contain(folder)
-    planned = plan_photos(sources.photos, options.size, skipped, options.panoramas)
+    planned = plan_photos(
+        sources.photos, options.size, skipped, options.panoramas, options.as_stored
+    )
     if options.photos is not None:
         planned = evenly_spread(planned, options.photos)
     clips = [(video, read_clip(video.path)) for video in sources.videos]

@@ -21,7 +21,10 @@ class Attitude:
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo in ``input/``, upright, and its metadata. All fields can be stored as JSON."""
+    """A photo in ``input/``, upright unless ``turned``, and its metadata.
+
+    All fields can be stored as JSON.
+    """
 
     name: str  # path relative to input/, with "/"; unique
     source: str  # the original, as text for users: a path, or "walk.mp4 at 3.2 s"
@@ -36,3 +39,4 @@ class Photo:
     location_error: float | None = None  # m, horizontal, as the receiver states it
     attitude: Attitude | None = None
     panorama: bool = False  # equirectangular, of all directions
+    turned: int = 1  # EXIF orientation if the pixels in input/ are not upright

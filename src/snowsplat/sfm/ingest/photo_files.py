@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
@@ -54,6 +54,7 @@ class Header:
     pages: tuple[int, ...] = (0,)
     animated: int = 1  # number of pictures of an animation, of which only the first is used
     panorama: Panorama | None = None  # if the metadata say so
+    turned: int = 1  # the EXIF orientation that is ignored; see `as_stored`
 
     @property
     def sideways(self) -> bool:
@@ -72,6 +73,16 @@ class Header:
         upright = self.exif.orientation == 1 and as_stored
         ready = upright and whole and len(self.pages) == 1
         return self.format in _SUFFIXES and self.plain and ready
+
+    def as_stored(self) -> Header:
+        """The header if the pixels are used as stored: their orientation and depth are ignored.
+
+        COLMAP reads photos so, and a model that it has made describes these pixels.
+        """
+        if self.format == "TIFF":  # Pillow turns its pixels
+            return self
+        exif = replace(self.exif, orientation=1)
+        return replace(self, exif=exif, plain=True, turned=self.exif.orientation)
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
@@ -188,7 +199,9 @@ def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Im
     """
     try:
         with open_image(path, page=page) as opened:
-            image = ImageOps.exif_transpose(plain_pixels(opened, path))
+            image = plain_pixels(opened, path)
+            if header.exif.orientation != 1:
+                image = ImageOps.exif_transpose(image)
     except Exception as error:  # as in `read_header`
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:

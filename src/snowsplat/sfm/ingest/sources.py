@@ -193,13 +193,16 @@ def _search(root: Path) -> _Folder:
             else:
                 found.left_out.append((shown(folder / name), reason))
 
-    files = files_below(root, enter)
+    broken: list[str] = []
+    files = files_below(root, enter, broken)
     if not any(_is_photo_name(file) or _is_video_name(file) for file in files):
         found.left_out = []  # only photos called depth/1.png: they are the photos
         files = files_below(root, _masks_and_outputs)
     photos = [file for file in files if _is_photo_name(file)]
     if unread := unread_photos(files, photos):
         found.left_out.append((shown(root), unread))
+    if links := _broken_links(broken):
+        found.left_out.append((shown(root), links))
     found.videos = [file for file in files if _is_video_name(file)]
     no_views = {
         copy.name: f"is the same picture as {copy.used}" for copy in find_copies(root, photos)
@@ -212,6 +215,15 @@ def _search(root: Path) -> _Folder:
     found.masks = find_masks(root, photos)
     found.photos = [photo for photo in photos if photo not in found.masks.beside]
     return found
+
+
+def _broken_links(broken: Sequence[str]) -> str | None:
+    """The reason why photos and videos are not used that are broken links; None if none is."""
+    links = [name for name in broken if _is_photo_name(name) or _is_video_name(name)]
+    if not links:
+        return None
+    others = f" and {len(links) - 1} more" if len(links) > 1 else ""
+    return f"has links to files that are missing: {shown(links[0])}{others}; copy the files here"
 
 
 def _why_left_out(name: str, siblings: Sequence[str]) -> str | None:
@@ -315,8 +327,10 @@ def _is_photo(head: bytes) -> bool:
 def _nothing_in(inputs: Sequence[Path]) -> UserError:
     names = ", ".join(map(shown, inputs))
     for path in inputs:
-        if unread := unread_photos(files_below(path, _masks_and_outputs), []):
-            return UserError(f"{names}: {unread}")
+        broken: list[str] = []
+        files = files_below(path, _masks_and_outputs, broken)
+        if reason := unread_photos(files, []) or _broken_links(broken):
+            return UserError(f"{names}: {reason}")
     return UserError(
         f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
         "that contains them"

@@ -14,6 +14,7 @@ from snowsplat.data.placement import Placement
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.orientation import VIEWING_DISTANCE
 from snowsplat.sfm.gps import east_north_up, location_of, middle_of, position_errors
+from snowsplat.sfm.ingest.attitude import UPRIGHT
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.ground import of_ground
@@ -83,6 +84,7 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
     """
     cameras = read_cameras(model)
     known = _known(cameras, photos)
+    cameras = _upright(cameras, known)
     up, doubts = _up(cameras, known)
     gps, more = _gps(cameras, known, up)
     doubts += more
@@ -130,6 +132,15 @@ def _known(cameras: Cameras, photos: Sequence[Photo]) -> list[Photo | None]:
     """The photo of each camera, or None."""
     by_name = {photo.name: photo for photo in photos}
     return [by_name.get(name) for name in cameras.names]
+
+
+def _upright(cameras: Cameras, photos: Sequence[Photo | None]) -> Cameras:
+    """The cameras of the upright photos."""
+    turned = np.eye(3)[None].repeat(len(photos), axis=0)
+    for matrix, photo in zip(turned, photos, strict=True):
+        if photo is not None and photo.turned in UPRIGHT:
+            matrix[:2, :2] = UPRIGHT[photo.turned]
+    return replace(cameras, rotations=turned @ cameras.rotations)
 
 
 def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, list[str]]:
