@@ -38,6 +38,7 @@ from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
+from snowsplat.util.run_lock import one_run
 
 # Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
@@ -149,7 +150,7 @@ def train(
 
     Raises:
         UserError: an unusable dataset, impossible cameras (see `TrainOptions`); an unusable
-            setting, device or folder; too little memory; a loss or
+            setting, device or folder; another run in ``output``; too little memory; a loss or
             parameters that are not finite. A new folder is removed if it contains no results.
         TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
         KeyboardInterrupt: Ctrl-C before the first step; nothing is saved.
@@ -158,10 +159,11 @@ def train(
     options = options or TrainOptions()
     recipe(options.recipe or "default", **options.settings)  # reports an invalid setting first
     out = OutputFolder(Path(output))
-    out.check_free(resume=False, overwrite=overwrite)
-    job = _Job(out, options, observer, page, started, parts, loss)
-    with joined(job.device) as job.shards:
-        return job.train(dataset)
+    with one_run(out.path):
+        out.check_free(resume=False, overwrite=overwrite)
+        job = _Job(out, options, observer, page, started, parts, loss)
+        with joined(job.device) as job.shards:
+            return job.train(dataset)
 
 
 def resume(
@@ -197,10 +199,11 @@ def resume(
     started = time.monotonic()
     options = options or TrainOptions()
     out = OutputFolder(Path(output))
-    out.check_free(resume=True, overwrite=False)
-    job = _Job(out, options, observer, page, started, parts, loss)
-    with joined(job.device) as job.shards:
-        return job.resume(dataset)
+    with one_run(out.path):
+        out.check_free(resume=True, overwrite=False)
+        job = _Job(out, options, observer, page, started, parts, loss)
+        with joined(job.device) as job.shards:
+            return job.resume(dataset)
 
 
 def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | None = None) -> None:

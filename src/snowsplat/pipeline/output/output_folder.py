@@ -40,6 +40,7 @@ from snowsplat.util.files import (
     write_json,
     write_text,
 )
+from snowsplat.util.run_lock import LOCK
 from snowsplat.util.safe_json import from_json, read_json
 
 if TYPE_CHECKING:
@@ -145,7 +146,11 @@ class OutputFolder:
             return
         if not self.path.is_dir():
             raise UserError(f"{self.path}: is a file; use a folder for the output")
-        others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
+        others = (
+            entry
+            for entry in self.path.iterdir()
+            if entry.name != LOCK and not is_temporary(entry, _FILES)
+        )
         if any(others) and not self.is_output_folder():
             raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
         if self.is_output_folder() and not resume and not overwrite:
@@ -153,6 +158,14 @@ class OutputFolder:
                 f"{self.path}: already contains a training run; use `resume` to continue it, "
                 "`overwrite` to replace it, or use another folder"
             )
+
+    def clear(self) -> None:
+        """Remove everything except for the lock, which the caller holds."""
+        for entry in self.path.iterdir():
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            elif entry.name != LOCK:
+                entry.unlink(missing_ok=True)
 
     def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
         """Create the folder, remove the results of an earlier run, and call `describe`."""
