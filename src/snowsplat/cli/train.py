@@ -45,6 +45,7 @@ class Train(TrainFlags):
 
         if self.processes is not None and self.processes != 1 and processes.count() == 1:
             return processes.launch(self.processes, sys.argv[1:])
+        processes.end_with_launcher()
         if not processes.is_first():
             from snowsplat.pipeline.train import follow_training
 
