@@ -194,7 +194,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
             process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=output, stderr=error
             )
-            running.append(process)
+            running.append(files.enter_context(process))
         try:
             failed = _wait(running)
         finally:
