@@ -214,7 +214,8 @@ class _Job:
             self.plan = self._plan()
             self.stages.save()  # from now on, the folder is recognised as an output of `make`
             self._make_dataset()
-            return self._make_scene()
+            with one_run(self.dataset):  # no `sfm` changes the photos during the training
+                return self._make_scene()
 
     @contextmanager
     def _removed_if_alone(self) -> Iterator[None]:
