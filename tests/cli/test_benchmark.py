@@ -1,4 +1,4 @@
-"""`snowsplat benchmark`: protocols, tables, interrupted and failed scenes, claims."""
+"""`snowsplat benchmark`: protocols, tables, interrupted and failed scenes, locks."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_results(finished):
     assert "35.78" in text
     latex = (finished / "results.tex").read_text(encoding="utf-8")
     assert latex.count(r" \\") == 4  # titles, two scenes, mean
-    assert not list(finished.glob("*.claim"))
+    assert not list(finished.glob("*.lock"))
 
 
 @pytest.mark.slow
@@ -113,8 +113,8 @@ def test_killed_and_called_again(scenes, finished, tmp_path):
     command = (*BENCHMARK, scenes, "-o", out, "--iterations", "60")
     command += ("--scenes", "lego", "--suite", "blender")
     killed = popen(*command, forks=True)
-    claim = out / "lego.claim"
-    while not claim.exists():
+    lock = out / "lego.lock"
+    while not lock.exists():
         assert killed.poll() is None
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
@@ -126,7 +126,7 @@ def test_killed_and_called_again(scenes, finished, tmp_path):
         for folder in (finished, out)
     )
     assert first["psnr"] == second["psnr"]
-    assert not claim.exists()
+    assert not lock.exists()
 
 
 def test_suites():

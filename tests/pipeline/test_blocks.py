@@ -27,6 +27,7 @@ from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
+from snowsplat.util.run_lock import InUse, one_run
 
 SETTINGS = {"iterations": 40, "max_gaussians": 600, "init": "points"}
 OPTIONS = PlanOptions(blocks=3, settings=SETTINGS, hold_out=8)
@@ -205,12 +206,13 @@ def test_any_order_elsewhere_and_interrupted_gives_the_same_scene(planned, train
     shutil.copytree(planned, folder, symlinks=True)
     plan = Plan.read(folder)
     lines: list[str] = []
-    (folder / "block_02" / "train.claim").write_text("elsewhere 1", encoding="utf-8")
-    results = train_blocks(folder, [3, 2], on_block=lines.append)
+    with one_run(folder / "block_02"):
+        results = train_blocks(folder, [3, 2], on_block=lines.append)
+        with pytest.raises(InUse, match=rf"block_02: in use by process {os.getpid()} on "):
+            train_blocks(folder, [2])
     assert len(results) == 1
-    assert "another process" in lines[0]
+    assert "block_02: in use by" in lines[0]
     assert lines[1].startswith("block_03: ")
-    (folder / "block_02" / "train.claim").unlink()
     with pytest.raises(UserError, match=r"block_01: not trained; run .* `block` 1"):
         merge_blocks(folder)
 

@@ -11,6 +11,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.cli.train_flags import TrainFlags
 from snowsplat.util.errors import UserError
+from snowsplat.util.run_lock import one_run
 
 
 @dataclass
@@ -44,6 +45,7 @@ class Train(TrainFlags):
 
         if self.processes is not None and self.processes != 1 and processes.count() == 1:
             return processes.launch(self.processes, sys.argv[1:])
+        processes.end_with_launcher()
         if not processes.is_first():
             from snowsplat.pipeline.train import follow_training
 
@@ -52,7 +54,8 @@ class Train(TrainFlags):
         if self.resume and self.overwrite:
             raise UserError("--resume and --overwrite cannot be combined; use one of them")
         dataset, options = self.dataset_path(), self.options()
-        OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
+        with one_run(self.output):  # reports what is wrong before torch is imported
+            OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
         from snowsplat.pipeline.train import resume, train

@@ -44,6 +44,7 @@ from snowsplat.training.settings.declare import Settings, same
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
+from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
@@ -169,7 +170,8 @@ def make(
 
     Raises:
         UserError: photos or settings are unusable; the camera poses cannot be estimated;
-            ``output`` contains other files; see also `snowsplat.pipeline.train.train`.
+            ``output`` contains other files, or another run writes to it; see also
+            `snowsplat.pipeline.train.train`.
         TrainingStopped, KeyboardInterrupt: Ctrl-C. Finished stages and checkpoints are kept.
     """
     started = time.monotonic()
@@ -179,17 +181,16 @@ def make(
     out = Path(output) if output is not None else Path(f"{name}_scene")
     if options.compute.device is not None:  # report an unusable device before the long stages
         options.compute.apply()
-    _check_free(out)
-    return _Job(paths, name, out, options, overwrite, observer, page, started).run()
+    with one_run(out):
+        _check_free(out)
+        return _Job(paths, name, out, options, overwrite, observer, page, started).run()
 
 
 def _check_free(out: Path) -> None:
-    """Raises UserError if ``out`` is a file, or a folder with files that `make` has not written."""
-    if out.exists() and not out.is_dir():
-        raise UserError(f"{out}: is a file; use a folder for the output")
-    if out.is_dir():
-        remove_temporaries(out, (RECORD,))
-    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
+    """Raises UserError if the folder contains files that `make` has not written."""
+    remove_temporaries(out, (RECORD,))
+    others = any(entry.name != LOCK for entry in out.iterdir())
+    if others and not (out / RECORD).is_file():
         raise UserError(f"{out}: contains other files; use a new or an empty folder")
 
 
@@ -207,26 +208,23 @@ class _Job:
     started: float  # by `time.monotonic`
 
     def run(self) -> MakeResult:
-        self.sources = find_sources(self.inputs)  # an error before the folder is created
-        existed = self.out.exists()
-        self.out.mkdir(parents=True, exist_ok=True)
+        self.sources = find_sources(self.inputs)
         self.stages = Stages(self.out / RECORD, STAGES)
-        with self._removed_if_empty(existed):
+        with self._removed_if_alone():
             self.plan = self._plan()
             self.stages.save()  # from now on, the folder is recognised as an output of `make`
             self._make_dataset()
-            return self._make_scene()
+            with one_run(self.dataset):  # no `sfm` changes the photos during the training
+                return self._make_scene()
 
     @contextmanager
-    def _removed_if_empty(self, existed: bool) -> Iterator[None]:
-        """If the job wrote only its record, remove it, and the folder if the job created it."""
+    def _removed_if_alone(self) -> Iterator[None]:
+        """If the job wrote only its record, remove it."""
         try:
             yield
         finally:
-            if self.out.is_dir() and {entry.name for entry in self.out.iterdir()} <= {RECORD}:
+            if self.out.is_dir() and {entry.name for entry in self.out.iterdir()} <= {RECORD, LOCK}:
                 (self.out / RECORD).unlink(missing_ok=True)
-                if not existed:
-                    self.out.rmdir()
 
     def _plan(self) -> MakePlan:
         """The plan for the requested quality. If a time is requested, it is made for this time.
@@ -352,7 +350,8 @@ class _Job:
         if same and checkpoint.exists(folder.checkpoints):
             trained = resume(folder.path, options, observer=self.observer, page=self.page)
         else:
-            shutil.rmtree(folder.path, ignore_errors=True)
+            with one_run(folder.path):
+                folder.clear()
             self.stages.about["training"] = settings
             self.stages.save()
             new = self._new_training(options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
 from snowsplat.pipeline.run.photo_check import check_test_photos
+from snowsplat.pipeline.run.photo_stamps import Stamp, edited, stamps_of
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainResult
@@ -38,6 +40,9 @@ from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
+from snowsplat.util.run_lock import one_run
+
+logger = logging.getLogger(__name__)
 
 # Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
@@ -149,7 +154,7 @@ def train(
 
     Raises:
         UserError: an unusable dataset, impossible cameras (see `TrainOptions`); an unusable
-            setting, device or folder; too little memory; a loss or
+            setting, device or folder; another run in ``output``; too little memory; a loss or
             parameters that are not finite. A new folder is removed if it contains no results.
         TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
         KeyboardInterrupt: Ctrl-C before the first step; nothing is saved.
@@ -158,10 +163,11 @@ def train(
     options = options or TrainOptions()
     recipe(options.recipe or "default", **options.settings)  # reports an invalid setting first
     out = OutputFolder(Path(output))
-    out.check_free(resume=False, overwrite=overwrite)
-    job = _Job(out, options, observer, page, started, parts, loss)
-    with joined(job.device) as job.shards:
-        return job.train(dataset)
+    with one_run(out.path):
+        out.check_free(resume=False, overwrite=overwrite)
+        job = _Job(out, options, observer, page, started, parts, loss)
+        with joined(job.device) as job.shards:
+            return job.train(dataset)
 
 
 def resume(
@@ -197,10 +203,11 @@ def resume(
     started = time.monotonic()
     options = options or TrainOptions()
     out = OutputFolder(Path(output))
-    out.check_free(resume=True, overwrite=False)
-    job = _Job(out, options, observer, page, started, parts, loss)
-    with joined(job.device) as job.shards:
-        return job.resume(dataset)
+    with one_run(out.path):
+        out.check_free(resume=True, overwrite=False)
+        job = _Job(out, options, observer, page, started, parts, loss)
+        with joined(job.device) as job.shards:
+            return job.resume(dataset)
 
 
 def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | None = None) -> None:
@@ -239,7 +246,8 @@ class _Job:
         self.device = options.compute.apply()
         reset_peak()
         self.memory_before = resident_bytes()
-        self.doubts: tuple[str, ...] = ()  # about the cameras of the dataset
+        self.doubts: tuple[str, ...] = ()  # about the dataset
+        self.photos: dict[str, Stamp] = {}
 
     def train(self, path: Path | str) -> TrainResult:
         options = self.options
@@ -274,6 +282,7 @@ class _Job:
             self.observer.note(budget.described(plan))
         if "sweep" in config.starts:
             self.observer.note("computing depth maps for the initialisation")
+        self.photos = stamps_of(dataset, settings.path)
         self.shards.of_first(Setup(settings, memory.plan.config))
         trainer = self._trainer(dataset, memory.plan.config)
         self.out.begin(dataset, settings, memory.plan.config)
@@ -290,12 +299,14 @@ class _Job:
         if options.iterations is None:  # `iterations` replaces the time budget and its schedule
             budget = TimeBudget.for_run(options.minutes, meta.time, self.started)
             schedule = meta.schedule
+        meta = replace(meta, dataset=self.out.located(meta.dataset))
         settings = _resumed_dataset(options, path, start, meta)
         config = _resumed_config(options, start, meta)
         dataset = settings.load()
         self.doubts = check_cameras(
             dataset, settings.path, trusted=True
         )  # the first run has refused, or not
+        self._compare_photos(dataset, settings.path, meta)
         memory = self._memory(dataset, config, _gaussians_in(start))
         self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
         trainer = self._trainer(dataset, memory.plan.config, schedule, start.tensors)
@@ -305,6 +316,18 @@ class _Job:
         iterations = trainer.schedule.iterations
         self.observer.note(f"resuming from {start.path}, step {start.step} of {iterations}")
         return self._run(settings, meta.recipe, trainer, budget, 1.0, memory)
+
+    def _compare_photos(self, dataset: Dataset, path: str, meta: CheckpointMeta) -> None:
+        """Warn if photos or masks were edited since the training has begun."""
+        self.photos = stamps_of(dataset, path, meta.photos)
+        if meta.photos is not None and (names := edited(meta.photos, self.photos)):
+            text = (
+                f"{len(names)} of {len(self.photos)} photos and masks were edited after the first "
+                f"step (such as {names[0]}); the result is not that of either version; train in a "
+                "new folder to use the edited ones only"
+            )
+            self.doubts = (*self.doubts, text)
+            logger.warning("warning: %s: %s", path, text)
 
     def _trainer(
         self,
@@ -354,6 +377,7 @@ class _Job:
             checkpoint_seconds=self.options.checkpoint_seconds,
             page=self.page,
             doubts=self.doubts,
+            photos=self.photos,
         )
         if self.page is not None:
             self.page.open_training(trainer, self.out.path.name, self.observer)

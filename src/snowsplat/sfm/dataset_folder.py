@@ -43,6 +43,7 @@ from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import remove_temporaries
+from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
 
@@ -108,9 +109,10 @@ def make_dataset(
         `Verdict`.
 
     Raises:
-        UserError: the photos cannot be used, ``folder`` contains other files, no poses were found,
-            or pycolmap is missing. In these cases, the files that this run created are removed.
-            This error is also raised if the disk is full; in this case, the files remain.
+        UserError: the photos cannot be used, ``folder`` contains other files, another run writes to
+            it, no poses were found, or pycolmap is missing. In these cases, the files that this run
+            created are removed. This error is also raised if the disk is full; in this case, the
+            files remain.
         OSError: a file cannot be read or written.
     """
     if find_spec("pycolmap") is None:
@@ -120,15 +122,15 @@ def make_dataset(
         )
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     in_place = sources.contain(folder / "input")
-    _check_free(folder, in_place, sources.inputs, options, overwrite)
-    _rename_former_files(folder)
-    with _remove_on_failure(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        stages = Stages(folder / RECORD, STAGES)
-        stages.about = {"inputs": [str(path.absolute()) for path in sources.inputs]}
-        stages.save()  # from here on the folder is recognised as a dataset
-        left = _time_left(sources, options, later or Later())
-        return _run(stages, sources, folder, options, watcher, in_place, left)
+    with one_run(folder):
+        _check_free(folder, in_place, sources.inputs, options, overwrite)
+        _rename_former_files(folder)
+        with _remove_on_failure(folder):
+            stages = Stages(folder / RECORD, STAGES)
+            stages.about = {"inputs": [str(path.absolute()) for path in sources.inputs]}
+            stages.save()  # from here on the folder is recognised as a dataset
+            left = _time_left(sources, options, later or Later())
+            return _run(stages, sources, folder, options, watcher, in_place, left)
 
 
 def _time_left(sources: Sources, options: DatasetOptions, later: Later) -> SfmTimeLeft:
@@ -281,10 +283,6 @@ def _check_free(
     overwrite: bool,
 ) -> None:
     """Raises UserError if the dataset must not be written to ``folder``."""
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise UserError(f"{folder}: is a file; use a folder for the dataset")
     remove_temporaries(folder, (RECORD, REPORT))
     record = next((folder / name for name in RECORDS if (folder / name).is_file()), None)
     if record is not None:
@@ -301,7 +299,7 @@ def _check_free(
                 "`overwrite`"
             )
         return
-    allowed = {".new"}  # left by a run that was killed in its first stage
+    allowed = {LOCK, ".new"}  # .new: left by a run that was killed in its first stage
     if in_place:
         allowed |= {"input"} | ({"distorted"} if options.skip_matching else set())
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
@@ -335,8 +333,7 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
     disk is full, they remain if the stage "photos" is finished, so that the same command resumes.
     If the folder contained a dataset before, nothing is removed.
     """
-    existed = folder.exists()
-    before = {entry.name for entry in folder.iterdir()} if existed else set()
+    before = {entry.name for entry in folder.iterdir()}
     try:
         yield
     except BaseException as error:
@@ -345,8 +342,6 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
         if RECORD not in before and (isinstance(error, UserError) or not resumable):
             for name in {"input", ".new", *_OUTPUT_NAMES} - before:
                 _remove(folder / name)
-            if not existed and folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
                 f"{folder}: the disk is full; free some space, then run the same command again"

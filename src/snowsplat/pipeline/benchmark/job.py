@@ -28,11 +28,11 @@ from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.scene.render import render
-from snowsplat.util.claims import claimed
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.machine import processor_name
 from snowsplat.util.process_memory import peak_bytes
+from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, read_json
 
 #: A file in the output folder of a scene.
@@ -112,10 +112,11 @@ class SceneResult:
         return result
 
 
-def run(job: Job, device: str | None, threads: int | None) -> bool:
-    """Run the job in a new process; False if another process has claimed the scene.
+def run(job: Job, device: str | None, threads: int | None) -> None:
+    """Run the job in a new process.
 
     Raises:
+        InUse: another process trains the scene.
         UserError: it failed; the message is its last line.
     """
     request = json.dumps({"job": asdict(job), "device": device, "threads": threads})
@@ -129,10 +130,11 @@ def run(job: Job, device: str | None, threads: int | None) -> bool:
         process.stdin.flush()  # it stays open: its end tells that this process has ended
         lines = process.stderr.read().strip().splitlines()
         code = process.wait()
-    if code not in (0, TAKEN):
-        last = (lines or [f"ended with exit code {code}"])[-1]
+    last = (lines or [f"ended with exit code {code}"])[-1]
+    if code == TAKEN:
+        raise InUse(last)
+    if code != 0:
         raise UserError(f"{job.scene}: {last.removeprefix('snowsplat: ')}")
-    return code == 0
 
 
 def work(job: Job, device: str | None, threads: int | None) -> None:
@@ -209,12 +211,14 @@ def main() -> int:
     request = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     job = from_json(Job, request["job"])
+    sys.argv = ["snowsplat", "benchmark", "-o", str(Path(job.output).parent)]  # for `Holder`
     try:
-        with claimed(Path(f"{job.output}.claim"), _WAIT_SECONDS) as is_ours:
-            if not is_ours:
-                return TAKEN
+        with locked(Path(f"{job.output}.lock"), f"{job.scene}: in use by", _WAIT_SECONDS):
             if SceneResult.read(job) is None:
                 work(job, request["device"], request["threads"])
+    except InUse as error:
+        print(error, file=sys.stderr)
+        return TAKEN
     except UserError as error:
         print(f"snowsplat: {error}", file=sys.stderr)
         return 2

@@ -19,6 +19,7 @@ from snowsplat.pipeline.run import option
 from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.run_lock import InUse
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def benchmark(
         The results, also written as results.json, results.csv, results.tex and index.html.
 
     Raises:
+        InUse: other processes train all the scenes that are not finished.
         UserError: no scenes, unusable options, or results that were made with other settings.
         KeyboardInterrupt: Ctrl-C; the same call continues.
     """
@@ -91,10 +93,12 @@ def benchmark(
     output.mkdir(parents=True, exist_ok=True)
     on_line(f"{SUITES[name].title}: {len(jobs)} scenes, {len(finished)} finished")
     waiting = [job for job in jobs if job.scene not in finished]
-    failures = _run_all(waiting, options, on_line)
+    failures, elsewhere = _run_all(waiting, options, on_line)
     results = [result for job in jobs if (result := SceneResult.read(job)) is not None]
     report = BenchmarkReport(name, results, failures)
     write_report(output, report)
+    if elsewhere and len(elsewhere) == len(waiting):
+        raise elsewhere[0]
     return report
 
 
@@ -136,11 +140,12 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
 
 def _run_all(
     jobs: Sequence[Job], options: BenchmarkOptions, on_line: Callable[[str], None]
-) -> dict[str, str]:
-    """Run the jobs that nobody else runs; returns the errors, by scene."""
+) -> tuple[dict[str, str], list[InUse]]:
+    """Run the jobs that nobody else runs; returns the errors by scene, and who runs the others."""
     devices = _devices(options)
     threads = None if options.jobs == 1 else max(1, (os.cpu_count() or 1) // options.jobs)
     failures: dict[str, str] = {}
+    elsewhere: list[InUse] = []
     stopped = False
 
     def work(job: Job) -> None:
@@ -148,9 +153,11 @@ def _run_all(
             return
         device = devices.pop()
         try:
-            if not run(job, device, threads):
-                on_line(f"{job.scene}: another process trains it")
-                return
+            run(job, device, threads)
+        except InUse as error:
+            elsewhere.append(error)
+            on_line(str(error))
+            return
         except UserError as error:
             failures[job.scene] = str(error)
             on_line(str(error))
@@ -172,7 +179,7 @@ def _run_all(
         except KeyboardInterrupt:  # the processes get it, too, and save a checkpoint
             stopped = True
             raise
-    return failures
+    return failures, elsewhere
 
 
 def _devices(options: BenchmarkOptions) -> list[str | None]:

@@ -29,6 +29,7 @@ from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
+from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, read_json
 
 PLAN = "plan.json"
@@ -148,6 +149,11 @@ def plan_blocks(
         OSError: a file cannot be written.
     """
     options, folder = options or PlanOptions(), Path(folder)
+    with one_run(folder):
+        return _plan(dataset, folder, options)
+
+
+def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     _check_free(folder)
     config = recipe(options.recipe, **options.settings)
     if config.exposure != "off":
@@ -178,7 +184,6 @@ def plan_blocks(
         distance = sky_distance([view.camera for view in whole.train])
         shared["sky_distance"] = float(f"{distance:.4g}")
     plan = Plan(settings, options.recipe, shared, axes, options.margin, [])
-    folder.mkdir(parents=True, exist_ok=True)
     plan.write(folder)  # without blocks: it is unfinished
     limit, blocks, digits = config.density.max_gaussians, [], max(2, len(str(options.blocks)))
     for number, content in enumerate(contents, 1):
@@ -197,11 +202,7 @@ def plan_blocks(
 
 def _check_free(folder: Path) -> None:
     """Raise `UserError` if ``folder`` contains anything but an unfinished plan."""
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise UserError(f"{folder}: is a file; use a folder")
-    if not any(folder.iterdir()):
+    if {entry.name for entry in folder.iterdir()} <= {LOCK}:
         return
     try:
         unfinished = read_json(folder / PLAN)["blocks"] == []

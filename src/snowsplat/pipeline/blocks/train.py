@@ -11,8 +11,8 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.train import TrainOptions, resume, train
-from snowsplat.util.claims import claimed
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.run_lock import InUse, one_run
 from snowsplat.util.safe_json import read_json
 
 _CHECKPOINT_SECONDS = 60.0
@@ -62,6 +62,7 @@ def train_blocks(
         The results of the blocks that were trained now.
 
     Raises:
+        InUse: other processes train all the blocks that are not finished.
         UserError: there is no plan or no such block; see also `snowsplat.pipeline.train.train`.
         TrainingStopped: Ctrl-C. A checkpoint is saved, and the same call continues.
         KeyboardInterrupt: Ctrl-C before the first step of a block.
@@ -71,7 +72,7 @@ def train_blocks(
     for number in only:
         if not 1 <= number <= len(plan.blocks):
             raise SettingError("block", f"{number} does not exist; use 1 to {len(plan.blocks)}")
-    results = []
+    results, elsewhere = [], list[InUse]()
     for number, block in enumerate(plan.blocks, 1):
         if only and number not in only:
             continue
@@ -79,12 +80,18 @@ def train_blocks(
         if is_finished(out):
             on_block(f"{block.name}: finished")
             continue
-        with claimed(folder / block.name / "train.claim") as is_ours:
-            if not is_ours:
-                on_block(f"{block.name}: another process trains it")
-            elif not is_finished(out):  # by another process, a moment ago
-                on_block(f"{block.name}: {block.views} photos, {block.points:,} points")
-                results.append(_train(folder, plan, block, compute or Compute(), memory, observer))
+        try:
+            with one_run(folder / block.name):
+                if not is_finished(out):  # by another process, a moment ago
+                    on_block(f"{block.name}: {block.views} photos, {block.points:,} points")
+                    results.append(
+                        _train(folder, plan, block, compute or Compute(), memory, observer)
+                    )
+        except InUse as error:
+            elsewhere.append(error)
+            on_block(str(error))
+    if elsewhere and not results:
+        raise elsewhere[0]
     return results
 
 

@@ -23,11 +23,13 @@ from __future__ import annotations
 
 import argparse
 import ast
+import logging
+import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +42,7 @@ from snowsplat.util.files import (
     write_json,
     write_text,
 )
+from snowsplat.util.run_lock import LOCK
 from snowsplat.util.safe_json import from_json, read_json
 
 if TYPE_CHECKING:
@@ -49,6 +52,8 @@ if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.settings.config import TrainConfig
+
+logger = logging.getLogger(__name__)
 
 #: Folders inside the folder of `make`: the dataset, and the output folder of its training.
 DATASET, SCENE = "dataset", "scene"
@@ -145,7 +150,11 @@ class OutputFolder:
             return
         if not self.path.is_dir():
             raise UserError(f"{self.path}: is a file; use a folder for the output")
-        others = (entry for entry in self.path.iterdir() if not is_temporary(entry, _FILES))
+        others = (
+            entry
+            for entry in self.path.iterdir()
+            if entry.name != LOCK and not is_temporary(entry, _FILES)
+        )
         if any(others) and not self.is_output_folder():
             raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
         if self.is_output_folder() and not resume and not overwrite:
@@ -153,6 +162,14 @@ class OutputFolder:
                 f"{self.path}: already contains a training run; use `resume` to continue it, "
                 "`overwrite` to replace it, or use another folder"
             )
+
+    def clear(self) -> None:
+        """Remove everything except for the lock, which the caller holds."""
+        for entry in self.path.iterdir():
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            elif entry.name != LOCK:
+                entry.unlink(missing_ok=True)
 
     def begin(self, dataset: Dataset, settings: DatasetSettings, config: TrainConfig) -> None:
         """Create the folder, remove the results of an earlier run, and call `describe`."""
@@ -310,6 +327,8 @@ class OutputFolder:
     def settings(self) -> tuple[DatasetSettings, tuple[float, float, float]]:
         """How the dataset was read, and the background colour (red, green, blue in 0..1).
 
+        If the folder was moved, the paths are those of `located`.
+
         Raises:
             UserError: missing or damaged settings.
         """
@@ -337,7 +356,39 @@ class OutputFolder:
         except (KeyError, TypeError, ValueError, SyntaxError, OverflowError):
             where = ours if ours.is_file() else theirs
             raise UserError(f"{where}: damaged; it does not name the dataset") from None
-        return dataset, (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+        return self.located(dataset), (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+
+    def located(self, dataset: DatasetSettings) -> DatasetSettings:
+        """``dataset`` with the paths of today, if this folder was moved with its dataset.
+
+        A path of `make` is always that of the dataset beside this folder: after a copy, the first
+        one exists, too. Any other path is replaced only if it does not exist any more, but the same
+        relative path does.
+        """
+        try:
+            former = Path(str(_namespace(self.path / "cfg_args")["model_path"]))
+        except (OSError, KeyError, ValueError, SyntaxError):
+            return dataset
+        here = self.path.absolute()
+        if not former.is_absolute() or former == here:
+            return dataset
+
+        def today(path: str) -> str:
+            moved = Path(os.path.normpath(here / os.path.relpath(path, former)))
+            own = former.name == SCENE and Path(path) in (
+                former.parent / DATASET,
+                former.parent / FORMER_DATASET,
+            )
+            if not moved.exists() or (Path(path).exists() and not own):
+                return path
+            if not own:
+                logger.info("%s was moved; %s is read from %s", self.path, Path(path).name, moved)
+            return str(moved)
+
+        tests = dataset.test_list
+        return replace(
+            dataset, path=today(dataset.path), test_list=None if tests is None else today(tests)
+        )
 
 
 def _left_out_in(metrics: Path) -> list[str]:

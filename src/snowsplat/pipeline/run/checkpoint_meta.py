@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.output.output_folder import FORMER_DATASET, DatasetSettings
+from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import from_json
@@ -23,6 +24,7 @@ class CheckpointMeta:
         recipe: the recipe from which the configuration was derived.
         training: the configuration, see `config_to_json`.
         time: see `TimeBudget.as_json`; None without a time budget.
+        photos: stamps of the photos and masks; None in checkpoints of earlier versions.
         schedule: the schedule, if it has changed: for a time budget, or because the scene overfits.
     """
 
@@ -31,6 +33,7 @@ class CheckpointMeta:
     training: dict[str, Any]
     time: dict[str, float] | None = None
     schedule: Schedule | None = None
+    photos: dict[str, Stamp] | None = None
 
     @classmethod
     def from_checkpoint(cls, start: Checkpoint) -> CheckpointMeta:

@@ -13,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -62,6 +63,21 @@ class Setup:
     config: TrainConfig
     schedule: Schedule | None = None
     checkpoint: Path | None = None
+
+
+def end_with_launcher() -> None:
+    """If `launch` has started this process, end at once when that process has ended.
+
+    Otherwise, the processes of a killed command would go on, and keep the output folder locked.
+    """
+    if _LAUNCHED in os.environ:
+
+        def watch() -> None:
+            while os.read(0, 1):  # nothing is written; the pipe ends with the process
+                pass
+            os._exit(_LOST_CODE)
+
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def count() -> int:
@@ -175,7 +191,10 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
             output = None if rank == 0 else subprocess.DEVNULL
             error = None if rank == 0 else files.enter_context(TemporaryFile())
             errors.append(error)
-            running.append(subprocess.Popen(command, env=environment, stdout=output, stderr=error))
+            process = subprocess.Popen(
+                command, env=environment, stdin=subprocess.PIPE, stdout=output, stderr=error
+            )
+            running.append(files.enter_context(process))
         try:
             failed = _wait(running)
         finally:

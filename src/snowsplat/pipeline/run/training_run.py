@@ -19,6 +19,7 @@ from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.collective import Collective
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
+from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
@@ -60,7 +61,8 @@ class TrainingRun:
         save_iterations: steps after which the scene is written, in addition to the last step.
         checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
         page: shows the training in the browser.
-        doubts: what is doubtful about the cameras of the dataset, for the report.
+        doubts: what is doubtful about the dataset, for the report.
+        photos: stamps of the photos and masks, for checkpoints.
     """
 
     out: OutputFolder
@@ -75,6 +77,7 @@ class TrainingRun:
     checkpoint_seconds: float | None = None
     page: LivePage | None = None
     doubts: tuple[str, ...] = ()
+    photos: dict[str, Stamp] | None = None
 
     def __post_init__(self) -> None:
         self.config = self.trainer.config
@@ -214,7 +217,8 @@ class TrainingRun:
 
     def _save_checkpoint(self) -> Path:
         self._restore_folder()
-        meta = CheckpointMeta(self.settings, self.recipe, config_to_json(self.config))
+        training = config_to_json(self.config)
+        meta = CheckpointMeta(self.settings, self.recipe, training, photos=self.photos)
         if self.budget is not None:
             meta = replace(meta, time=self.budget.as_json())
         if self.trainer.schedule.since > 0:

@@ -1,0 +1,71 @@
+"""Stamps of the photos and masks of a training, by which `resume` notices that they were edited."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from snowsplat.data import Dataset
+
+_PART = 1 << 16  # bytes at the begin, the middle and the end of a file that its digest covers
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """A file at one time.
+
+    Attributes:
+        size: bytes.
+        time: of its last change, in nanoseconds; copies of a file may have another one.
+        digest: of parts of its content. An edited image is compressed anew, so all parts change.
+    """
+
+    size: int
+    time: int
+    digest: str
+
+
+def stamps_of(
+    dataset: Dataset, folder: Path | str, before: Mapping[str, Stamp] | None = None
+) -> dict[str, Stamp]:
+    """The stamps of photos and masks, by their paths relative to the folder of the dataset.
+
+    Args:
+        before: earlier stamps. Files with the same size and time are not read again.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    stamps: dict[str, Stamp] = {}
+    for view in [*dataset.train, *dataset.test]:
+        for image in (view.image, view.mask):
+            if image is not None:
+                name = Path(os.path.relpath(image.path, folder)).as_posix()
+                if name not in stamps:
+                    stamps[name] = _stamp(image.path, (before or {}).get(name))
+    return stamps
+
+
+def edited(before: Mapping[str, Stamp], now: Mapping[str, Stamp]) -> list[str]:
+    """The files with another content, and those that are only in one of both; sorted."""
+
+    def content(stamps: Mapping[str, Stamp]) -> set[tuple[str, int, str]]:
+        return {(name, stamp.size, stamp.digest) for name, stamp in stamps.items()}
+
+    return sorted({name for name, _, _ in content(before) ^ content(now)})
+
+
+def _stamp(path: Path, before: Stamp | None) -> Stamp:
+    status = path.stat()
+    size, time = status.st_size, status.st_mtime_ns
+    if before is not None and (before.size, before.time) == (size, time):
+        return before
+    digest = hashlib.blake2b(digest_size=8)
+    with open(path, "rb") as file:
+        for start in sorted({0, max(0, (size - _PART) // 2), max(0, size - _PART)}):
+            file.seek(start)
+            digest.update(file.read(_PART))
+    return Stamp(size, time, digest.hexdigest())

@@ -1,0 +1,76 @@
+"""A training whose folder or dataset was moved, and photos that are edited before `resume`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import pytest
+from PIL import Image, ImageOps
+
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_source import load_dataset_of
+from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+
+_SETTINGS = {"max_gaussians": 200, "init": "points", "checkpoint_every": 2}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """A dataset and its training, side by side."""
+    project = tmp_path_factory.mktemp("first") / "project"
+    write_toy_dataset(project / "dataset", n_views=6)
+    train(project / "dataset", project / "scene", TrainOptions(settings=_longer(2)))
+    return project
+
+
+def _longer(iterations):
+    return {**_SETTINGS, "iterations": iterations}
+
+
+def _dataset_of(out):
+    return load_dataset_of(OutputFolder(out))[0].train[0].image.path.parents[1]
+
+
+def test_moved_folders(project, tmp_path, caplog):
+    caplog.set_level("INFO", logger="snowsplat")
+    # A dataset beside a folder named scene, as `make` has it: the copy belongs to the copy.
+    copy = shutil.copytree(project, tmp_path / "copy")
+    assert _dataset_of(copy / "scene") == copy / "dataset"
+    assert _dataset_of(project / "scene") == project / "dataset"
+    # Only the output was moved.
+    shutil.copytree(project / "scene", tmp_path / "a" / "scene")
+    assert _dataset_of(tmp_path / "a" / "scene") == project / "dataset"
+    # Of other names, a path that exists is never replaced; one that does not is, and it is said.
+    other = tmp_path / "other"
+    (copy / "dataset").rename(copy / "photos")
+    train(copy / "photos", copy / "out", TrainOptions(settings=_longer(2)))
+    shutil.copytree(copy, other)
+    assert _dataset_of(other / "out") == copy / "photos"
+    assert "was moved" not in caplog.text
+    shutil.rmtree(copy)
+    assert _dataset_of(other / "out") == other / "photos"
+    assert "was moved; photos is read from" in caplog.text
+    resume(other / "out", TrainOptions(settings={"iterations": 4}))
+    assert OutputFolder(other / "out").scenes() == [2, 4]
+
+
+def test_edited_photos(project, tmp_path, caplog):
+    dataset, out = tmp_path / "dataset", tmp_path / "out"
+    shutil.copytree(project / "dataset", dataset)
+    train(dataset, out, TrainOptions(settings=_longer(2)))
+    photos = sorted((dataset / "images").iterdir())
+    os.utime(photos[1], (1.0, 1.0))
+    resume(out, TrainOptions(settings={"iterations": 4}))
+    assert "edited" not in caplog.text  # only the time of the file has changed
+    ImageOps.invert(Image.open(photos[0]).convert("RGB")).save(photos[0])
+    resume(out, TrainOptions(settings={"iterations": 6}))
+    [warning] = [line for line in caplog.messages if "edited" in line]
+    said = "1 of 6 photos and masks were edited after the first step"
+    assert said in warning
+    assert f"images/{photos[0].name}" in warning
+    assert "edited after the first step" in (out / "report.html").read_text(encoding="utf-8")
+    caplog.clear()
+    resume(out, TrainOptions(settings={"iterations": 8}))
+    assert "edited" not in caplog.text  # it is said once
