@@ -37,6 +37,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.core import checkpoint
 from snowsplat.util.ply import open_table
+from snowsplat.util.run_lock import LOCK
 
 _MOST_DEFECTS = 20
 _SOURCE = str(Path(snowsplat.__file__).parents[1])
@@ -235,12 +236,14 @@ def _open(path: Path) -> None:
 
 
 def leftovers(*folders: Path) -> list[str]:
-    """Names of temporary files and folders."""
+    """Names of temporary files and folders. The lock of a folder stays; it is not held."""
     found = []
     for folder in folders:
         for path in folder.rglob("*"):
             name = path.name
             odd = name.startswith(".") or name.endswith((".tmp", ".pairs", ".models", "-journal"))
+            if name == LOCK:
+                continue
             if odd or name.endswith(("-wal", "-shm", "_strong.db")):
                 found.append(str(path.relative_to(folder)))
     return found

@@ -79,8 +79,8 @@ def benchmark(
         The results, also written as results.json, results.csv, results.tex and index.html.
 
     Raises:
-        InUse: other processes train all the scenes that are not finished.
-        UserError: no scenes, unusable options, or results that were made with other settings.
+        UserError: no scenes, unusable options, or results that were made with other settings; or
+            other processes train all the scenes that are not finished.
         KeyboardInterrupt: Ctrl-C; the same call continues.
     """
     folder, output, options = Path(folder), Path(output), options or BenchmarkOptions()

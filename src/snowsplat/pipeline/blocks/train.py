@@ -62,8 +62,8 @@ def train_blocks(
         The results of the blocks that were trained now.
 
     Raises:
-        InUse: other processes train all the blocks that are not finished.
-        UserError: there is no plan or no such block; see also `snowsplat.pipeline.train.train`.
+        UserError: there is no plan or no such block, or other processes train all the blocks that
+            are not finished; see also `snowsplat.pipeline.train.train`.
         TrainingStopped: Ctrl-C. A checkpoint is saved, and the same call continues.
         KeyboardInterrupt: Ctrl-C before the first step of a block.
     """
