@@ -50,9 +50,7 @@ def _depths(cameras: Sequence[Camera], points: Tensor) -> list[tuple[float, floa
     levels = torch.tensor([_NEAREST, 0.5], dtype=torch.float64)
     found = []
     for camera in cameras:
-        pixel, depth = camera.project(points)
-        size = torch.tensor([camera.width, camera.height])
-        seen = depth[(depth > 0.0) & ((pixel >= 0.0) & (pixel < size)).all(1)]
+        seen = camera.depths_in_view(points)
         if len(seen) >= _FEWEST:
             nearest, median = torch.quantile(seen, levels).tolist()
             found.append((nearest, median))

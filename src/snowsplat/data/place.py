@@ -18,15 +18,14 @@ def moved_to_origin(
     """Cameras, points and the origin of a dataset as it is stored.
 
     The poses and points that are returned are relative to the origin. It is `HERE`, and nothing is
-    moved, unless the camera centres are so far away that float32 would bend the scene.
+    moved, unless the scene is so far away that float32 would bend the scene.
 
     Args:
         posed: at least one, with poses in float64.
         points: may be in float64; the result is in float32.
     """
     centres = torch.stack([image.camera.position for image in posed]).numpy()
-    # The points are the scene. But a cloud of a laser scanner may have been moved without the
-    # poses; it is the judge that finds this.
+    # Both decide: points that were moved without the poses are the business of the judge.
     known = centres if points is None else np.concatenate([centres, points.xyz.double().numpy()])
     origin = origin_of(known)
     if origin == HERE:

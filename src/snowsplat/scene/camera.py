@@ -104,3 +104,9 @@ class Camera:
         depth = x_cam[:, 2]
         focal, centre = points.new_tensor([[self.fx, self.fy], [self.cx, self.cy]])
         return x_cam[:, :2] / depth[:, None] * focal + centre, depth
+
+    def depths_in_view(self, points: Tensor) -> Tensor:
+        """The depths (V,) of those of the world points (P, 3) that are in the image; in order."""
+        pixel, depth = self.project(points)
+        size = pixel.new_tensor([self.width, self.height])
+        return depth[(depth > 0.0) & ((pixel >= 0.0) & (pixel < size)).all(1)]

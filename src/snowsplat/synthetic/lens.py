@@ -15,16 +15,32 @@ _NEWTON_STEPS = 8
 
 
 @dataclass(frozen=True)
-class Lens:
+class _CentredLens:
+    """One focal length, the principal point at the centre, and four coefficients of distortion."""
+
+    width: int
+    height: int
+    focal: float  # pixels, per radian at the centre
+    distortion: tuple[float, float, float, float]  # as in COLMAP's model of the same name
+
+    @property
+    def params(self) -> tuple[float, ...]:
+        """Parameters of COLMAP's model: fx, fy, cx, cy, then the distortion."""
+        return (self.focal, self.focal, self.width / 2, self.height / 2, *self.distortion)
+
+    @property
+    def _middle(self) -> np.ndarray:
+        return np.array([[self.width / 2], [self.height / 2]])
+
+
+@dataclass(frozen=True)
+class Lens(_CentredLens):
     """Pixel coordinates as in `snowsplat.scene.camera.Camera`; principal point at the centre.
 
     A point (x, y, 1) in the camera's frame is at focal · d(x, y) from the image centre, where
     d(x, y) = (x, y) (1 + k1 r² + k2 r⁴) + (2 p1 xy + p2 (r² + 2x²), p1 (r² + 2y²) + 2 p2 xy).
     """
 
-    width: int
-    height: int
-    focal: float  # pixels
     distortion: tuple[float, float, float, float]  # k1, k2, p1, p2
     model: ClassVar[str] = "OPENCV"
 
@@ -54,15 +70,6 @@ class Lens:
         rays = np.concatenate([xy, np.ones_like(xy[:1])])
         return rays / np.sqrt((rays * rays).sum(axis=0))
 
-    @property
-    def params(self) -> tuple[float, ...]:
-        """Parameters of COLMAP's OPENCV: fx, fy, cx, cy, k1, k2, p1, p2."""
-        return (self.focal, self.focal, self.width / 2, self.height / 2, *self.distortion)
-
-    @property
-    def _middle(self) -> np.ndarray:
-        return np.array([[self.width / 2], [self.height / 2]])
-
     def _distorted(self, xy: np.ndarray) -> np.ndarray:
         k1, k2, p1, p2 = self.distortion
         x, y = xy
@@ -74,16 +81,13 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class FisheyeLens:
+class FisheyeLens(_CentredLens):
     """As `Lens`, for a fisheye lens, which may see directions at 90° to its axis or more.
 
     A point at the angle θ to the axis is at focal · θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) pixels
     from the image centre.
     """
 
-    width: int
-    height: int
-    focal: float  # pixels per radian at the centre
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # k1, k2, k3, k4
     model: ClassVar[str] = "OPENCV_FISHEYE"
 
@@ -110,15 +114,6 @@ class FisheyeLens:
             angle = angle - (self._distorted(angle) - goal) / slope
         sine = np.sin(angle) / np.maximum(goal, 1e-300)
         return np.stack([sine * x, sine * y, np.cos(angle)])
-
-    @property
-    def params(self) -> tuple[float, ...]:
-        """Parameters of COLMAP's OPENCV_FISHEYE: fx, fy, cx, cy, k1, k2, k3, k4."""
-        return (self.focal, self.focal, self.width / 2, self.height / 2, *self.distortion)
-
-    @property
-    def _middle(self) -> np.ndarray:
-        return np.array([[self.width / 2], [self.height / 2]])
 
     def _distorted(self, angle: np.ndarray) -> np.ndarray:
         k1, k2, k3, k4 = self.distortion

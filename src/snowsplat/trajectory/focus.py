@@ -60,9 +60,7 @@ def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:
     points = points.detach().to(torch.float64)[:: -(-len(points) // _POINTS_SAMPLED) or 1]
     medians = []
     for camera in cameras[:: -(-len(cameras) // _CAMERAS_SAMPLED)]:
-        pixels, depth = camera.project(points)
-        size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        seen = depth[(depth > 0) & ((pixels >= 0) & (pixels < size)).all(1)]
+        seen = camera.depths_in_view(points)
         if len(seen):
             medians.append(float(seen.median()))
     if medians:

@@ -118,12 +118,8 @@ def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:
 
 def nearest_depth(camera: Camera, points: Tensor) -> float:
     """The depth that 98% of the points (P, 3) in the view exceed; 0 if it shows too few points."""
-    pixel, depth = camera.project(points)
-    size = torch.tensor([camera.width, camera.height])
-    inside = (depth > 0.0) & (pixel >= 0.0).all(1) & (pixel < size).all(1)
-    if int(inside.sum()) < _FEWEST_POINTS:
-        return 0.0
-    return float(torch.quantile(depth[inside], _QUANTILE))
+    seen = camera.depths_in_view(points)
+    return float(torch.quantile(seen, _QUANTILE)) if len(seen) >= _FEWEST_POINTS else 0.0
 
 
 def _sample(points: Tensor, count: int) -> Tensor:
