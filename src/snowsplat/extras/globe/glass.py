@@ -33,18 +33,12 @@ _FAR = 12.0
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What is around the Gaussians, for one camera.
+    """What is around the Gaussians, for one camera."""
 
-    Attributes:
-        behind: (H, W, 3) sRGB in 0..1, behind the Gaussians.
-        keep: (H, W, 1): share of the light that the glass lets through; 0 where the base is in
-            front.
-        add: (H, W, 3) linear light that reflections or the base add.
-    """
-
-    behind: np.ndarray
+    behind: np.ndarray  # (H, W, 3) sRGB in 0..1, behind the Gaussians
+    # (H, W, 1): share of the light that the glass lets through; 0 where the base is in front.
     keep: np.ndarray
-    add: np.ndarray
+    add: np.ndarray  # (H, W, 3) linear light that reflections or the base add
 
     def around(self, color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         """The complete picture.

@@ -40,25 +40,15 @@ td { font-variant-numeric: tabular-nums; }
 
 @dataclass(frozen=True)
 class Fitted:
-    """The content of the page.
+    """The content of the page."""
 
-    Attributes:
-        name: of the photo.
-        photo: (H, W, 3) uint8.
-        gaussians: the result of the fit.
-        moments: the course of the fit; the last one is the result.
-        compact: PSNR in dB, bytes and bits per pixel of the compact file.
-        files: names and descriptions of the files beside the page.
-        video: the video of the fit.
-    """
-
-    name: str
-    photo: Tensor
-    gaussians: ImageGaussians
-    moments: list[Moment]
-    compact: tuple[float, int, float]
-    files: dict[str, str]
-    video: Path
+    name: str  # of the photo
+    photo: Tensor  # (H, W, 3) uint8
+    gaussians: ImageGaussians  # the result of the fit
+    moments: list[Moment]  # the course of the fit; the last one is the result
+    compact: tuple[float, int, float]  # PSNR in dB, bytes and bits per pixel of the compact file
+    files: dict[str, str]  # names and descriptions of the files beside the page
+    video: Path  # the video of the fit
 
 
 def write_image_report(path: Path, fitted: Fitted) -> None:
