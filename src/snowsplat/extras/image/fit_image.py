@@ -32,7 +32,7 @@ from snowsplat.util.process import single_threaded
 FILES = {
     "image.png": "the image that the Gaussians approximate the photo with",
     "image.gimg": "the Gaussians, quantised: a compact file",
-    "extras.image.svg": "an ellipse with a gradient for each Gaussian",
+    "image.svg": "an ellipse with a gradient for each Gaussian",
     "forming.mp4": "a video of the fit",
     "metrics.json": "PSNR and SSIM, and their course",
     "report.html": "this page",
@@ -111,10 +111,10 @@ def fit_image(
         file_psnr = compare(stored.render(), target).psnr
         files = dict(FILES)
         if gaussians.blending == "front-to-back":
-            write_svg(output / "extras.image.svg", gaussians)
+            write_svg(output / "image.svg", gaussians)
         else:
-            (output / "extras.image.svg").unlink(missing_ok=True)  # of an earlier fit
-            del files["extras.image.svg"]
+            (output / "image.svg").unlink(missing_ok=True)  # of an earlier fit
+            del files["image.svg"]
         file_bytes = (output / "image.gimg").stat().st_size
         width, height = gaussians.width, gaussians.height
         bits = 8 * file_bytes / (width * height)
