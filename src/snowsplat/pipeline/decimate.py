@@ -53,7 +53,7 @@ def file_size(decimate: int | str | None) -> int | None:
 
 @dataclass(frozen=True)
 class Decimation:
-    """Makes fewer Gaussians of a scene: neighbours are merged, and the result is fitted to views."""
+    """Makes fewer Gaussians of a scene: merges neighbours, and fits the result to views."""
 
     cameras: Sequence[Camera] = ()  # the cameras of the photos; empty: unknown
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the colour behind the scene

@@ -15,8 +15,7 @@ from snowsplat.data.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.metrics import compare
 from snowsplat.extras.image.compact_file import read_compact, write_compact
 from snowsplat.extras.image.fit import FitOptions, Fitter
-from snowsplat.extras.image.history import Moment, recorded_steps
-from snowsplat.extras.image.image_report import Fitted, write_image_report
+from snowsplat.extras.image.image_report import Fitted, Moment, recorded_steps, write_image_report
 from snowsplat.extras.image.model import ImageGaussians
 from snowsplat.extras.image.svg import write_svg
 from snowsplat.pipeline.compute import Compute

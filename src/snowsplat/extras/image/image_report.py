@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.extras.image.history import Moment
 from snowsplat.extras.image.model import COLORS, LOG_SIGMAS, OPACITY_LOGIT, ImageGaussians
 from snowsplat.util import charts
 from snowsplat.util.duration import duration
@@ -36,6 +35,25 @@ _STYLE = (
 td { font-variant-numeric: tabular-nums; }
 """
 )
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The state of a fit after a step."""
+
+    step: int
+    seconds: float  # time spent in steps so far
+    gaussians: int
+    psnr: float  # dB
+    ssim: float
+
+
+def recorded_steps(steps: int, count: int) -> list[int]:
+    """At most `count` steps from 1 to `steps`, at first close together.
+
+    The k-th of them is proportional to k²: the image changes most in the first steps.
+    """
+    return sorted({max(1, round(steps * (k / count) ** 2)) for k in range(1, count + 1)})
 
 
 @dataclass(frozen=True)

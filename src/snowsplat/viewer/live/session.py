@@ -222,11 +222,6 @@ class Session:
                 return True
             return not self._paused
 
-    def is_here(self, visitor: Visitor) -> bool:
-        """Whether the browser is still connected."""
-        with self._changed:
-            return visitor in self._visitors.values()
-
     def next_request(self, scene: int, training: bool) -> RenderRequest | None:
         """The next image to render; None if there is none, or if the training has to run first.
 
