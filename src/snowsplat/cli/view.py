@@ -1,7 +1,5 @@
 """`snowsplat view`: a finished scene in the browser."""
 
-from __future__ import annotations
-
 import getpass
 import os
 import signal

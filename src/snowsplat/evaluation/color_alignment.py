@@ -1,7 +1,5 @@
 """Aligning the colours of an image with those of a photo, so that exposure does not count."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The six tensors of Gaussians that the operations read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """`sum_of_rows`: a sum that is bit-identical in every run."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 

@@ -1,7 +1,5 @@
 """`make`: make a scene from photos or a video: camera poses, training, rendered test views."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

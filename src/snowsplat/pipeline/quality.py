@@ -1,7 +1,5 @@
 """`PRESETS`: the work of `make` at each quality."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

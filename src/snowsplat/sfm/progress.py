@@ -1,7 +1,5 @@
 """The progress callback of a long job."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 

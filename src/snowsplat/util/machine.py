@@ -1,7 +1,5 @@
 """A description of this machine, without user name or host name."""
 
-from __future__ import annotations
-
 import os
 import platform
 from pathlib import Path

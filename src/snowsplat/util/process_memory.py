@@ -1,7 +1,5 @@
 """The memory of this process: the present resident memory and its peak."""
 
-from __future__ import annotations
-
 import gc
 import sys
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """`lift`: a photo and its depth map -> Gaussians."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

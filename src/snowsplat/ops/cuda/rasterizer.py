@@ -1,7 +1,5 @@
 """Rasterization on a GPU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -3,8 +3,6 @@
 Importing this module registers the HTML page as a format. It does not import torch.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from snowsplat.formats import (

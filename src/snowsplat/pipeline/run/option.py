@@ -1,7 +1,5 @@
 """Options that several subcommands have, as fields of their options."""
 
-from __future__ import annotations
-
 import math
 
 from snowsplat.training.settings.declare import setting

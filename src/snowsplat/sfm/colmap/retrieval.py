@@ -7,8 +7,6 @@ dataset, so no vocabulary has to be downloaded. All sums have a fixed order, so 
 only on the features.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`Progress`: what a training reports after each step."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from snowsplat.evaluation.metrics import Evaluation

@@ -1,7 +1,5 @@
 """Key cameras: views that a user stores on the page, to render a video along them."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

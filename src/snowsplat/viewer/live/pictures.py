@@ -1,7 +1,5 @@
 """`draw`: renders an image of Gaussians in one of the display modes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 viser also lists the keys in its command palette (Ctrl-K).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """`TrainingViewer`: updates the page between two training steps."""
 
-from __future__ import annotations
-
 import math
 import time
 
