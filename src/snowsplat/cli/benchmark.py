@@ -1,5 +1,7 @@
 """`snowsplat benchmark`: all scenes of a benchmark suite, and a table."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,5 +1,7 @@
 """`snowsplat blocks`: a scene that is larger than the memory, in blocks that are merged."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,5 +1,7 @@
 """`snowsplat clean`: a scene without floaters."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -5,6 +5,8 @@ most similar one as a suggestion, and an invalid value is explained as it is in 
 declaration of the setting.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress

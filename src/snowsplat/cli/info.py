@@ -1,5 +1,7 @@
 """`snowsplat info`: the contents of a file or folder."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`snowsplat publish`: a static web site that shows a scene."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,5 +1,7 @@
 """The lines that are printed about finished stages."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """The subcommands, by name. The module of a subcommand is imported when it is called."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec

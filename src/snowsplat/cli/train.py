@@ -1,5 +1,7 @@
 """`snowsplat train`: trains a scene from photos with known camera poses."""
 
+from __future__ import annotations
+
 import sys
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass

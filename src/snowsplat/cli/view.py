@@ -1,5 +1,7 @@
 """`snowsplat view`: a finished scene in the browser."""
 
+from __future__ import annotations
+
 import getpass
 import os
 import signal

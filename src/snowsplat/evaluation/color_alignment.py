@@ -1,5 +1,7 @@
 """Aligning the colours of an image with those of a photo, so that exposure does not count."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 

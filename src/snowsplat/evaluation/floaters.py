@@ -11,6 +11,8 @@ is about 1 on the surface and small in front of it; the sums are over the pixels
 surface.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -11,6 +11,8 @@ fitted to the photo, see `color_alignment`. Thus it does not count that the phot
 exposure or white balance than the scene. It is listed beside the PSNR and never replaces it.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass

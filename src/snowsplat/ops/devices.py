@@ -1,5 +1,7 @@
 """Selects the device for the computation."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable
 

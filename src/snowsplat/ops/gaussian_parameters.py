@@ -1,5 +1,7 @@
 """The six tensors of Gaussians that the operations read."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Protocol
 

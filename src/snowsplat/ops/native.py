@@ -4,6 +4,8 @@ At the first launch on the CPU, `util/native_library.py` loads the library for t
 set. A GPU has the same entries: see `ops/cuda`.
 """
 
+from __future__ import annotations
+
 import ctypes
 import functools
 import threading

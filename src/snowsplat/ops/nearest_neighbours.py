@@ -1,5 +1,7 @@
 """`neighbours`: distances to the nearest other points."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 

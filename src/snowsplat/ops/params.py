@@ -4,6 +4,8 @@ The meaning of the fields and the shapes of the tensors are documented there. `E
 struct of each operation. The layouts are compared when the library is loaded.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from torch import Tensor

@@ -1,5 +1,7 @@
 """`project`: 3D Gaussians → the 2D splats that a camera sees."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,5 +1,7 @@
 """`rasterize`: composites 2D splats into an image, front to back."""
 
+from __future__ import annotations
+
 import functools
 from dataclasses import dataclass, replace
 from typing import Any

@@ -25,6 +25,8 @@ Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) 
 (i + 0.5, j + 0.5).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace

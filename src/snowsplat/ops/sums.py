@@ -1,5 +1,7 @@
 """`sum_of_rows`: a sum that is bit-identical in every run."""
 
+from __future__ import annotations
+
 from torch import Tensor
 
 

@@ -1,5 +1,7 @@
 """`View`: the camera of an image, and how Gaussians are projected to it."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """`convert`: merge and edit scenes, and write the result in another format."""
 
+from __future__ import annotations
+
 import logging
 import math
 from collections.abc import Callable, Sequence

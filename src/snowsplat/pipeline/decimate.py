@@ -1,5 +1,7 @@
 """Fewer Gaussians: how many `convert` keeps, and what makes them look like the whole scene."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

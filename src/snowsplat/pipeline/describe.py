@@ -1,5 +1,7 @@
 """`describe`: what a file or folder contains."""
 
+from __future__ import annotations
+
 from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import Any

@@ -1,5 +1,7 @@
 """`evaluate`: PSNR, SSIM and LPIPS of a trained scene."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal

@@ -1,5 +1,7 @@
 """`make`: make a scene from photos or a video: camera poses, training, rendered test views."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import shutil

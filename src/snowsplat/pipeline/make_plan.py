@@ -18,6 +18,8 @@ training then has less time. If structure from motion takes 45% longer than pred
 the time is still left for the training.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -1,5 +1,7 @@
 """`publish`: a static web site that shows a scene."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass
 from functools import partial

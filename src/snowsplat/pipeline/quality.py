@@ -1,5 +1,7 @@
 """`PRESETS`: the work of `make` at each quality."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Literal
 

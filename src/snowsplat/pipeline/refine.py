@@ -1,5 +1,7 @@
 """A scene with fewer Gaussians, trained again for a moment on its photos."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """`render_images`: renders a scene from the cameras of its photos, and copies the photos."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

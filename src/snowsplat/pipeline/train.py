@@ -1,5 +1,7 @@
 """`train` and `resume`: train a scene from a dataset and write it to an output folder."""
 
+from __future__ import annotations
+
 import logging
 import time
 from collections.abc import Mapping, Sequence

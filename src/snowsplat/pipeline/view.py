@@ -1,5 +1,7 @@
 """`view`: the files of a page that shows a scene, in levels of detail if it is large."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """`watch`: shows the newest scene of an output folder in the browser, also during training."""
 
+from __future__ import annotations
+
 from contextlib import suppress
 from pathlib import Path
 from typing import Any

@@ -13,6 +13,8 @@ it stopped; see `snowsplat.util.stages`. In version 0.1.0, the two last files we
 capture.json and capture_report.html.
 """
 
+from __future__ import annotations
+
 import errno
 import hashlib
 import json

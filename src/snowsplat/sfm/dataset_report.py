@@ -1,5 +1,7 @@
 """dataset_report.html: the result of structure from motion as one self-contained page."""
 
+from __future__ import annotations
+
 import json
 import math
 import shlex

@@ -1,5 +1,7 @@
 """The progress callback of a long job."""
 
+from __future__ import annotations
+
 from typing import Protocol
 
 

@@ -3,6 +3,8 @@
 The frame is that of `orient`: y points down.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

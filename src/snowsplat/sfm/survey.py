@@ -1,5 +1,7 @@
 """`survey`: counts the photos and the frames of videos, before they are read."""
 
+from __future__ import annotations
+
 import statistics
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Smooth paths that follow given cameras: near the training cameras, or exactly through keys."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """Closed paths around the focus of the cameras; all frames look at the focus."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

@@ -5,6 +5,8 @@ Both versions of Google's specification are written, because players read one or
 codec. https://github.com/google/spatial-media/tree/master/docs
 """
 
+from __future__ import annotations
+
 import shutil
 from pathlib import Path
 from typing import BinaryIO

@@ -1,5 +1,7 @@
 """A small closed path around one camera, which shows the depth of a scene from one photo."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 

@@ -1,5 +1,7 @@
 """The order in which a path visits cameras: the order of their names, or a short tour."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import torch

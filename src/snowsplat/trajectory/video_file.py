@@ -1,5 +1,7 @@
 """Writes images as the frames of an mp4 file: `video_writer`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction

@@ -1,5 +1,7 @@
 """Line charts as SVG for reports, with round numbers on the axes, in the colours of the page."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from html import escape

@@ -4,6 +4,8 @@ The pages are also well-formed XML. Arguments named ``html`` are markup. Any oth
 file names, must be escaped with `text`.
 """
 
+from __future__ import annotations
+
 import base64
 import io
 from collections.abc import Iterable, Sequence

@@ -1,5 +1,7 @@
 """A description of this machine, without user name or host name."""
 
+from __future__ import annotations
+
 import os
 import platform
 from pathlib import Path

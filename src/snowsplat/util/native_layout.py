@@ -7,6 +7,8 @@ fields. `Layout.hash` is a hash of the names, kinds and offsets of the fields; `
 `native/layout.h` computes the same hash.
 """
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields

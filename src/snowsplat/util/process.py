@@ -1,5 +1,7 @@
 """Settings of the process during training: one torch thread, and deferred Ctrl-C."""
 
+from __future__ import annotations
+
 import signal
 import threading
 from collections.abc import Callable, Iterator

@@ -1,5 +1,7 @@
 """The memory of this process: the present resident memory and its peak."""
 
+from __future__ import annotations
+
 import gc
 import sys
 from contextlib import suppress

@@ -1,5 +1,7 @@
 """Reading untrusted JSON and file names: limited memory, no paths outside a folder."""
 
+from __future__ import annotations
+
 import json
 import os
 import sys

@@ -5,6 +5,8 @@ can make a browser connect to this machine. A page cannot change the Host and Or
 the browser writes. So these headers reveal both attacks.
 """
 
+from __future__ import annotations
+
 import ipaddress
 import logging
 import re

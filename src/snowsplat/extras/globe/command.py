@@ -1,5 +1,7 @@
 """`snowsplat globe`: a scene in a snow globe."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -3,6 +3,8 @@
 The page does the same on the GPU (`web/splats.vert`).
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 

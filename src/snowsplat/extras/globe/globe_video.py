@@ -4,6 +4,8 @@ The glass and the base do not move, except while the globe is shaken. The scene 
 a globe with a music box. The last frame continues with the first one.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

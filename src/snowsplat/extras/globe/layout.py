@@ -3,6 +3,8 @@
 The frame is that of `snowsplat.extras.globe.dimensions`.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """`make_globe`: a scene in a snow globe, as a web page and a video."""
 
+from __future__ import annotations
+
 import time
 from dataclasses import dataclass
 from pathlib import Path

@@ -13,6 +13,8 @@ file always gives the same Gaussians. The order of additive Gaussians has no eff
 along a Z-order curve, and the levels of x and y are stored as differences modulo 2¹⁶.
 """
 
+from __future__ import annotations
+
 import lzma
 import struct
 import zlib

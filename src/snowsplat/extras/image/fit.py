@@ -5,6 +5,8 @@ image has large gradients. More are added later, where the squared error is larg
 where they are needed.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

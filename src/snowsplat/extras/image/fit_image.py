@@ -1,5 +1,7 @@
 """`fit_image`: a photo as 2D Gaussians. `decode_image`: the image in a compact file."""
 
+from __future__ import annotations
+
 import math
 import time
 from dataclasses import asdict, dataclass, field

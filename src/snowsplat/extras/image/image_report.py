@@ -1,5 +1,7 @@
 """report.html: a fitted image, its Gaussians, and the course of the fit, on one page."""
 
+from __future__ import annotations
+
 import base64
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`ImageGaussians`: 2D Gaussians whose blended colours are an image."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Literal
 

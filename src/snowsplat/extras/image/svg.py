@@ -1,5 +1,7 @@
 """The Gaussians as a picture in the format SVG: one ellipse with a radial gradient for each."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from pathlib import Path

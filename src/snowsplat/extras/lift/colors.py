@@ -1,5 +1,7 @@
 """Corrects the colours of discs, so that their image from the photo's camera is the photo."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 

@@ -7,6 +7,8 @@ Two kinds of models are supported, both given by their path:
 - a folder of the library transformers with a model for depth estimation.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

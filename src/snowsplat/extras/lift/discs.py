@@ -1,5 +1,7 @@
 """Flat Gaussians on a surface: each covers the part of the surface that its pixels see."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 

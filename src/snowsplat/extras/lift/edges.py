@@ -5,6 +5,8 @@ viewpoints. Two neighbours are linked if their depths are similar. Everything th
 neighbourhood (tangents, merging of pixels, resizing) uses linked pixels only.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import torch

@@ -1,5 +1,7 @@
 """`lift`: a photo and its depth map -> Gaussians."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

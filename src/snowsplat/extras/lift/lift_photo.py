@@ -1,5 +1,7 @@
 """`lift_photo`: one photo and its depth map become a scene in an output folder."""
 
+from __future__ import annotations
+
 import math
 import time
 from dataclasses import dataclass, field

@@ -1,5 +1,7 @@
 """The surface that a depth map describes: a point and two tangents for each pixel."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import torch

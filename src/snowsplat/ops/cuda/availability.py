@@ -1,5 +1,7 @@
 """Checks whether a GPU can be used, and if not, explains the reason and the remedy."""
 
+from __future__ import annotations
+
 import ctypes
 import functools
 import importlib

@@ -1,5 +1,7 @@
 """`Kernel`: the data needed to launch a kernel."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Protocol
 

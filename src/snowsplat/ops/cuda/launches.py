@@ -8,6 +8,8 @@ SEQUENCES  name → a function `(run, suffix, params) -> int` that runs several 
            "" or "_f64": the suffix of the kernels that exist in both variants.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """`neighbours` on a GPU."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """`photometric_loss` and `ssim` on a GPU."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

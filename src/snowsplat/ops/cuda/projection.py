@@ -1,5 +1,7 @@
 """`project` and the statistics of its splats on a GPU."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

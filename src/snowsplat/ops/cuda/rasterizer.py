@@ -1,5 +1,7 @@
 """Rasterization on a GPU."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import torch

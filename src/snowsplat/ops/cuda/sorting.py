@@ -4,6 +4,8 @@ If the number of pairs is known only on the GPU, `sort_pairs` takes an upper bou
 the actual number. These functions do not wait for the GPU.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """`plane_sweep` on a GPU."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from snowsplat.ops.cuda.kernels import Kernel, Run

@@ -6,6 +6,8 @@ gives the splats of each tile, nearest first. The CPU does not wait for the GPU,
 of instances is requested.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """The protocols of the usual benchmark suites, and the figures published for them."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,5 +1,7 @@
 """Levels of detail: when a scene is shown with them, and writing them with progress."""
 
+from __future__ import annotations
+
 import time
 from pathlib import Path
 

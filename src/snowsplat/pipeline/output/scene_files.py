@@ -3,6 +3,8 @@
 Importing this module registers the HTML page as a format. It does not import torch.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from snowsplat.formats import (

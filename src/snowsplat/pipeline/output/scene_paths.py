@@ -3,6 +3,8 @@
 `snowsplat info` uses this module, so it does not import torch.
 """
 
+from __future__ import annotations
+
 import filecmp
 from pathlib import Path
 

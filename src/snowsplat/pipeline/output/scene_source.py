@@ -1,5 +1,7 @@
 """Loads a scene and its cameras from the output folder of a training run, or from a file."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Checks of a dataset before a training: impossible cameras, and damaged photos."""
 
+from __future__ import annotations
+
 import logging
 import os
 from collections.abc import Sequence

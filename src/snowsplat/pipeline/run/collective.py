@@ -4,6 +4,8 @@ Process 0 calls the methods. Before each operation, it tells the other processes
 `follow`, to do the same. A single process has nobody to tell.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Options that several subcommands have, as fields of their options."""
 
+from __future__ import annotations
+
 import math
 
 from snowsplat.training.settings.declare import setting

@@ -1,5 +1,7 @@
 """Stamps of the photos and masks of a training, by which `resume` notices that they were edited."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 from collections.abc import Mapping

@@ -4,6 +4,8 @@ OUT/refined/sparse/0 has the cameras of all photos, at their full size, and the 
 dataset. `load_dataset_of` uses it, and so can other programs and further training runs.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path

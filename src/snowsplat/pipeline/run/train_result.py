@@ -1,5 +1,7 @@
 """How a training run ends: `TrainResult` or, after Ctrl-C, `TrainingStopped`."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

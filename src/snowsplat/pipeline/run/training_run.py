@@ -1,5 +1,7 @@
 """`TrainingRun`: runs the steps of one training run and writes its files."""
 
+from __future__ import annotations
+
 import time
 import warnings
 from dataclasses import asdict, dataclass, replace

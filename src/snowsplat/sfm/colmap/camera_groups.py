@@ -13,6 +13,8 @@ does not determine the focal length of each photo. Whether the groups are right 
 model that is estimated with them (`better`).
 """
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Mapping, Sequence
 

@@ -7,6 +7,8 @@ run for hours. Therefore it reads the model in a child process, which has a time
 of BYTES of additional memory.
 """
 
+from __future__ import annotations
+
 import subprocess
 import sys
 from pathlib import Path

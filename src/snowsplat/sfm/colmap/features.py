@@ -1,5 +1,7 @@
 """Detects features in the photos and writes them into the COLMAP database."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -4,6 +4,8 @@ The child process of COLMAP does not import torch, so it cannot use `snowsplat.o
 exist for the CPU only; `native/params.h` documents their parameters.
 """
 
+from __future__ import annotations
+
 import ctypes
 import functools
 from collections.abc import Callable

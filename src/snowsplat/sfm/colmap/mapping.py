@@ -1,5 +1,7 @@
 """Estimates camera poses and points from matches, and removes unreliable poses and points."""
 
+from __future__ import annotations
+
 import copy
 import shutil
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,5 +1,7 @@
 """Matches the features of pairs of photos, and verifies the matches, in the COLMAP database."""
 
+from __future__ import annotations
+
 import functools
 import os
 from collections.abc import Iterator, Sequence

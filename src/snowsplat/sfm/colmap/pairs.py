@@ -13,6 +13,8 @@
 If several rules apply, all of them are used, so that all photos are connected by pairs.
 """
 
+from __future__ import annotations
+
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -4,6 +4,8 @@ Towards the poles, a panorama is stretched more and more, so features are detect
 of it. Their positions and shapes are those in the panorama.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import cv2

@@ -6,6 +6,8 @@ correlation", 1985), with the inverse compositional algorithm of Baker and Matth
 20 years on: a unifying framework", IJCV 2004).
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import cv2

@@ -26,6 +26,8 @@ matches, the second and third attempts are made, too. The result is the possible
 with the most registered photos, weighted by its agreement with the matches.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import shutil
 import time

@@ -1,5 +1,7 @@
 """Makes a model again, without false matches, if photos of it are in a wrong place."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,5 +1,7 @@
 """Computes the `SfmResult` from COLMAP models: which photos have a pose, and how good they are."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -7,6 +7,8 @@ dataset, so no vocabulary has to be downloaded. All sums have a fixed order, so 
 only on the features.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,6 +4,8 @@ OpenCV is three to five times as fast as COLMAP's own detection on the CPU: it u
 instructions of the processor, and computes descriptors only of features that are kept.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,5 +1,7 @@
 """Chooses the photos from which a model is made first: a subset that is spread over the scene."""
 
+from __future__ import annotations
+
 import itertools
 from typing import Any
 

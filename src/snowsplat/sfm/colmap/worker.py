@@ -10,6 +10,8 @@ Ctrl-C, which the parent handles. The output of COLMAP goes to stderr, which the
 a log file.
 """
 
+from __future__ import annotations
+
 import faulthandler
 import json
 import os

@@ -1,5 +1,7 @@
 """The up direction from the ground, a floor or a table: the largest plane below the cameras."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

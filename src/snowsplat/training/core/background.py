@@ -1,5 +1,7 @@
 """`Background`: the colour behind the scene in each step."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 

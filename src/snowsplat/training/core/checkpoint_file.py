@@ -4,6 +4,8 @@ The header contains the CRC-32, the dtype and the shape of each array, and the C
 itself. `read` verifies all of them.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import re

@@ -4,6 +4,8 @@
 updates the parameters in the same pass. `Adam` stores the state between steps.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 

@@ -1,5 +1,7 @@
 """`Progress`: what a training reports after each step."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from snowsplat.evaluation.metrics import Evaluation

@@ -1,5 +1,7 @@
 """`Trainer`: Algorithm 1 of the paper. It creates `Gaussians` from a `Dataset`."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,5 +1,7 @@
 """`ViewQueue`: the training views in random order, with their photos, which are decoded ahead."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 
 import torch

@@ -7,6 +7,8 @@ of `TrainConfig`; those of the package are in `snowsplat.training.settings.densi
 control of the paper, and `McmcDensity` is that of Kheradmand et al. 2024.
 """
 
+from __future__ import annotations
+
 from typing import Protocol
 
 from torch import Tensor

@@ -1,5 +1,7 @@
 """What moves in the photos: the masks that the training found."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The best and the worst views: photo, rendering, and error."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,6 +5,8 @@ of the variance that the rendering explains decides; see `ViewMetrics.explained`
 with training photos tells why: if those look right, the scene lacks photos, not steps.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -9,6 +9,8 @@
 the same fields. This module imports nothing slow: neither torch nor numpy.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields

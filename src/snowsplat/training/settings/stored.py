@@ -1,5 +1,7 @@
 """A `TrainConfig` as JSON values, for checkpoints and `config.json`."""
 
+from __future__ import annotations
+
 import logging
 from dataclasses import asdict, fields
 from typing import Any

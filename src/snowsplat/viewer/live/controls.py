@@ -1,5 +1,7 @@
 """The controls of the page: training controls for all browsers, and controls of each browser."""
 
+from __future__ import annotations
+
 import asyncio
 import dataclasses
 import html

@@ -1,5 +1,7 @@
 """The curves of a training run in the viewer: loss of all steps, PSNR of a few views."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections import deque

@@ -1,5 +1,7 @@
 """Key cameras: views that a user stores on the page, to render a video along them."""
 
+from __future__ import annotations
+
 import json
 import math
 import time

@@ -1,5 +1,7 @@
 """Colour maps: (256, 3) uint8 tables."""
 
+from __future__ import annotations
+
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,5 +1,7 @@
 """The cameras of the photos: frustums in the scene, and views to which a browser can go."""
 
+from __future__ import annotations
+
 import asyncio
 import dataclasses
 import functools

@@ -1,5 +1,7 @@
 """`draw`: renders an image of Gaussians in one of the display modes."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 from dataclasses import dataclass

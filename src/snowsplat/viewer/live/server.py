@@ -1,5 +1,7 @@
 """Starts viser's server on a free port, without console output and with the checks of `Guard`."""
 
+from __future__ import annotations
+
 import contextlib
 import errno
 import io

@@ -3,6 +3,8 @@
 viser also lists the keys in its command palette (Ctrl-K).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,5 +1,7 @@
 """`TrainingViewer`: updates the page between two training steps."""
 
+from __future__ import annotations
+
 import math
 import time
 

@@ -1,5 +1,7 @@
 """`NetworkViewer`: a page for any number of browsers, and the images that they request."""
 
+from __future__ import annotations
+
 import asyncio
 import functools
 import logging

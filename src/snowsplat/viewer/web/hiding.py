@@ -5,6 +5,8 @@ surfaces. `hiding.js` hides Gaussians by distance and by size while they are cop
 drawing; the scene itself is not changed.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -4,6 +4,8 @@ It can be opened from disk in any browser with WebGL 2, and makes no network req
 embedded as a compressed PLY file in base64. Pages are written, but cannot be read.
 """
 
+from __future__ import annotations
+
 import base64
 from pathlib import Path
 

@@ -5,6 +5,8 @@ Its script also fits what a view must show into the window, and frames the subje
 scripts are `panel.css`, `hiding.js` and `panel.js`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date

@@ -1,5 +1,7 @@
 """A static web site that shows a scene: any web host can serve its folder."""
 
+from __future__ import annotations
+
 import html
 import io
 from collections.abc import Callable, Mapping, Sequence

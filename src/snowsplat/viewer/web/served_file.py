@@ -1,5 +1,7 @@
 """The files of a `StaticServer`: in memory or on disk."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field

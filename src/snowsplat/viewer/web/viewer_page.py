@@ -5,6 +5,8 @@ initial view are inserted at the places that it provides, and the panel (panel.p
 where the page creates the viewer.
 """
 
+from __future__ import annotations
+
 import base64
 import hashlib
 import html
