@@ -6,8 +6,6 @@ them: position, rotation (xyzw) and scale, in the frame of a PLY turned by 180°
 Other zip files, such as USDZ, are named in the error message.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import struct
@@ -159,11 +157,7 @@ def _differs(value: object, neutral: object) -> bool:
 
 
 def _place(scene: GaussianArrays, settings: dict[str, Any]) -> GaussianArrays:
-    """The splats in the frame of a PLY.
-
-    Raises:
-        Damaged: the settings are no similarity.
-    """
+    """The splats in the frame of a PLY. Raises: Damaged: the settings are no similarity."""
     if "position" not in settings:
         return scene
     import torch

@@ -6,8 +6,6 @@ the tensors into memory. The parameters are those of a PLY: logarithms of scales
 logits of opacities, SH coefficients by order.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from pathlib import Path
@@ -77,11 +75,7 @@ def _load(path: Path) -> Any:
 
 
 def _splats(path: Path, content: Any) -> dict[Any, Any]:
-    """The tensors by name.
-
-    Raises:
-        UserError: another kind of checkpoint.
-    """
+    """The tensors by name. Raises: UserError: another kind of checkpoint."""
     splats = content.get("splats", content) if isinstance(content, dict) else None
     if isinstance(splats, dict) and all(name in splats for name in _NAMES[:4]):
         if "sh0" in splats:

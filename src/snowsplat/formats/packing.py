@@ -29,11 +29,7 @@ _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no loga
 
 
 def read_file(path: Path) -> bytes:
-    """The content of the file.
-
-    Raises:
-        UserError: the file cannot be read.
-    """
+    """The content of the file. Raises: UserError: the file cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
