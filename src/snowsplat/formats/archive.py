@@ -6,6 +6,8 @@ them: position, rotation (xyzw) and scale, in the frame of a PLY turned by 180°
 Other zip files, such as USDZ, are named in the error message.
 """
 
+from __future__ import annotations
+
 import logging
 import re
 import struct

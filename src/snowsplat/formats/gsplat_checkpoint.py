@@ -6,6 +6,8 @@ the tensors into memory. The parameters are those of a PLY: logarithms of scales
 logits of opacities, SH coefficients by order.
 """
 
+from __future__ import annotations
+
 import logging
 import re
 from pathlib import Path

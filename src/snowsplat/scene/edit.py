@@ -1,5 +1,7 @@
 """Editing a scene: transform, crop, merge. The input Gaussians are not modified."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import replace

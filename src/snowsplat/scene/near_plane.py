@@ -8,6 +8,8 @@ usual distance. Thus usual scenes have the near plane of the paper, and a scene 
 power of two has the same images.
 """
 
+from __future__ import annotations
+
 import math
 
 #: The near plane of the implementation of the paper, in world units.

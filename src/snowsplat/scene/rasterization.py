@@ -1,5 +1,7 @@
 """`rasterization`: the call of gsplat, on a CPU as well as on a GPU."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -5,6 +5,8 @@ Sums of these weights are gradients: Σ w(p) g(p) is the gradient of Σ c(p) g(p
 image c and any weights g of the pixels p, with respect to the colour of the Gaussian.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 
