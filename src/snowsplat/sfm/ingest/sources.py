@@ -69,6 +69,7 @@ class Sources:
         left_out: path and reason of each photo, video or folder that is not used.
         unused_masks: masks without a photo.
         notes: lines for the user.
+        posed: the folder with camera poses, if it is the only input.
     """
 
     inputs: tuple[Path, ...]
@@ -76,6 +77,7 @@ class Sources:
     left_out: list[tuple[str, str]]
     unused_masks: list[Path]
     notes: list[str] = field(default_factory=list)
+    posed: Path | None = None
 
     @property
     def photos(self) -> list[Source]:
@@ -116,6 +118,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     left_out: list[tuple[str, str]] = []
     unused: list[Path] = []
     notes: list[str] = []
+    posed: Path | None = None
     seen: dict[Path, Path] = {}
     folders = {"masks"}  # names in use
 
@@ -141,9 +144,10 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
                 add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
             continue
         if (poses := poses_in(path)) is not None:
+            posed = path if len(inputs) == 1 else None
             notes.append(
-                f"{shown(path)}: has camera poses already ({poses}); to use them: snowsplat train "
-                f"{shown(path)} -o OUT --eval; here, poses are estimated again"
+                f"{shown(path)}: has camera poses already ({poses}), which are estimated again; to "
+                f"use them: snowsplat make {shown(path)}"
             )
         elif (export := find_export(path)) is not None and export.photos is not None:
             notes.append(
@@ -166,7 +170,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
             add(Source(photo_folder / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
-    return Sources(tuple(inputs), files, left_out, unused, notes)
+    return Sources(tuple(inputs), files, left_out, unused, notes, posed)
 
 
 @dataclass
