@@ -35,6 +35,8 @@ _FOLD = 0.05
 _LARGEST = 2.0
 # Share of the field that views must cover.
 _COVERED = 0.995
+# Pixels: the error of positions from `strips`. The pole of a panorama is exactly at its border.
+_POSITION_ERROR = 0.05
 # Nodes are kept for so many views: 0.1 to 5 MB each.
 _KEPT = 24
 
@@ -101,8 +103,11 @@ class LensView:
         """(H, W) bool: whether positions from `strips` are in the photo and in its circle."""
         if not self.partial:
             return np.ones(position.shape[:2], bool)
+        size = self.lens.width, self.lens.height
+        inside = ((position >= -_POSITION_ERROR) & (position <= np.add(size, _POSITION_ERROR))).all(
+            -1
+        )
         x, y = position[..., 0], position[..., 1]
-        inside = (x >= 0) & (x <= self.lens.width) & (y >= 0) & (y <= self.lens.height)
         if self.circle is not None:
             _, _, cx, cy, _ = intrinsics(self.lens)
             inside &= (x - cx) ** 2 + (y - cy) ** 2 <= self.circle**2
