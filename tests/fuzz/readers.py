@@ -516,7 +516,7 @@ def _video(name: str, file: str, **options: Any) -> Reader:
 
     def read(folder: Path) -> Any:
         path = folder / file
-        clip.is_video(path)
+        clip.why_no_video(path)
         found = clip.read_clip(path)
         return video_frames.extract_frames(found, folder, 4, 640, silent)
 

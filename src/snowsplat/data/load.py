@@ -243,18 +243,16 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     )
 
 
-def poses_in(root: Path) -> str | None:
-    """What gives the poses of the photos in a folder: "sparse/0" or "transforms.json"; or None."""
+def poses_in(root: Path) -> Path | None:
+    """What gives the poses of the photos in a folder, relative to it, as sparse/0; or None."""
     try:
         poses = _find_poses(root, "images") if root.is_dir() else None
     except UserError:  # several datasets
         return None
     if poses is None:
         return None
-    program = f"{poses.export.kind.name}, " if poses.export else ""
-    file = poses.export.cameras if poses.export else [*poses.models, *poses.transforms][0]
-    assert file is not None
-    return program + file.relative_to(root).as_posix()
+    cameras = poses.export and poses.export.cameras
+    return (cameras or [*poses.models, *poses.transforms][0]).relative_to(root)
 
 
 def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:

@@ -39,6 +39,8 @@ VIDEO_SUFFIXES = _suffixes(
 )
 #: The record of the stages of a dataset, and its name in version 0.1.0.
 RECORDS = ("sfm.json", "capture.json")
+# Folders in a dataset in which programs keep models of all its images.
+_MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
 _LONGEST_NAME = 200  # bytes of a name in input/
 _KEPT_END = 12  # characters at the end of a longer name
 # The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
@@ -146,8 +148,8 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         if (poses := poses_in(path)) is not None:
             posed = path if len(inputs) == 1 else None
             notes.append(
-                f"{shown(path)}: has camera poses already ({poses}), which are estimated again; to "
-                f"use them: snowsplat make {shown(path)}"
+                f"{shown(path)}: has camera poses already ({shown(poses)}), which are estimated "
+                f"again; to use them: snowsplat make {shown(path)}"
             )
         elif (export := find_export(path)) is not None and export.photos is not None:
             notes.append(
@@ -269,7 +271,10 @@ def _photos_of_dataset(root: Path) -> Path:
     export = find_export(root)
     if export is not None and export.photos is not None:
         return export.photos
-    if not (poses_in(root) or is_output(root)):
+    poses = poses_in(root)
+    # A model deeper in the folder may be that of a few of the photos.
+    near = poses is not None and (len(poses.parts) == 1 or poses.parts[0] in _MODEL_FOLDERS)
+    if not (near or is_output(root)):
         return root
     for name in ("input", "images"):
         if (root / name).is_dir():
