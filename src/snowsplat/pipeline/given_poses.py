@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from snowsplat.data import Dataset, View
 from snowsplat.data.files.matching import match_names
@@ -36,8 +38,12 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     if reason:
         observer.note(f"{name}: its camera poses are not used, but estimated again: {reason}")
         return None
-    again = f"to estimate them again: snowsplat make {name}/images"
-    observer.note(f"{name}: its camera poses are used ({dataset.description}); {again}")
+    line = f"{name}: its camera poses are used ({dataset.description})"
+    folders = [str(photo.path.parent) for photo in sources.photos]
+    photos = os.path.commonpath(folders or [settings.path])
+    if Path(photos) != Path(settings.path):  # there are no poses in this folder
+        line += f"; to estimate them again: snowsplat make {shown(photos)}"
+    observer.note(line)
     if without:
         observer.note(
             f"{name}: {len(without)} of {len(sources.photos)} photos have no pose and are not used "

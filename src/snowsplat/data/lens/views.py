@@ -103,11 +103,9 @@ class LensView:
         """(H, W) bool: whether positions from `strips` are in the photo and in its circle."""
         if not self.partial:
             return np.ones(position.shape[:2], bool)
-        size = self.lens.width, self.lens.height
-        inside = ((position >= -_POSITION_ERROR) & (position <= np.add(size, _POSITION_ERROR))).all(
-            -1
-        )
         x, y = position[..., 0], position[..., 1]
+        least, right, bottom = -_POSITION_ERROR, self.lens.width, self.lens.height
+        inside = (x >= least) & (x <= right - least) & (y >= least) & (y <= bottom - least)
         if self.circle is not None:
             _, _, cx, cy, _ = intrinsics(self.lens)
             inside &= (x - cx) ** 2 + (y - cy) ** 2 <= self.circle**2
