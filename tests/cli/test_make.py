@@ -132,6 +132,30 @@ def test_a_folder_of_version_0_1_is_continued(run, photos, tmp_path, monkeypatch
     assert not (out / "dataset").exists()
 
 
+def test_a_dataset_is_trained_with_its_poses(run, refused, dataset, tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=10))
+    root, out = shutil.copytree(dataset, tmp_path / "scan"), tmp_path / "out"
+    command = ("make", root, "-o", out, "--quality", "draft", "--threads", 1)
+    result = run(*command)
+    assert result.code == 0, result.err
+    assert "its camera poses are used" in result.out
+    assert f"those of {root} are used" in result.out
+    assert not (out / "dataset").exists()
+    assert (out / "scan.ply").is_file()
+    assert files(root) == files(dataset)
+
+    again = run(*command)
+    assert again.code == 0, again.err
+    assert again.out.count("done before") == 2
+
+    assert "--overwrite" in refused("make", dataset / "images", "-o", out)
+    points = root / "sparse/0/points3D.bin"
+    points.unlink()
+    again = run(*command)
+    assert again.code == 0, again.err
+    assert "scene: repeated" in again.out
+
+
 @pytest.fixture
 def killed(photos, tmp_path) -> Callable[..., str]:
     """Run the command as a process, kill it when a condition holds; returns its output."""

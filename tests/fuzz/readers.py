@@ -11,6 +11,7 @@ import functools
 import gzip
 import io
 import json
+import shutil
 import struct
 import tempfile
 import zipfile
@@ -27,8 +28,11 @@ from PIL import Image
 from pillow_heif import register_heif_opener
 
 from snowsplat.data import load_dataset
+from snowsplat.data.colour_profile import to_srgb
 from snowsplat.data.decode import ImageSource, load_image, load_mask
 from snowsplat.data.decode import read_header as read_image_header
+from snowsplat.data.files.mask_look import doubt_about_files
+from snowsplat.data.files.mask_pixels import looks_like_mask
 from snowsplat.data.imports import find_export, read_export
 from snowsplat.data.points_ply import read_points, write_points
 from snowsplat.evaluation.lpips import Lpips
@@ -42,7 +46,7 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.sfm import dataset_folder
-from snowsplat.sfm.ingest import clip, mask_files, photo_files, video_frames
+from snowsplat.sfm.ingest import archive, clip, mask_files, photo_files, video_frames
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent
@@ -53,6 +57,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 
+from ..data import colour_profiles
 from ..data.imports import exports
 from ..formats.test_ksplat import ksplat, section
 from ..sfm.pictures import exif, pan, photo, write_video
@@ -434,14 +439,63 @@ def _read_photo(path: Path) -> Any:
         raise UserError(str(error)) from None
 
 
-def _read_mask(folder: Path) -> Any:
-    header = photo_files.read_header(folder / "photo.jpg")
-    return mask_files.read_mask(folder / "a.png", header, header.size(None))
+#: Mode of a mask -> suffix of its file.
+MASKS = {"L": "png", "1": "png", "P": "png", "RGBA": "png", "I;16": "png", "RGB": "jpg"}
+MASKS |= {"F": "tif", "LA": "webp"}
 
 
-def _make_mask(folder: Path) -> None:
-    photo(width=80, height=60).save(folder / "photo.jpg")
-    Image.effect_noise((80, 60), 90).save(folder / "a.png")
+def _mask(mode: str, ending: str) -> Reader:
+    file = f"a.{ending}"
+
+    def make(folder: Path) -> None:
+        photo(width=80, height=60).save(folder / "photo.jpg")
+        Image.effect_noise((80, 60), 90).convert(mode).save(folder / file)
+
+    def read(folder: Path) -> Any:
+        looks_like_mask(folder / file)
+        doubt_about_files([folder / file])
+        header = photo_files.read_header(folder / "photo.jpg")
+        return mask_files.read_mask(folder / file, header, header.size(None))
+
+    pack = _png_with_checksums if ending == "png" else None
+    return Reader(f"mask {mode} {ending}", file, make, read, pack=pack, extra=_image_memory)
+
+
+def _profile(mode: str, profile: Callable[[], bytes]) -> Reader:
+    """A photo of this mode with a damaged ICC profile."""
+
+    def pack(data: bytes) -> bytes:
+        packed = io.BytesIO()
+        Image.effect_noise((16, 12), 90).convert(mode).save(packed, "TIFF", icc_profile=data)
+        return packed.getvalue()
+
+    def read(folder: Path) -> Any:
+        with Image.open(folder / "a.tif") as image:
+            return np.asarray(to_srgb(image, folder / "a.tif"))
+
+    def make(folder: Path) -> None:
+        (folder / "a.tif").write_bytes(profile())
+
+    return Reader(f"colour profile {mode}", "a.tif", make, read, pack=pack)
+
+
+def _photos_in_zip(folder: Path) -> None:
+    with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("scan/a.txt", "some text " * 9)
+        for name in ("scan/1.jpg", "scan/äöü/2.jpg", "__MACOSX/._1.jpg"):
+            picture = io.BytesIO()
+            photo(width=16, height=12).save(picture, "JPEG")
+            packed.writestr(name, picture.getvalue())
+
+
+def _read_photos_in_zip(folder: Path) -> int:
+    archive.files_in(folder / "a.zip")
+    unpacked = archive.unpack(folder / "a.zip")
+    try:
+        assert {path.name for path in folder.iterdir()} == {"a.zip", unpacked.name}
+        return sum(path.stat().st_size for path in unpacked.rglob("*"))
+    finally:
+        shutil.rmtree(unpacked)
 
 
 # Videos
@@ -462,7 +516,7 @@ def _video(name: str, file: str, **options: Any) -> Reader:
 
     def read(folder: Path) -> Any:
         path = folder / file
-        clip.is_video(path)
+        clip.why_no_video(path)
         found = clip.read_clip(path)
         return video_frames.extract_frames(found, folder, 4, 640, silent)
 
@@ -630,7 +684,11 @@ READERS: tuple[Reader, ...] = (
     ),
     *(_image(kind, ending, "image", _read_image) for kind, ending in IMAGES.items()),
     *(_image(kind, end, "photo", _read_photo) for kind, end in (IMAGES | {"heic": "heic"}).items()),
-    Reader("mask", "a.png", _make_mask, _read_mask, pack=_png_with_checksums, extra=_image_memory),
+    *(_mask(mode, ending) for mode, ending in MASKS.items()),
+    _profile("RGB", lambda: colour_profiles.colour_profile(colour_profiles.PROPHOTO, 1.8)),
+    _profile("L", lambda: colour_profiles.grey_profile(1.8)),
+    _profile("CMYK", lambda: colour_profiles.cmyk_profile(0.1)),
+    Reader("photos in a zip file", "a.zip", _photos_in_zip, _read_photos_in_zip),
     _video("mp4", "a.mp4"),
     _video("mkv", "a.mkv"),
     _video("avi", "a.avi", codec="mjpeg"),

@@ -32,7 +32,7 @@ from snowsplat.sfm import dataset_folder
 from snowsplat.sfm.colmap import check_model
 from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest import photo_files
-from snowsplat.sfm.ingest.clip import is_video, read_clip
+from snowsplat.sfm.ingest.clip import read_clip, why_no_video
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint, checkpoint_file
 from snowsplat.training.core.history import History
@@ -465,8 +465,8 @@ def test_a_model_for_which_colmap_would_allocate_all_memory(tmp_path, monkeypatc
 def test_a_video_that_is_a_playlist(tmp_path, text):
     write_video(tmp_path / "secret.mp4", pan(4))
     (tmp_path / "a.mp4").write_text(text)
-    assert is_video(tmp_path / "secret.mp4")
-    assert not is_video(tmp_path / "a.mp4")
+    assert why_no_video(tmp_path / "secret.mp4") is None
+    assert why_no_video(tmp_path / "a.mp4") is not None
     with pytest.raises(UserError, match="can be decoded"):
         read_clip(tmp_path / "a.mp4")
 
@@ -475,7 +475,7 @@ def test_a_video_whose_name_looks_like_a_url(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_video(tmp_path / "secret.mp4", pan(4))
     (tmp_path / "concat:secret.mp4").write_text("nothing")
-    assert not is_video(Path("concat:secret.mp4"))
+    assert why_no_video(Path("concat:secret.mp4")) is not None
 
 
 def test_a_video_with_huge_frames(tmp_path, rejected):
@@ -495,13 +495,13 @@ def test_a_video_with_huge_frames(tmp_path, rejected):
 def test_a_video_with_too_many_frames(tmp_path, rejected, count):
     """All frames have the same size, so the file does not list their sizes."""
     path = write_video(tmp_path / "a.mp4", pan(4))
-    assert is_video(path)
+    assert why_no_video(path) is None
     data = bytearray(path.read_bytes())
     struct.pack_into(">II", data, data.find(b"stsz") + 8, 1, count)
     struct.pack_into(">I", data, data.find(b"stsc") + 16, count)  # all frames in one chunk
     path.write_bytes(data)
     assert "declares more frames" in rejected(lambda: read_clip(path))
-    assert not guarded(lambda: is_video(path), tmp_path, path.stat().st_size)
+    assert guarded(lambda: why_no_video(path), tmp_path, path.stat().st_size)
 
 
 # Records

@@ -53,7 +53,8 @@ class Make:
     """
 
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
-    """One or more photos (JPEG, PNG, WebP, TIFF, HEIC), folders of photos, or videos."""
+    """One or more photos (JPEG, PNG, WebP, TIFF, HEIC), folders of photos, or videos. The camera
+    poses of a dataset are used, if its folder is the only input and they are plausible."""
     output: Annotated[Path | None, flag("OUT", "-o", default="./INPUT_scene")] = None
     """Output folder. It is created if it does not exist."""
     quality: Annotated[
@@ -148,9 +149,10 @@ def print_summary(made: MakeResult) -> None:
     figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
     if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
         figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
+    poses = made.dataset_report or f"those of {made.dataset} are used"
     print(
         f"\nThe scene, for any viewer:  {made.scene}\n"
-        f"Report on camera poses:     {made.dataset_report}\n"
+        f"{'Report on camera poses:' if made.dataset_report else 'Camera poses:':27} {poses}\n"
         f"Report on the training:     {made.folder.report}\n"
         f"Rendered test views:        {made.renders}\n"
         f" and held-out photos:       {made.photos}\n"

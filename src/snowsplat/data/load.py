@@ -15,7 +15,7 @@ from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_exte
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.files.photos import photos_below
-from snowsplat.data.imports import find_export, read_export
+from snowsplat.data.imports import Export, find_export, read_export
 from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.model import LensModel
@@ -188,20 +188,40 @@ def read_files(
     )
 
 
-def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str]:
-    if not root.exists():
-        raise UserError(f"{root}: no such folder")
+@dataclass(frozen=True)
+class _Poses:
+    """What gives the poses of a dataset: COLMAP models, the largest first; transforms files; or an
+    export. Only one of them is used."""
+
+    models: list[Path]
+    transforms: list[Path]
+    export: Export | None
+
+
+def _find_poses(root: Path, images: str) -> _Poses | None:
+    """What gives the poses of the images in a folder, or of a file; None if there is nothing."""
     export = find_export(root) if root.is_file() else None
     transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse") or ([] if transforms else find_models(root))
     models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
     if not transforms and not (models and (root / images).is_dir()):  # dense/0/sparse, sfm …
         models = find_models_below(root, images) or models
-    if transforms and not models:
-        return read_transforms(transforms, images)
+    if models:
+        return _Poses(models, [], None)
+    if transforms:
+        return _Poses([], transforms, None)
     export = export or find_export(root)
-    if export and export.cameras and not models:
-        return read_export(root, export, images)
+    return _Poses([], [], export) if export and export.cameras else None
+
+
+def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str]:
+    if not root.exists():
+        raise UserError(f"{root}: no such folder")
+    poses = _find_poses(root, images)
+    if poses and poses.transforms:
+        return read_transforms(poses.transforms, images)
+    if poses and poses.export:
+        return read_export(root, poses.export, images)
     if root.suffix.lower() == ".zip" and root.is_file():
         raise UserError(
             f"{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
@@ -209,12 +229,12 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         )
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
-    if not models or not ((root / images).is_dir() or photos_below(root)):
+    if not poses or not ((root / images).is_dir() or photos_below(root)):
         above = next((p for p in root.absolute().parents[:2] if poses_in(p)), None)
         if above is not None:
             raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
-    if models:
-        return read_colmap(root, models, images)
+    if poses:
+        return read_colmap(root, poses.models, images)
     if (known := advice(root)) is not None:
         raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
     raise NoPosesError(
@@ -223,13 +243,16 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     )
 
 
-def poses_in(root: Path) -> str | None:
-    """What gives the poses of the photos in a folder: "sparse/0" or "transforms.json"; or None."""
-    models = find_models(root / "sparse")
-    files = models[:1] or find_transforms(root)
-    if not files and (export := find_export(root)) and export.cameras:
-        return f"{export.kind.name}, {export.cameras.relative_to(root).as_posix()}"
-    return files[0].relative_to(root).as_posix() if files and root.is_dir() else None
+def poses_in(root: Path) -> Path | None:
+    """What gives the poses of the photos in a folder, relative to it, as sparse/0; or None."""
+    try:
+        poses = _find_poses(root, "images") if root.is_dir() else None
+    except UserError:  # several datasets
+        return None
+    if poses is None:
+        return None
+    cameras = poses.export and poses.export.cameras
+    return (cameras or [*poses.models, *poses.transforms][0]).relative_to(root)
 
 
 def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:

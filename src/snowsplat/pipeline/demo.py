@@ -58,7 +58,7 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
     truth = _take_photos(out / PHOTOS, observer)
     truth.write(out / TRUTH)
     made = make(out / PHOTOS, out / MADE, _OPTIONS, observer=observer)
-    dataset = made.dataset_report.parent
+    dataset = made.dataset
     # On a slow machine, `make` uses only some of the photos, to finish in time.
     used = {path.name for path in (dataset / "input").iterdir()}
     poses = {name: pose for name, pose in truth.poses.items() if name in used}

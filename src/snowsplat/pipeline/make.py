@@ -1,4 +1,7 @@
-"""`make`: make a scene from photos or a video: camera poses, training, rendered test views."""
+"""`make`: make a scene from photos or a video: camera poses, training, rendered test views.
+
+If the input is a dataset, its camera poses are used, unless they are impossible.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,16 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from snowsplat import ops
+from snowsplat.data import Dataset
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import (
@@ -29,6 +34,7 @@ from snowsplat.pipeline.quality import PRESETS, Preset, Quality
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.live_page import LivePage
+from snowsplat.pipeline.run.photo_stamps import stamps_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.sfm.colmap import SfmOptions
 from snowsplat.sfm.cost import measure_speed
@@ -106,7 +112,8 @@ class MakeResult:
     Attributes:
         scene: the PLY file.
         folder: the output folder of the training.
-        dataset_report: the HTML page about the camera poses.
+        dataset: the folder of the dataset that the scene is trained from.
+        dataset_report: the HTML page about the camera poses; None if the input has poses.
         renders, photos: folders with the rendered test views and the held-out photos.
         psnr, ssim, psnr_aligned: means over the held-out photos; PSNR in dB. If gains of exposure
             are learnt, the colour-aligned PSNR tells the quality.
@@ -119,7 +126,8 @@ class MakeResult:
 
     scene: Path
     folder: OutputFolder
-    dataset_report: Path
+    dataset: Path
+    dataset_report: Path | None
     renders: Path
     photos: Path
     psnr: float
@@ -158,10 +166,11 @@ def make(
     A stage is repeated if its photos or settings have changed.
 
     Args:
-        inputs: one or more photos, folders of photos, or videos.
+        inputs: one or more photos, folders of photos, or videos; or the folder of a dataset, whose
+            poses are used if `given_poses` finds them plausible.
         output: the output folder; default: NAME_scene in the current folder, where NAME is the name
-            of the first input without its suffix. It contains dataset/, scene/ (the
-            output folder of the training) and NAME.ply (the scene).
+            of the first input without its suffix. It contains dataset/ (unless the input is
+            a dataset), scene/ (the output folder of the training) and NAME.ply (the scene).
         overwrite: replace an existing scene in ``output`` that was made from other photos.
         page: shows the training in the browser.
 
@@ -211,11 +220,35 @@ class _Job:
         self.sources = find_sources(self.inputs)
         self.stages = Stages(self.out / RECORD, STAGES)
         with self._removed_if_alone():
+            self._check_inputs()
+            self.given = self._given()
             self.plan = self._plan()
             self.stages.save()  # from now on, the folder is recognised as an output of `make`
-            self._make_dataset()
-            with one_run(self.dataset):  # no `sfm` changes the photos during the training
+            if self.given is None:
+                self._make_dataset()
+            # No `sfm` changes the photos during the training.
+            with one_run(self.dataset) if self.given is None else nullcontext():
                 return self._make_scene()
+
+    def _check_inputs(self) -> None:
+        """Raises UserError if the folder has a scene of other photos that must not be replaced."""
+        inputs = [str(path.absolute()) for path in self.inputs]
+        before = self.stages.about.get("inputs", inputs)
+        if before != inputs and not self.overwrite:
+            what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
+            raise UserError(
+                f"{self.out}: contains a scene made from {what}; use another folder, or set "
+                "`overwrite`"
+            )
+        self.stages.about["inputs"] = inputs
+
+    def _given(self) -> Dataset | None:
+        """The dataset that is the input, if its poses are used."""
+        posed = self.sources.posed
+        if posed is None:
+            return None
+        self.sources = replace(self.sources, notes=[])  # they offer the poses
+        return given_poses(self.sources, self._dataset_settings(posed), self.observer)
 
     @contextmanager
     def _removed_if_alone(self) -> Iterator[None]:
@@ -233,7 +266,7 @@ class _Job:
         plan.
         """
         quality, minutes = self.options.quality, self.options.minutes
-        if minutes is None:
+        if minutes is None or self.given is not None:
             quality = quality or "normal"
             return MakePlan(quality, PRESETS[quality].photos)
         photos = survey(self.sources)
@@ -276,8 +309,11 @@ class _Job:
         return Later(work=PRESETS[self.plan.quality].training)
 
     def _make_scene(self) -> MakeResult:
-        # The key is the name of the folder, also if version 0.1.0 has recorded it.
-        settings: dict[str, Any] = {self.dataset.name: _fingerprint(self.dataset)}
+        settings: dict[str, Any] = {}
+        if self.given is not None:
+            settings["given"] = _fingerprint_of(self.given, self.dataset)
+        else:  # The key is the name of the folder, also if version 0.1.0 has recorded it.
+            settings[self.dataset.name] = _fingerprint(self.dataset)
         if self.options.minutes is None:
             preset = PRESETS[self.plan.quality]
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
@@ -297,7 +333,8 @@ class _Job:
         return MakeResult(
             scene=self.file,
             folder=folder,
-            dataset_report=self.dataset / REPORT,
+            dataset=self.dataset,
+            dataset_report=None if self.given is not None else self.dataset / REPORT,
             renders=target / "renders",
             photos=target / "gt",
             psnr=scene["psnr"],
@@ -312,6 +349,9 @@ class _Job:
     @property
     def dataset(self) -> Path:
         """The folder of the dataset; a folder with the former name is kept."""
+        if self.given is not None:
+            assert self.sources.posed is not None
+            return self.sources.posed
         former = self.out / FORMER_DATASET
         return former if former.is_dir() else self.out / DATASET
 
@@ -377,11 +417,18 @@ class _Job:
             return replace(options, minutes=minutes, settings=settings)
         preset = PRESETS[self.plan.quality]
         settings |= {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
-        return replace(options, resolution=_width(self.dataset, preset), settings=settings)
+        dataset = self.given or self._dataset_settings(self.dataset).load()
+        return replace(options, resolution=_width(dataset, preset), settings=settings)
+
+    def _dataset_settings(self, dataset: Path) -> DatasetSettings:
+        return DatasetSettings(str(dataset), hold_out=HOLD_OUT, first_held_out=FIRST_HELD_OUT)
 
     def _minutes_left(self, given: float) -> float:
         """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""
-        photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
+        if self.given is not None:
+            photos = len(self.given.train) + len(self.given.test)
+        else:
+            photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
         left = given - self._elapsed() - _RENDER_SECONDS * -(-photos // HOLD_OUT)
         shortest = max(_MIN_SECONDS, _MIN_SHARE * given)
         if left < shortest:
@@ -397,12 +444,27 @@ class _Job:
         return {}
 
 
-def _width(dataset: Path, preset: Preset) -> int | None:
+def _width(dataset: Dataset, preset: Preset) -> int | None:
     """The width in pixels of the photos for training; None if they need not be reduced."""
-    cameras = [view.camera for view in DatasetSettings(str(dataset)).load().train]
+    cameras = [view.camera for view in [*dataset.train, *dataset.test]]
     camera = max(cameras, key=lambda camera: max(camera.width, camera.height))
     longer = max(camera.width, camera.height)
     return None if longer <= preset.side else round(camera.width * preset.side / longer)
+
+
+def _fingerprint_of(dataset: Dataset, folder: Path) -> str:
+    """A hash of the cameras and points of a dataset, and of its photos and masks."""
+    digest = hashlib.sha256()
+    for view in [*dataset.train, *dataset.test]:
+        camera = view.camera
+        intrinsics = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        pose = camera.cam_from_world.tolist()
+        digest.update(repr((view.name, intrinsics, pose, view.image.view)).encode())
+    if dataset.points is not None:
+        digest.update(dataset.points.xyz.numpy().tobytes())
+    stamps = stamps_of(dataset, folder)
+    digest.update(repr(sorted((k, v.size, v.digest) for k, v in stamps.items())).encode())
+    return digest.hexdigest()
 
 
 def _fingerprint(dataset: Path) -> str:

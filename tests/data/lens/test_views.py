@@ -106,6 +106,12 @@ def test_several_views_cover_the_photo_and_each_pixel_has_its_ray(name):
     assert reached[wanted].mean() > 0.98
 
 
+@pytest.mark.parametrize("width", [896, 1200, 3840])
+def test_all_pixels_of_a_panorama_are_used(width):
+    views = lens_views(LensModel("EQUIRECTANGULAR", width, width // 2, (width, width // 2)))
+    assert not any(view.partial for view in views)
+
+
 @pytest.mark.parametrize("name", ["circle of 220°", "panorama"])
 def test_colours_of_a_wide_view_encode_its_rays(name):
     """A photo whose colours are directions: they are found in each view, to 0.1 pixels."""

@@ -84,6 +84,15 @@ def test_links_are_not_created(tmp_path):
     assert inside(unpack(path)) == ["1.jpg"]
 
 
+def test_nothing_inside(tmp_path):
+    path = write(
+        tmp_path / "a.zip", {".hidden.jpg": b"x", "l": b"/etc"}, external_attr=0o120777 << 16
+    )
+    with pytest.raises(UserError, match="has no files"):
+        unpack(path)
+    assert not (tmp_path / "a").exists()
+
+
 def test_a_password(tmp_path):
     data = bytearray(write(tmp_path / "a.zip", {"1.jpg": b"x"}).read_bytes())
     at = data.find(b"PK\x01\x02")

@@ -9,8 +9,9 @@ import pillow_heif
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.inputs import GatherOptions, find_inputs, gather
+from snowsplat.sfm.ingest.inputs import GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
@@ -272,7 +273,7 @@ def test_broken_links_are_named(tmp_path):
     for photo_file in root.glob("[0-9].jpg"):
         photo_file.unlink()
     with pytest.raises(UserError, match="has links to files that are missing: x.jpg"):
-        find_inputs([root])
+        find_sources([root])
 
 
 def write_all(folder, picture, count=5):
@@ -388,15 +389,15 @@ def test_ctrl_c_and_progress(tmp_path):
         gathered(root, tmp_path / "other", report=stop)
 
 
-def test_find_inputs_lists_all_files_that_are_read(tmp_path):
+def test_paths_of_sources_are_all_files_that_are_read(tmp_path):
     root = write_photos(tmp_path / "p")
     (root / "masks").mkdir()
     photo().save(root / "masks" / "1.png")
     path = write_video(tmp_path / "a.mp4", pan(3))
-    listed = [p.relative_to(tmp_path).as_posix() for p in find_inputs([root, path])]
+    listed = [p.relative_to(tmp_path).as_posix() for p in find_sources([root, path]).paths]
     assert listed == ["p/0.jpg", "p/1.jpg", "p/masks/1.png", "p/2.jpg", "a.mp4"]
     with pytest.raises(UserError):
-        find_inputs([tmp_path / "absent"])
+        find_sources([tmp_path / "absent"])
 
 
 def test_the_pages_of_a_scan_are_photos(tmp_path):

@@ -45,7 +45,7 @@ def find_export(path: Path) -> Export | None:
     If there is only one folder in a folder, as unpacked archives have it, it is searched too.
     """
     if path.is_file():
-        return next((Export(kind, path, None) for kind in KINDS if kind.reads_file(path)), None)
+        return next((Export(kind, path, None) for kind in KINDS if kind.is_one(path)), None)
     return _in_folder(path) or next(map(_in_folder, _only_folder(path)), None)
 
 

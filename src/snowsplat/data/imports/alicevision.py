@@ -6,7 +6,6 @@ at (0, 0). The principal point is relative to the centre of the photo.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +33,6 @@ from snowsplat.util.safe_json import quoted
 # The coefficients of each kind of camera.
 _COUNTS = {"pinhole": 0, "none": 0, "radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
 _COUNTS |= {"brown": 5, "fisheye": 4, "fisheye4": 4}
-
-
-def find(folder: Path) -> Iterator[Path]:
-    """The files of cameras in a folder."""
-    paths = [*sorted(folder.glob("*.sfm")), folder / "sfm.json"]
-    return (path for path in paths if is_alicevision(path))
 
 
 def is_alicevision(path: Path) -> bool:
@@ -79,9 +72,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         rotation = numbers(where, transform.get("rotation"), 9).reshape(3, 3).T
         centre = numbers(where, transform.get("center"), 3)
         cam = rigid(where, rotation, -rotation @ centre)
-        photo = photos.find(name)
-        if photo is None:
-            found.missing.append(name)
+        if (photo := found.photo(photos, name)) is None:
             continue
         found.shots.append(Shot(photo, lens, cam))
     points = list(objects(f"{path}: structure", scene.get("structure") or []))

@@ -7,7 +7,6 @@ centre. https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html des
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +18,11 @@ from snowsplat.data.imports.reconstruction import Reconstruction, Shot
 from snowsplat.data.imports.values import head_of, load_text, numbers, rigid
 from snowsplat.util.errors import UserError
 
+#: Other files than bundle.out may be of an earlier step.
+PATTERNS = ("bundle.out", "*.out", "bundle/bundle.out", "bundle/*.out")
 # "photo.jpg 0 1500.2": a focal length from EXIF may follow the name.
 _FOCAL = re.compile(r"\s+\d+(\s+[-+.\deE]+)?$")
 _FLIP = np.diag([1.0, -1.0, -1.0])
-
-
-def find(folder: Path) -> Iterator[Path]:
-    """The files of cameras in a folder; others than bundle.out may be of an earlier step."""
-    for place in (folder, folder / "bundle"):
-        paths = sorted(place.glob("*.out"), key=lambda p: (p.name != "bundle.out", p.name))
-        yield from (path for path in paths if is_bundler(path))
 
 
 def is_bundler(path: Path) -> bool:
@@ -48,9 +42,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         rows = [numbers(where, next(lines, "").split(), 3) for _ in range(4)]
         if focal == 0:  # not aligned
             continue
-        photo = photos.find(name)
-        if photo is None:
-            found.missing.append(name)
+        if (photo := found.photo(photos, name)) is None:
             continue
         header = photos.header(photo)
         size = header.width, header.height

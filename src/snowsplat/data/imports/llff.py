@@ -6,7 +6,6 @@ height, width and focal length of the photos in full size; two depths follow.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +20,6 @@ from snowsplat.util.safe_json import is_file
 
 _COLUMNS = 17
 _MOST_ROWS = 1_000_000
-
-
-def find(folder: Path) -> Iterator[Path]:
-    """The file of poses in a folder."""
-    return (path for path in (folder / "poses_bounds.npy",) if is_llff(path))
 
 
 def is_llff(path: Path) -> bool:

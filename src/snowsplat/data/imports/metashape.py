@@ -41,11 +41,6 @@ _SKEW_ERROR = 0.5
 _FAR = 1000.0
 
 
-def find(folder: Path) -> Iterator[Path]:
-    """The XML files of cameras in a folder."""
-    return (path for path in sorted(folder.glob("*.xml")) if is_metashape(path))
-
-
 def is_metashape(path: Path) -> bool:
     """Whether a file starts like cameras that Metashape has exported."""
     head = head_of(path)
@@ -98,9 +93,7 @@ def _read_chunk(
             continue
         matrix = numbers(where, (transform.text or "").split(), 16).reshape(4, 4)
         pose = rigid(where, matrix[:3, :3], matrix[:3, 3])
-        photo = photos.find(label)
-        if photo is None:
-            found.missing.append(label)
+        if (photo := found.photo(photos, label)) is None:
             continue
         key = camera.get("sensor_id")
         if key not in lenses:

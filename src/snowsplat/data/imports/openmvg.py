@@ -5,7 +5,7 @@ The centre of the first pixel is at (0, 0). Without "structure", the file has no
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,6 @@ _DISTORTION = {
 _NAMED = (1 << 30) - 1 | 1 << 30  # of an identifier; the highest bit tells that its name follows
 
 
-def find(folder: Path) -> Iterator[Path]:
-    """The files of cameras in a folder."""
-    paths = sorted(folder.glob("sfm_data*.json"), key=lambda path: -path.stat().st_size)
-    return (path for path in paths if is_openmvg(path))
-
-
 def is_openmvg(path: Path) -> bool:
     """Whether a file starts like one of OpenMVG."""
     return path.suffix.lower() == ".json" and b'"sfm_data_version"' in head_of(path)
@@ -75,9 +69,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         rotation = numbers(where, values.get("rotation"), 3, 3)
         centre = numbers(where, values.get("center"), 3)
         cam = rigid(where, rotation, -rotation @ centre)
-        photo = photos.find(name)
-        if photo is None:
-            found.missing.append(name)
+        if (photo := found.photo(photos, name)) is None:
             continue
         found.shots.append(Shot(photo, lenses[key], cam))
     xyz = [

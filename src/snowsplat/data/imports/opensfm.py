@@ -7,7 +7,6 @@ units of its larger side, from its centre. https://opensfm.org/docs/geometry.htm
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +32,11 @@ from snowsplat.util.safe_json import quoted
 
 logger = logging.getLogger(__name__)
 
+#: In a project of OpenDroneMap, there is a folder of OpenSfM.
+PATTERNS = ("reconstruction.json", "opensfm/reconstruction.json")
 _PERSPECTIVE = ("perspective", "brown", "simple_radial", "radial")
 _FISHEYE = ("fisheye", "fisheye_opencv")
 _SPHERICAL = ("spherical", "equirectangular")
-
-
-def find(folder: Path) -> Iterator[Path]:
-    """The files of cameras in a folder, or in that of OpenSfM in a project of OpenDroneMap."""
-    names = ("reconstruction.json", "opensfm/reconstruction.json")
-    return (folder / name for name in names if is_opensfm(folder / name))
 
 
 def is_opensfm(path: Path) -> bool:
@@ -73,9 +68,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         key = shot.get("camera")
         if not isinstance(key, str) or key not in cameras:
             raise damaged(where, f"has the camera {quoted(key)}, which is not in the file")
-        photo = photos.find(name)
-        if photo is None:
-            found.missing.append(name)
+        if (photo := found.photo(photos, name)) is None:
             continue
         if key not in lenses:
             lenses[key] = _lens(f"{path}: camera {quoted(key)}", table(where, cameras[key]))

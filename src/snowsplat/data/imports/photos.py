@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.dataset import safe_name
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, read_header
+from snowsplat.data.files.listing import folded
+from snowsplat.data.files.photos import photos_below
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
 
-# Folders whose images are not the photos of a dataset, or are smaller copies of them.
-_OTHER_IMAGES = {"masks", "mask", "depth", "depths", "confidence", "normals", "thumbnails"}
-_OTHER_IMAGES |= {"images_2", "images_4", "images_8"}
-_MOST_FILES = 500_000
+# Smaller copies of the photos, whose folder may have any name.
+_SMALLER = {"images_2", "images_4", "images_8"}
 
 
 class PhotoFolder:
@@ -51,9 +50,9 @@ class PhotoFolder:
             for suffix in ("", *IMAGE_SUFFIXES) if not is_photo(name) else ("",):
                 if is_file(self.root / (folder + name + suffix)) and is_photo(name + suffix):
                     return folder + name + suffix
-        parts = PurePosixPath(name.lower())
+        last = folded(PurePosixPath(name).name)
         index = self._index()
-        return self._nearest(name, index.get(parts.name) or index.get(_stem(parts.name)) or [])
+        return self._nearest(name, index.get(last) or index.get(_stem(last)) or [])
 
     def header(self, file: str) -> Header:
         """The header of a photo from `find`.
@@ -94,19 +93,15 @@ class PhotoFolder:
         """The photos below the root, by their names and by their names without suffix."""
         if self._by_name is None:
             self._by_name = {}
-            top = self.root / self._preferred if self._only else self.root
-            count = 0
-            for folder, subfolders, files in os.walk(top):
-                kept = (s for s in sorted(subfolders) if s.lower() not in _OTHER_IMAGES)
-                subfolders[:] = [s for s in kept if not s.startswith(".")]
-                count += len(files)
-                if count > _MOST_FILES:
-                    raise UserError(f"{self.root}: has more than {_MOST_FILES:,} files; use fewer")
-                for file in sorted(files):
-                    if is_photo(file) and not file.startswith("."):
-                        path = (Path(folder) / file).relative_to(self.root).as_posix()
-                        for key in {file.lower(), _stem(file.lower())}:
-                            self._by_name.setdefault(key, []).append(path)
+            below = f"{self._preferred}/" if self._only else ""
+            try:
+                photos = photos_below(self.root / below)
+            except OSError:  # a folder that cannot be read
+                photos = []
+            for photo in (p for p in photos if _SMALLER.isdisjoint(p.split("/"))):
+                name = folded(PurePosixPath(photo).name)
+                for key in {name, _stem(name)}:
+                    self._by_name.setdefault(key, []).append(below + photo)
         return self._by_name
 
 

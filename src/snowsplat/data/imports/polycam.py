@@ -8,7 +8,6 @@ maps of their confidence are 0 where it is low.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,26 +19,32 @@ from snowsplat.data.imports.values import from_opengl, load_json, number, table
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
-#: Folders of cameras and of their photos; the first that both exist are used.
+# Folders of cameras and of their photos.
 _PAIRS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+#: The folders of cameras, those with the best poses first.
+PATTERNS = tuple(f"{place}{cameras}" for place in ("keyframes/", "") for cameras, _ in _PAIRS)
 _MILLIMETRE = 1e-3
 
 
-def find(folder: Path) -> Iterator[Path]:
-    """The folder of cameras in a capture, if they have poses."""
-    for cameras, _ in _folders(folder):
-        first = min(cameras.glob("*.json"))
-        try:
-            values = load_json(first)
-        except UserError:
-            values = {}
-        if isinstance(values, dict) and "fx" in values and "t_23" in values:
-            yield cameras
+def is_polycam(cameras: Path) -> bool:
+    """Whether a folder describes the cameras of photos in a folder beside it, with poses."""
+    images = cameras.parent / dict(_PAIRS).get(cameras.name, "")
+    first = min(cameras.glob("*.json"), default=None) if images.is_dir() else None
+    try:
+        values = load_json(first) if first else None
+    except UserError:
+        return False
+    return isinstance(values, dict) and "fx" in values and "t_23" in values
 
 
 def photos(folder: Path) -> Path | None:
-    """The folder of photos in a capture."""
-    return next((images for _, images in _folders(folder)), None)
+    """The folder of photos in a capture, also if its cameras have no poses."""
+    for pattern in PATTERNS:
+        cameras = folder / pattern
+        images = cameras.with_name(dict(_PAIRS)[cameras.name])
+        if images.is_dir() and any(cameras.glob("*.json")):
+            return images
+    return None
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
@@ -52,9 +57,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     found = Reconstruction()
     for file in sorted(path.glob("*.json")):
         found.total += 1
-        photo = photos.find(f"{prefix}/{images}/{file.stem}")
-        if photo is None:
-            found.missing.append(file.stem)
+        if (photo := found.photo(photos, f"{prefix}/{images}/{file.stem}")) is None:
             continue
         values = table(file, load_json(file))
         fx, fy, cx, cy = (number(file, values, key) for key in ("fx", "fy", "cx", "cy"))
@@ -70,11 +73,3 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             Shot(photo, lens, pose, depth, _MILLIMETRE, confidence if is_file(confidence) else None)
         )
     return found
-
-
-def _folders(folder: Path) -> Iterator[tuple[Path, Path]]:
-    """The folders of cameras and of photos, those with the best poses first."""
-    for place in (folder / "keyframes", folder):
-        for cameras, images in _PAIRS:
-            if (place / images).is_dir() and any((place / cameras).glob("*.json")):
-                yield place / cameras, place / images

@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import logging
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +29,6 @@ logger = logging.getLogger(__name__)
 _RENAMED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 _NEEDED = {"name", "x", "y", "alt", "heading", "pitch", "roll", "f"}
 _POSITIONS = {"name", "x", "y", "alt"}
-
-
-def find(folder: Path) -> Iterator[Path]:
-    """The CSV files of cameras in a folder."""
-    return (path for path in sorted(folder.glob("*.csv")) if is_realityscan(path))
 
 
 def is_realityscan(path: Path) -> bool:
@@ -67,9 +61,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         values = dict(zip(columns, row, strict=True))
         where = f"{path}: camera {quoted(values['name'])}"
         found.total += 1
-        photo = photos.find(values["name"])
-        if photo is None:
-            found.missing.append(values["name"])
+        if (photo := found.photo(photos, values["name"])) is None:
             continue
         header = photos.header(photo)
         width, height = header.width, header.height

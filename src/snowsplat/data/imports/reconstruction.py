@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.dataset import Points
+from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.lens.model import LensModel
 
 
@@ -38,3 +39,10 @@ class Reconstruction:
     missing: list[str] = field(default_factory=list)
     points: Points | None = None
     points_from: str = ""
+
+    def photo(self, photos: PhotoFolder, name: str) -> str | None:
+        """The result of `PhotoFolder.find`; a photo that is not there is added to ``missing``."""
+        photo = photos.find(name)
+        if photo is None:
+            self.missing.append(name)
+        return photo

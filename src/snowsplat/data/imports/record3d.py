@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +34,11 @@ from snowsplat.util.safe_json import is_file
 
 logger = logging.getLogger(__name__)
 
+#: An export may be in the folder of its EXR files.
+PATTERNS = ("metadata.json", "metadata", "EXR_RGBD/metadata.json")
 _PACKED = ".r3d"
 _DIGITS = re.compile(r"[0-9]{1,9}")
 _FOLDERS = ("rgb", "rgbd", "images", "EXR_RGBD/rgb")
-
-
-def find(folder: Path) -> Iterator[Path]:
-    """The metadata of an export, in its folder or that of its EXR files."""
-    places = (folder / "metadata.json", folder / "metadata", folder / "EXR_RGBD" / "metadata.json")
-    return (path for path in places if is_record3d(path))
 
 
 def is_record3d(path: Path) -> bool:
@@ -58,10 +53,8 @@ def is_record3d(path: Path) -> bool:
 
 def photos(folder: Path) -> Path | None:
     """The folder of photos in an export."""
-    for path in find(folder):
-        places = (path.parent / name for name in _FOLDERS)
-        return next((place for place in places if place.is_dir()), None)
-    return None
+    path = next(filter(is_record3d, (folder / name for name in PATTERNS)), None)
+    return path and next(filter(Path.is_dir, (path.parent / name for name in _FOLDERS)), None)
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:

@@ -35,6 +35,8 @@ _FOLD = 0.05
 _LARGEST = 2.0
 # Share of the field that views must cover.
 _COVERED = 0.995
+# Pixels: the error of positions from `strips`. The pole of a panorama is exactly at its border.
+_POSITION_ERROR = 0.05
 # Nodes are kept for so many views: 0.1 to 5 MB each.
 _KEPT = 24
 
@@ -102,7 +104,8 @@ class LensView:
         if not self.partial:
             return np.ones(position.shape[:2], bool)
         x, y = position[..., 0], position[..., 1]
-        inside = (x >= 0) & (x <= self.lens.width) & (y >= 0) & (y <= self.lens.height)
+        least, right, bottom = -_POSITION_ERROR, self.lens.width, self.lens.height
+        inside = (x >= least) & (x <= right - least) & (y >= least) & (y <= bottom - least)
         if self.circle is not None:
             _, _, cx, cy, _ = intrinsics(self.lens)
             inside &= (x - cx) ** 2 + (y - cy) ** 2 <= self.circle**2

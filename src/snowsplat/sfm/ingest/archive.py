@@ -71,12 +71,14 @@ def unpack(path: Path) -> Path:
     called ``NAME_unpacked``.
 
     Raises:
-        UserError: the file is damaged or has a password; a file in it has a path outside of the
-            folder; it needs more disk space than there is; or the folder cannot be written.
+        UserError: the file is damaged, empty or has a password; a file in it has a path outside of
+            the folder; it needs more disk space than there is; or the folder cannot be written.
     """
     try:
         with _opened(path) as archive:
             entries = _checked(archive, path)
+            if not entries:
+                raise UserError(f"{shown(path)}: has no files; copy it again, or use another file")
             for folder in (path.with_suffix(""), path.with_name(f"{path.stem}_unpacked")):
                 if _has_all(folder, entries):
                     return folder

@@ -99,11 +99,6 @@ class NoVideoError(ValueError):
     """A file has sound or pictures, but no video; the message says so."""
 
 
-def is_video(path: Path) -> bool:
-    """Whether a file contains a video stream, by its content. A cover picture is none."""
-    return why_no_video(path) is None
-
-
 def why_no_video(path: Path) -> str | None:
     """Why a file is no readable video, e.g. "has only sound"; None if it is one."""
     import av

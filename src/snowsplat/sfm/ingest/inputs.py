@@ -64,15 +64,6 @@ class GatherOptions:
     as_stored: bool = False
 
 
-def find_inputs(inputs: Sequence[Path]) -> list[Path]:
-    """All files that `gather` would read, including masks. Fast, because few files are opened.
-
-    Raises:
-        UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
-    """
-    return find_sources(inputs).paths
-
-
 def gather(
     inputs: Sequence[Path] | Sources, dataset: Path, options: GatherOptions, report: Report
 ) -> Gathered:

@@ -39,6 +39,8 @@ VIDEO_SUFFIXES = _suffixes(
 )
 #: The record of the stages of a dataset, and its name in version 0.1.0.
 RECORDS = ("sfm.json", "capture.json")
+# Folders in a dataset in which programs keep models of all its images.
+_MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
 _LONGEST_NAME = 200  # bytes of a name in input/
 _KEPT_END = 12  # characters at the end of a longer name
 # The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
@@ -69,6 +71,7 @@ class Sources:
         left_out: path and reason of each photo, video or folder that is not used.
         unused_masks: masks without a photo.
         notes: lines for the user.
+        posed: the folder with camera poses, if it is the only input.
     """
 
     inputs: tuple[Path, ...]
@@ -76,6 +79,7 @@ class Sources:
     left_out: list[tuple[str, str]]
     unused_masks: list[Path]
     notes: list[str] = field(default_factory=list)
+    posed: Path | None = None
 
     @property
     def photos(self) -> list[Source]:
@@ -116,6 +120,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     left_out: list[tuple[str, str]] = []
     unused: list[Path] = []
     notes: list[str] = []
+    posed: Path | None = None
     seen: dict[Path, Path] = {}
     folders = {"masks"}  # names in use
 
@@ -141,9 +146,10 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
                 add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
             continue
         if (poses := poses_in(path)) is not None:
+            posed = path if len(inputs) == 1 else None
             notes.append(
-                f"{shown(path)}: has camera poses already ({poses}); to use them: snowsplat train "
-                f"{shown(path)} -o OUT --eval; here, poses are estimated again"
+                f"{shown(path)}: has camera poses already ({shown(poses)}), which are estimated "
+                f"again; to use them: snowsplat make {shown(path)}"
             )
         elif (export := find_export(path)) is not None and export.photos is not None:
             notes.append(
@@ -166,7 +172,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
             add(Source(photo_folder / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
-    return Sources(tuple(inputs), files, left_out, unused, notes)
+    return Sources(tuple(inputs), files, left_out, unused, notes, posed)
 
 
 @dataclass
@@ -265,7 +271,10 @@ def _photos_of_dataset(root: Path) -> Path:
     export = find_export(root)
     if export is not None and export.photos is not None:
         return export.photos
-    if not (poses_in(root) or is_output(root)):
+    poses = poses_in(root)
+    # A model deeper in the folder may be that of a few of the photos.
+    near = poses is not None and (len(poses.parts) == 1 or poses.parts[0] in _MODEL_FOLDERS)
+    if not (near or is_output(root)):
         return root
     for name in ("input", "images"):
         if (root / name).is_dir():

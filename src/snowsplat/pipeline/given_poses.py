@@ -1,0 +1,73 @@
+"""`given_poses`: the camera poses that a folder of photos has already, if they are plausible."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from snowsplat.data import Dataset, View
+from snowsplat.data.files.matching import match_names
+from snowsplat.data.judge.verdict import judge
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.output.output_folder import DatasetSettings
+from snowsplat.sfm.ingest.sources import Source, Sources
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import shown
+
+# With poses of a smaller share of the photos, a scene of all of them is not possible.
+_LEAST_SHARE = 0.5
+
+
+def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer) -> Dataset | None:
+    """The dataset in the folder ``sources.posed``; None if its poses must be estimated.
+
+    A line says whether the poses are used, and if not, why. Photos without a pose are named.
+
+    Args:
+        settings: how to read the dataset.
+    """
+    name = shown(settings.path)
+    try:
+        dataset = settings.load()
+        views = [*dataset.train, *dataset.test]
+        without = _without_pose(sources.photos, views)
+        reason = _why_not(dataset, len(without), len(sources.photos))
+    except UserError as error:
+        reason = str(error)
+    if reason:
+        observer.note(f"{name}: its camera poses are not used, but estimated again: {reason}")
+        return None
+    line = f"{name}: its camera poses are used ({dataset.description})"
+    folders = [str(photo.path.parent) for photo in sources.photos]
+    photos = os.path.commonpath(folders or [settings.path])
+    if Path(photos) != Path(settings.path):  # there are no poses in this folder
+        line += f"; to estimate them again: snowsplat make {shown(photos)}"
+    observer.note(line)
+    if without:
+        observer.note(
+            f"{name}: {len(without)} of {len(sources.photos)} photos have no pose and are not used "
+            f"(the first is {shown(without[0].path)})"
+        )
+    return dataset
+
+
+def _why_not(dataset: Dataset, without: int, photos: int) -> str | None:
+    """The reason why the poses are not used; None if they are."""
+    impossible = [finding.text for finding in judge(dataset) if finding.impossible]
+    if impossible:
+        return impossible[0].rpartition(";")[0]  # without the advice
+    if without > (1 - _LEAST_SHARE) * photos:
+        return f"{without} of {photos} photos have no pose"
+    return None
+
+
+def _without_pose(photos: Sequence[Source], views: Sequence[View]) -> list[Source]:
+    """The photos that no view shows."""
+    used = {view.image.path.resolve() for view in views}
+    left = [photo for photo in photos if photo.path.resolve() not in used]
+    if len(left) < len(photos):
+        return left
+    # The views show undistorted copies of the photos, in another folder.
+    names = match_names([photo.name for photo in photos], [path.as_posix() for path in used]).files
+    return [photo for photo in photos if photo.name not in names]
