@@ -123,7 +123,9 @@ def track_fit(views: Sequence[View], rig: Rig, points: Points | None) -> TrackFi
     focal: list[float] = []
     for centre, photos in cameras.values():
         wrong = [photo.typical for photo in photos if not photo.typical <= _OFF]
-        if wrong and (factor := _focal(photos)) is not None:
+        if np.isinf(wrong).any():
+            off += wrong
+        elif wrong and (factor := _focal(photos)) is not None:
             focal += [factor] * len(wrong)
         elif wrong and not _other_pictures(photos, centre):
             off += wrong
@@ -150,8 +152,6 @@ def _other_pictures(photos: Sequence[_Photo], centre: np.ndarray) -> bool:
         photos: of one camera.
         centre: (2,) its principal point, relative to the size of the photo.
     """
-    if not all(np.isfinite(photo.typical) for photo in photos):
-        return False
     projected = np.concatenate([photo.projected for photo in photos])
     observed = np.concatenate([photo.observed for photo in photos])
     r2 = (projected**2).sum(1, keepdims=True)
