@@ -1,4 +1,4 @@
-"""`track_fit`: points that are not where they were observed are found, other photos are no fault."""
+"""`track_fit`: points that are not where they were observed are found; other photos are right."""
 
 from __future__ import annotations
 
@@ -150,11 +150,11 @@ def scaled(ray: np.ndarray) -> np.ndarray:
     "change",
     [
         pytest.param(scaled, id="scaled"),
-        pytest.param(lambda ray: ray + [0.3, 0.2], id="cropped"),
+        pytest.param(lambda ray: ray + np.array([0.3, 0.2]), id="cropped"),
         pytest.param(
             lambda ray: ray * (1 - 0.2 * (ray**2).sum(1, keepdims=True)), id="undistorted"
         ),
-        pytest.param(lambda ray: ray + [0.003, 0.0], id="small"),
+        pytest.param(lambda ray: ray + np.array([0.003, 0.0]), id="small"),
     ],
 )
 def test_observations_of_other_pictures_are_no_finding(reconstruction, change):
