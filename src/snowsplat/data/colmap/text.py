@@ -39,6 +39,8 @@ _LONGEST_NAME = 1000
 _LINES_PER_BLOCK = 50_000
 # Characters of a long line whose words are counted at once.
 _CHARACTERS_PER_BLOCK = 1 << 20
+# Characters of a track; a longer one is not used, as its line may be damaged.
+_LONGEST_TRACK = 1 << 16
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -122,7 +124,7 @@ def read_observations(path: Path, wanted: Mapping[int, np.ndarray]) -> dict[int,
     found = {}
     for image, line in _images(path):
         if image.number in wanted:
-            words = line.split()
+            words = line.split() if len(line) <= _CHARACTERS_PER_BLOCK * 4 else []
             rows = [words[3 * i : 3 * i + 3] for i in wanted[image.number].tolist()]
             try:
                 values = np.array([row or ["nan"] * 3 for row in rows], np.float64)
@@ -249,7 +251,7 @@ def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
     for row, line in enumerate(filter(None, _lines(path))):
         words = line.split(maxsplit=8)
         if row % every == 0:
-            tracks[row] = words[8] if len(words) > 8 else ""
+            tracks[row] = words[8] if 0 < len(words[8:]) and len(words[8]) <= _LONGEST_TRACK else ""
             if len(tracks) > TRACKS:
                 every *= 2
                 for odd in [row for row in tracks if row % every]:
