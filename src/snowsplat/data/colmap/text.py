@@ -251,7 +251,8 @@ def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
     for row, line in enumerate(filter(None, _lines(path))):
         words = line.split(maxsplit=8)
         if row % every == 0:
-            tracks[row] = words[8] if 0 < len(words[8:]) and len(words[8]) <= _LONGEST_TRACK else ""
+            track = "".join(words[8:])
+            tracks[row] = track if len(track) <= _LONGEST_TRACK else ""
             if len(tracks) > TRACKS:
                 every *= 2
                 for odd in [row for row in tracks if row % every]:
