@@ -158,7 +158,7 @@ def _right(dataset: Dataset, random: _Random) -> list[tuple[str, Dataset]]:
         other = (
             None
             if points is None or xyz is None
-            else Points(torch.from_numpy(xyz).float(), points.rgb)
+            else dataclasses.replace(points, xyz=torch.from_numpy(xyz).float())
         )
         found.append((f"turned, scaled by {scale:g}", _with_rig(dataset, moved, other)))
     return found

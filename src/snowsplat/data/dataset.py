@@ -26,19 +26,37 @@ logger = logging.getLogger(__name__)
 _MAX_COORDINATE = 1e18
 
 
+@dataclass(frozen=True)
+class Tracks:
+    """Where photos show some of the points, as measured by the program that made the points.
+
+    Attributes:
+        photos: names of photos, as `View.name`; of distorted ones too.
+        photo: (N,) int64, index of the photo of each observation.
+        point: (N,) int64, index of the point.
+        ray: (N, 2) float64, x / z and y / z in the frame of the camera.
+    """
+
+    photos: list[str]
+    photo: np.ndarray
+    point: np.ndarray
+    ray: np.ndarray
+
+
 @dataclass
 class Points:
     """A coloured point cloud in the world frame."""
 
     xyz: Tensor  # (P, 3) float32, finite; readers return float64 if the file has it
     rgb: Tensor  # (P, 3) uint8
+    tracks: Tracks | None = None  # of some of the points
 
     def __len__(self) -> int:
         return self.xyz.shape[0]
 
     def to(self, device: torch.device) -> Points:
         """These points on ``device``; not copied if they are already there."""
-        return Points(self.xyz.to(device), self.rgb.to(device))
+        return Points(self.xyz.to(device), self.rgb.to(device), self.tracks)
 
 
 def usable_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None:

@@ -32,9 +32,10 @@ def moved_to_origin(
         return list(posed), _float32(points), origin
     moved = [replace(image, camera=image.camera.seen_from(origin)) for image in posed]
     if points is not None:
-        points = Points(points.xyz.double() - torch.tensor(origin, dtype=torch.float64), points.rgb)
+        xyz = points.xyz.double() - torch.tensor(origin, dtype=torch.float64)
+        points = replace(points, xyz=xyz)
     return moved, _float32(points), origin
 
 
 def _float32(points: Points | None) -> Points | None:
-    return None if points is None else Points(points.xyz.float().contiguous(), points.rgb)
+    return None if points is None else replace(points, xyz=points.xyz.float().contiguous())

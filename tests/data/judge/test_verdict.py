@@ -206,3 +206,18 @@ def test_impossible_lens(matched: Dataset) -> None:
     )
     (finding,) = judge(with_rig(matched, few))
     assert finding.text.startswith("3 photos: ")
+
+
+@pytest.mark.slow
+def test_poses_of_some_photos(matched: Dataset) -> None:
+    """Most pairs agree. Far from the origin, the others have lost digits: no training."""
+    rig = rig_of(matched)
+    positions = rig.positions.copy()
+    positions[[0, 4], 2] += 0.5
+    some = with_rig(matched, rig.moved(rig.rotation, positions))
+    (finding,) = judge(some)
+    assert finding.text.startswith("the matches of ")
+    assert not finding.impossible
+    (finding,) = judge(dataclasses.replace(some, origin=(1e6, 0.0, 0.0)))
+    assert finding.impossible
+    assert "lost digits" in finding.text

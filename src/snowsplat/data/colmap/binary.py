@@ -7,19 +7,22 @@ must fit into the file.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from snowsplat.data.colmap.types import (
     CAMERA_MODELS,
+    TRACKS,
     ColmapCamera,
     ColmapImage,
+    PointFile,
     PointRecords,
     check_count,
     checked_camera,
     damaged,
+    track_rows,
     unreadable,
 )
 from snowsplat.util.errors import UserError
@@ -124,17 +127,47 @@ def read_images(path: Path) -> list[ColmapImage]:
     Raises:
         UserError: the file is unreadable or damaged.
     """
+    return [image for image, _ in _images(path)]
+
+
+def read_observations(path: Path, wanted: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Read some observations of an images.bin.
+
+    Args:
+        wanted: (N,) int64, indices of the observations of an image, by its id.
+
+    Returns:
+        (N, 3) float64: x and y in pixels, and the id of the point. NaN: no such observation.
+
+    Raises:
+        UserError: the file is unreadable or damaged.
+    """
+    record = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+    found = {}
+    for image, data in _images(path):
+        if image.number in wanted:
+            records, rows = np.frombuffer(data, record), wanted[image.number]
+            values = np.full((len(rows), 3), np.nan)
+            known = rows < len(records)
+            chosen = records[rows[known]]
+            values[known] = np.column_stack([chosen["xy"], chosen["point"]])
+            found[image.number] = values
+    return found
+
+
+def _images(path: Path) -> Iterator[tuple[ColmapImage, memoryview]]:
+    """The images of an images.bin, and the bytes of their observations."""
     cursor = _Cursor(path, "images", _SMALLEST_IMAGE)
     check_count(path, "images", cursor.count)
-    images = []
+    data = memoryview(cursor.data)
     for _ in range(cursor.count):
         number, *pose, camera_id = cursor.take(_IMAGE_HEAD)
         name = cursor.take_string()
         (observations,) = cursor.take(_COUNT)
+        start = cursor.offset
         cursor.skip(_OBSERVATION_BYTES * observations)
-        images.append(ColmapImage(name, camera_id, tuple(pose), number))
+        yield ColmapImage(name, camera_id, tuple(pose), number), data[start : cursor.offset]
     cursor.finish()
-    return images
 
 
 def read_frames(path: Path) -> list[tuple[int, list[int]]]:
@@ -158,8 +191,8 @@ def read_frames(path: Path) -> list[tuple[int, list[int]]]:
     return frames
 
 
-def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a points3D.bin: positions (P, 3) float64 and colours (P, 3) uint8.
+def read_points(path: Path) -> PointFile:
+    """Read a points3D.bin.
 
     Raises:
         UserError: the file is unreadable or damaged.
@@ -187,7 +220,13 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         max(0, size - record.itemsize + 1), record, data, strides=(1,)
     )
     records = everywhere[starts]
-    return records["xyz"], records["rgb"]
+    tracks = {}
+    for row in range(0, len(starts), -(-len(starts) // TRACKS) or 1):
+        track = int(starts[row]) + _POINT_BYTES
+        (length,) = unpack(data, track - _COUNT.size)
+        tracks[row] = np.frombuffer(data, "<u4", 2 * length, track).reshape(-1, 2)
+    ids = records["id"].astype(np.int64)
+    return PointFile(records["xyz"], records["rgb"], ids, track_rows(tracks))
 
 
 def write_model(

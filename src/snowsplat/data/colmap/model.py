@@ -13,7 +13,13 @@ import numpy as np
 
 from snowsplat.data.colmap import binary as binary_files
 from snowsplat.data.colmap import text as text_files
-from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel, PointRecords
+from snowsplat.data.colmap.types import (
+    ColmapCamera,
+    ColmapImage,
+    ColmapModel,
+    PointFile,
+    PointRecords,
+)
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.util.errors import UserError
 
@@ -75,20 +81,44 @@ def _read_frames(folder: Path, is_text: bool) -> dict[int, int]:
 
 
 def read_points(folder: Path) -> Points | None:
-    """Read the 3D points of the model in a folder; None if it has none.
+    """Read the 3D points of the model in a folder, without tracks; None if it has none.
 
     `usable_points` removes points that are not finite or implausibly far away.
 
     Raises:
         UserError: a file is damaged.
     """
+    if (found := read_point_file(folder)) is None:
+        return None
+    path, points = found
+    return usable_points(path, points.xyz, points.rgb)
+
+
+def read_point_file(folder: Path) -> tuple[Path, PointFile] | None:
+    """The file of the points of the model in a folder, and what is in it; None if it has none.
+
+    Raises:
+        UserError: the file is damaged.
+    """
     path = folder / "points3D.bin"
     if path.is_file():
-        return usable_points(path, *binary_files.read_points(path))
+        return path, binary_files.read_points(path)
     path = folder / "points3D.txt"
     if path.is_file():
-        return usable_points(path, *text_files.read_points(path))
+        return path, text_files.read_points(path)
     return None
+
+
+def read_observations(
+    model: ColmapModel, wanted: Mapping[int, np.ndarray]
+) -> dict[int, np.ndarray]:
+    """Read some observations of the images of a model; see `binary.read_observations`."""
+    read, suffix = (
+        (text_files.read_observations, ".txt")
+        if model.text
+        else (binary_files.read_observations, ".bin")
+    )
+    return read(model.folder / f"images{suffix}", wanted)
 
 
 def write_model(

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.data.colmap.model import count_images, read_model, read_points
+from snowsplat.data.colmap.model import count_images, read_model
 from snowsplat.data.colmap.places import workspace_of
-from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel
+from snowsplat.data.colmap.tracks import points_with_tracks
+from snowsplat.data.colmap.types import ColmapImage, ColmapModel, lens_of
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photos import find_photos, photos_below
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.lens.project import intrinsics
 from snowsplat.data.points_ply import read_points as read_points_ply
@@ -52,8 +52,8 @@ def read_colmap(
     model = read_model(folder)
     if not model.images:
         raise UserError(f"{folder}: the COLMAP model has no images; run COLMAP again")
-    posed = _images_on_disk(workspace_of(folder, root, images), images, model)
-    points = read_points(folder)
+    posed, names = _images_on_disk(workspace_of(folder, root, images), images, model)
+    points = points_with_tracks(model, names)
     ply = folder / "points3D.ply"
     if points is None and ply.is_file():
         points = usable_points(ply, *read_points_ply(ply))
@@ -73,8 +73,11 @@ def _warn_of_other_models(root: Path, models: Sequence[Path]) -> None:
     )
 
 
-def _images_on_disk(root: Path, images: str, model: ColmapModel) -> list[PosedImage]:
-    """The images of a model whose files exist; warns of those that are missing.
+def _images_on_disk(
+    root: Path, images: str, model: ColmapModel
+) -> tuple[list[PosedImage], dict[int, str]]:
+    """The images of a model whose files exist, and their names by image id; warns of those that
+    are missing.
 
     They are in the folder ``root / images``. If they are not, they may be elsewhere in ``root``.
     """
@@ -95,14 +98,15 @@ def _images_on_disk(root: Path, images: str, model: ColmapModel) -> list[PosedIm
             places[name] = (place / first, file.removeprefix(f"{first}/"), file)
     if not places:
         raise _no_images(root, images, model)
-    posed, missing = [], []
+    posed, missing, names = [], [], {}
     for image in model.images:
         if image.name not in places:
             missing.append(image.name)
             continue
         where, file, name = places[image.name]
-        camera, lens = posed_camera(model, image), _lens(model.cameras[image.camera_id])
+        camera, lens = posed_camera(model, image), lens_of(model.cameras[image.camera_id])
         frame = model.frames.get(image.number)
+        names[image.number] = safe_name(name)
         posed.append(
             PosedImage(
                 safe_name(name),
@@ -121,7 +125,7 @@ def _images_on_disk(root: Path, images: str, model: ColmapModel) -> list[PosedIm
             len(model.images),
             quoted(missing[0]),
         )
-    return posed
+    return posed, names
 
 
 def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
@@ -151,7 +155,7 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
             f"{model.folder}: image {image.name[:80]} has camera {image.camera_id}, which the "
             "model does not contain; copy the model again"
         )
-    fx, fy, cx, cy, _ = intrinsics(_lens(colmap))
+    fx, fy, cx, cy, _ = intrinsics(lens_of(colmap))
     numbers = (fx, fy, cx, cy, *colmap.params)
     if min(fx, fy) <= 0 or not all(abs(number) < 1e9 for number in numbers):
         raise UserError(
@@ -172,7 +176,3 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
         rotation = identity + norm2 * (rotation - identity)
     pose = torch.cat([rotation, translation[:, None]], 1)
     return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)
-
-
-def _lens(camera: ColmapCamera) -> LensModel:
-    return LensModel(camera.model, camera.width, camera.height, camera.params)

@@ -13,12 +13,15 @@ import numpy as np
 
 from snowsplat.data.colmap.types import (
     CAMERA_MODELS,
+    TRACKS,
     ColmapCamera,
     ColmapImage,
+    PointFile,
     PointRecords,
     check_count,
     checked_camera,
     damaged,
+    track_rows,
     unreadable,
 )
 from snowsplat.util.errors import UserError
@@ -36,6 +39,8 @@ _LONGEST_NAME = 1000
 _LINES_PER_BLOCK = 50_000
 # Characters of a long line whose words are counted at once.
 _CHARACTERS_PER_BLOCK = 1 << 20
+# Characters of a track; a longer one is not used, as its line may be damaged.
+_LONGEST_TRACK = 1 << 16
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -109,27 +114,51 @@ def read_images(path: Path) -> list[ColmapImage]:
     Raises:
         UserError: the file is unreadable or damaged.
     """
-    images: list[ColmapImage] = []
+    images = [image for image, _ in _images(path)]
+    _warn_if_fewer(path, "images", len(images))
+    return images
+
+
+def read_observations(path: Path, wanted: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """As `binary.read_observations`, of an images.txt."""
+    found = {}
+    for image, line in _images(path):
+        if image.number in wanted:
+            words = line.split() if len(line) <= _CHARACTERS_PER_BLOCK * 4 else []
+            rows = [words[3 * i : 3 * i + 3] for i in wanted[image.number].tolist()]
+            try:
+                values = np.array([row or ["nan"] * 3 for row in rows], np.float64)
+            except ValueError:
+                raise damaged(path, f"the observations of image {image.name[:80]}") from None
+            found[image.number] = values.reshape(-1, 3)
+    return found
+
+
+def _images(path: Path) -> Iterator[tuple[ColmapImage, str]]:
+    """The images of an images.txt, and the lines of their observations."""
+    image: ColmapImage | None = None
+    count = 0
     # Each image has a second line: x, y and point id of each observation. It may be empty. Some
     # programs do not write it.
-    observations_follow = False
     for line in _lines(path):
-        if observations_follow and not _is_image(line):
-            observations_follow = False
+        if image is not None and not _is_image(line):
             if _count_words(line) % 3:
-                name = images[-1].name[:80]
+                name = image.name[:80]
                 raise damaged(path, f"the line after image {name} should hold its observations")
+            yield image, line
+            image = None
         elif line:
-            observations_follow = True
+            if image is not None:
+                yield image, ""
             words = line.split(maxsplit=9)
             try:
                 pose = tuple(map(float, words[1:8]))
-                images.append(ColmapImage(words[9], int(words[8]), pose, int(words[0])))
+                image = ColmapImage(words[9], int(words[8]), pose, int(words[0]))
             except (ValueError, IndexError):
                 raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
-            check_count(path, "images", len(images))
-    _warn_if_fewer(path, "images", len(images))
-    return images
+            check_count(path, "images", count := count + 1)
+    if image is not None:
+        yield image, ""
 
 
 def _is_image(line: str) -> bool:
@@ -173,30 +202,62 @@ def read_frames(path: Path) -> list[tuple[int, list[int]]]:
     return frames
 
 
-def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a points3D.txt: positions (P, 3) float64 and colours (P, 3) uint8.
+def read_points(path: Path) -> PointFile:
+    """Read a points3D.txt.
 
     Raises:
         UserError: the file is unreadable or damaged.
     """
     # Rows end with tracks of different lengths. numpy's reader is fast, but it would split the
     # complete track into words, so it gets only the columns that are used.
-    lines = (" ".join(line.split(maxsplit=8)[:8]) for line in _lines(path) if line)
-    xyz, rgb = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+    tracks: dict[int, str] = {}
+    lines = _points_without_tracks(path, tracks)
+    ids, xyz, rgb = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
     while block := list(islice(lines, _LINES_PER_BLOCK)):
         try:
             values = np.loadtxt(
-                block, np.float64, comments=None, usecols=(1, 2, 3, 4, 5, 6, 7), ndmin=2
+                block, np.float64, comments=None, usecols=(0, 1, 2, 3, 4, 5, 6, 7), ndmin=2
             )
         except (ValueError, IndexError) as error:
             raise damaged(path, f"not points ({' '.join(str(error).split())[:90]})") from None
-        colours = values[:, 3:6]
+        colours = values[:, 4:7]
         if not ((colours >= 0) & (colours <= 255)).all():
             raise damaged(path, "a colour is outside 0..255")
-        xyz.append(values[:, :3].copy())
+        ids.append(values[:, 0].astype(np.int64))
+        xyz.append(values[:, 1:4].copy())
         rgb.append(colours.astype(np.uint8))
     _warn_if_fewer(path, "points", sum(map(len, xyz)))
-    return np.concatenate(xyz), np.concatenate(rgb)
+    return PointFile(
+        np.concatenate(xyz),
+        np.concatenate(rgb),
+        np.concatenate(ids),
+        track_rows({row: _pairs(track) for row, track in tracks.items()}),
+    )
+
+
+def _pairs(track: str) -> np.ndarray:
+    """(N, 2) int64; none of a track that is damaged, because no point needs its track."""
+    try:
+        return np.array(track.split(), np.int64).reshape(-1, 2)
+    except ValueError:
+        return np.empty((0, 2), np.int64)
+
+
+def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
+    """The lines of a points3D.txt without their ends, the tracks; some of these go to ``tracks``,
+    by row.
+    """
+    every = 1
+    for row, line in enumerate(filter(None, _lines(path))):
+        words = line.split(maxsplit=8)
+        if row % every == 0:
+            track = "".join(words[8:])
+            tracks[row] = track if len(track) <= _LONGEST_TRACK else ""
+            if len(tracks) > TRACKS:
+                every *= 2
+                for odd in [row for row in tracks if row % every]:
+                    del tracks[odd]
+        yield " ".join(words[:8])
 
 
 def write_model(

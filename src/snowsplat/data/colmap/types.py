@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.data.lens.model import LensModel
 from snowsplat.util.errors import UserError
 
 #: Name and number of parameters of each camera model; the index is its number in binary files.
@@ -36,6 +37,8 @@ CAMERA_MODELS = (
 _MAX_SIDE = 1_000_000
 # Largest number of images, and of cameras. Each record takes about 400 bytes of memory.
 _MAX_RECORDS = 200_000
+#: Number of points whose tracks are read: enough for about 100 observations in each of 250 photos.
+TRACKS = 4000
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,27 @@ class PointRecords:
     xyz: np.ndarray  # (P, 3) float, world frame
     rgb: np.ndarray  # (P, 3) uint8
     tracks: Sequence[Sequence[tuple[int, int]]]  # per point: pairs (image id, observation index)
+
+
+@dataclass(frozen=True)
+class PointFile:
+    """The 3D points of a file, and the tracks of up to `TRACKS` of them, spread over the file."""
+
+    xyz: np.ndarray  # (P, 3) float64, world frame
+    rgb: np.ndarray  # (P, 3) uint8
+    ids: np.ndarray  # (P,) int64
+    tracks: np.ndarray  # (N, 3) int64: row of a point, image id, index of the observation
+
+
+def track_rows(pairs: Mapping[int, np.ndarray]) -> np.ndarray:
+    """`PointFile.tracks` from the pairs (image id, observation index) of points, by their row."""
+    rows = [np.column_stack([np.full(len(p), row), p]) for row, p in pairs.items()]
+    return np.concatenate([np.empty((0, 3), np.int64), *rows]).astype(np.int64)
+
+
+def lens_of(camera: ColmapCamera) -> LensModel:
+    """The lens of a camera."""
+    return LensModel(camera.model, camera.width, camera.height, camera.params)
 
 
 def damaged(path: Path, problem: str) -> UserError:

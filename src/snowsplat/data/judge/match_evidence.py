@@ -149,6 +149,8 @@ def _distances(pair: Pair, rig: Rig) -> np.ndarray:
     a, b = rig.rays(pair.a, pair.in_a), rig.rays(pair.b, pair.in_b)
     rotation = rig.rotation[pair.b] @ rig.rotation[pair.a].T
     baseline = rig.translation[pair.b] - rotation @ rig.translation[pair.a]
+    if np.linalg.norm(baseline) <= 1e-9 * np.linalg.norm(rig.translation[pair.b]):
+        baseline = np.array([1.0, 0.0, 0.0])  # at one place there is no parallax in any direction
     turned = a @ rotation.T  # the rays of the first camera, in the frame of the second
     normal = np.cross(baseline, turned)  # of the epipolar plane; its line in the second photo
     back = np.cross(baseline, b) @ rotation  # the same in the first photo, up to the sign

@@ -1,10 +1,11 @@
 """`judge`: are the cameras and masks of a dataset possible? Asked before every training.
 
-Three witnesses are heard, as far as the dataset has them:
+Four witnesses are heard, as far as the dataset has them:
 
 - the numbers: lenses, positions (`lens_check`, `position_check`);
 - the points: have they the colours of the photos where the cameras see them (`ColourEvidence`)?
 - the photos: do matches between them agree with the poses (`MatchEvidence`)?
+- the tracks: are the points where they were observed (`track_fit`)?
 
 Each witness is first asked whether it can tell: points at random positions and photos without
 matches say nothing. If a witness contradicts the cameras, the usual mistakes are tried (`repairs`).
@@ -28,6 +29,8 @@ from snowsplat.data.judge.photo_sample import PhotoSample
 from snowsplat.data.judge.position_check import position_findings
 from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs, zooms
 from snowsplat.data.judge.rig import Rig
+from snowsplat.data.judge.track_evidence import TrackFit, track_fit
+from snowsplat.scene.origin import HERE
 from snowsplat.util.natural_order import natural_key
 
 # Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
@@ -42,6 +45,9 @@ _PAIRS_FOR_PROOF = 6
 _MATCHES_AGREE = 0.5
 _MATCHES_PROVE = 0.8
 _MATCHES_CONTRADICT = 0.15
+# A pair contradicts the poses if nearly none of its matches agree. Some pairs do in scenes that
+# repeat themselves; poses that lost digits are wrong in about half of the pairs.
+_PAIRS_CONTRADICT = 0.3
 # A repair must improve the correlation of colours by this, or the share of matches by twice this.
 _BETTER = 0.2
 # Points that are projected to try a repair.
@@ -61,7 +67,7 @@ def judge(dataset: Dataset) -> list[Finding]:
     lenses, positions = _lenses(views), position_findings(rig)
     if any(finding.impossible for finding in lenses):
         return [*lenses, *masks]
-    poses = _poses(views, rig, dataset.points)
+    poses = _poses(views, rig, dataset.points, far=dataset.origin != HERE)
     # Wrong poses may have any positions; what is wrong with the poses says more.
     return [*lenses, *poses, *([] if poses else positions), *masks]
 
@@ -87,30 +93,56 @@ def _lenses(views: list[View]) -> list[Finding]:
     ]
 
 
-def _poses(views: list[View], rig: Rig, points: Points | None) -> list[Finding]:
+def _poses(views: list[View], rig: Rig, points: Points | None, *, far: bool) -> list[Finding]:
     sample = PhotoSample.of(views, rig)
+    tracks = track_fit(views, rig, points)
     if len(sample) < 2:
-        return []
+        return [] if tracks is None else [tracks.finding(impossible=far)]
     rig = rig.select(sample.views)
     colours, agreement = None, None
     if points is not None:
         colours = ColourEvidence(sample, points.xyz.numpy(), points.rgb.numpy())
-        if colours.informative():
-            agreement = colours.agreement(rig)
-            if _agrees(agreement, len(sample)):
-                return []
+        agreement = colours.agreement(rig) if colours.informative() else None
+    coloured = agreement is not None and _agrees(agreement, len(sample))
     matches = MatchEvidence(sample)
     fit = _fit(rig, matches)
-    if fit is None or fit.share < _MATCHES_AGREE:
+    if not coloured and (fit is None or fit.share < _MATCHES_AGREE):
         matches.widen()
         fit = _fit(rig, matches)
-    if colours is None or agreement is None:
-        return [] if fit is None else _by_matches(rig, matches, fit)
-    if fit is None:
-        return _by_colours(rig, colours, agreement)
-    if fit.share >= _MATCHES_AGREE:
-        return _points(rig, colours, agreement)
-    return _by_both(rig, colours, agreement, matches, fit)
+    if coloured:
+        found = []
+    elif colours is None or agreement is None:
+        found = [] if fit is None else _by_matches(rig, matches, fit)
+    elif fit is None:
+        found = _by_colours(rig, colours, agreement)
+    elif fit.share >= _MATCHES_AGREE:
+        found = _points(rig, colours, agreement)
+    else:
+        found = _by_both(rig, colours, agreement, matches, fit)
+    if any(finding.impossible for finding in found) or (found and tracks is None):
+        return found
+    return _inexact(fit, tracks, far=far)
+
+
+def _inexact(fit: Fit | None, tracks: TrackFit | None, *, far: bool) -> list[Finding]:
+    """Poses of which some are right, or nearly right, so that no other witness has named them.
+
+    Args:
+        far: the scene was far from the origin, where numbers lose digits.
+    """
+    shares = np.ones(0) if fit is None else fit.shares
+    wrong = int((shares < _MATCHES_CONTRADICT).sum())
+    contradicted = wrong >= max(_FEWEST_PAIRS, _PAIRS_CONTRADICT * len(shares))
+    if tracks is not None:
+        return [tracks.finding(impossible=far or contradicted)]
+    if not contradicted:
+        return []
+    text = f"the matches of {wrong} of {len(shares)} pairs of photos contradict the poses"
+    if not far:
+        return [Finding("poses", f"{text}, so the poses of some photos are wrong")]
+    text += "; the poses were too far from the origin, and lost digits"
+    todo = "move the scene to the origin in the program that made the poses, and export it again"
+    return [Finding("poses", f"{text}; {todo}", impossible=True)]
 
 
 def _fit(rig: Rig, matches: MatchEvidence) -> Fit | None:
