@@ -19,6 +19,7 @@ from snowsplat.data.bit_depth import eight_bits
 from snowsplat.data.colour_profile import is_transparent, to_srgb
 from snowsplat.data.files.mask_pixels import mask_levels
 from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of
+from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.resample import resampled
 from snowsplat.data.lens.views import LensView
 from snowsplat.util.errors import UserError
@@ -161,8 +162,8 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
         small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in pictures]
     else:
         small = list(_scaled(planes, source.view, *size))
-    shown = np.uint8(255) * _covered(source.view, *size)
-    return np.stack([*small[:3], np.minimum(small[3], shown) if len(small) == 4 else shown])
+    alpha = np.uint8(255) * shown(source.view, *size)
+    return np.stack([*small[:3], np.minimum(small[3], alpha) if len(small) == 4 else alpha])
 
 
 def load_mask(source: ImageSource) -> Tensor:
@@ -173,7 +174,7 @@ def load_mask(source: ImageSource) -> Tensor:
     Raises:
         UserError: see `load_image`.
     """
-    covered = torch.from_numpy(_covered(source.view, source.width, source.height))
+    covered = torch.from_numpy(shown(source.view, source.width, source.height))
     if source.blank:
         return covered
     try:
@@ -239,16 +240,6 @@ def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) 
     if len(made) == 4:  # premultiplied colours
         made[:3] = np.minimum(made[:3], made[3])
     return resize_area(made, width, height)
-
-
-def _covered(view: LensView | None, width: int, height: int) -> np.ndarray:
-    """(height, width) bool: the pixels of a view that lie completely in the photo."""
-    if view is None or not view.partial:
-        return np.ones((height, width), bool)
-    fine: np.ndarray = np.empty((_SAMPLES * height, _SAMPLES * width), bool)
-    for rows, position in view.strips(_SAMPLES * width, _SAMPLES * height):
-        fine[rows] = view.covered(position)
-    return np.logical_and.reduce(fine.reshape(height, _SAMPLES, width, _SAMPLES), axis=(1, 3))
 
 
 def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:

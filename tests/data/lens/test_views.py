@@ -92,7 +92,7 @@ def test_several_views_cover_the_photo_and_each_pixel_has_its_ray(name):
             shown = view.covered(found) & np.isfinite(found).all(-1)
             x, y = np.arange(view.width) + 0.5, np.arange(view.height)[rows] + 0.5
             true = position_of(view, x, y)
-            assert np.abs(found - true)[shown].max(initial=0) < 0.05  # pixels of the photo
+            assert np.abs(found - true)[shown].max(initial=0) < 0.02  # pixels of the photo
             inside = (found[shown] / 10).astype(int)
             reached[
                 inside[:, 1].clip(0, len(reached) - 1), inside[:, 0].clip(0, reached.shape[1] - 1)
