@@ -47,44 +47,54 @@ class Resampler {
 
  public:
   explicit Resampler(const ResampleParams& p)
-      : p_(p), x_nodes_(kRows * p.columns), y_nodes_(kRows * p.columns),
-        buffer_(kCapacity * kChannels + kOverrun), packed_(kCapacity + kOverrun) {}
+      : p_(p), x_(kRows * p.width), y_(kRows * p.width), buffer_(kCapacity * kChannels + kOverrun),
+        packed_(kCapacity + kOverrun) {
+    for (Line& line : lines_) line.x.resize(p.width), line.y.resize(p.width);
+  }
 
   void run() {
     for (int64_t top = 0; top < p_.count; top += kRows) {
       const int rows = int(std::min<int64_t>(kRows, p_.count - top));
-      for (int y = 0; y < rows; y++) interpolate_rows(top + y, y);
+      for (int y = 0; y < rows; y++) locate(top + y, y);
       for (int64_t left = 0; left < p_.width; left += kColumns) {
         const int columns = int(std::min<int64_t>(kColumns, p_.width - left));
-        for (int y = 0; y < rows; y++) locate(left, columns, y);
-        draw(0, 0, columns, rows);
+        draw(left, left, columns, 0, rows);
         for (int y = 0; y < rows; y++) write(left, columns, top, y);
       }
     }
   }
 
  private:
-  // The nodes of a row of the result.
-  void interpolate_rows(int64_t row, int y) {
-    const float* upper = p_.nodes + 2 * p_.columns * p_.row[row];
-    const float* lower = upper + 2 * p_.columns;
-    const float down = p_.down[row];
-    float *x_nodes = &x_nodes_[y * p_.columns], *y_nodes = &y_nodes_[y * p_.columns];
-    for (int64_t i = 0; i < p_.columns; i++) {
-      x_nodes[i] = upper[2 * i] + down * (lower[2 * i] - upper[2 * i]);
-      y_nodes[i] = upper[2 * i + 1] + down * (lower[2 * i + 1] - upper[2 * i + 1]);
+  // Positions of all columns in a row of nodes.
+  struct Line {
+    int64_t row = -1;
+    std::vector<float> x, y;
+  };
+
+  const Line& line_of(int64_t row) {
+    Line& line = lines_[row % 2];
+    if (line.row == row) return line;
+    line.row = row;
+    const float* nodes = p_.nodes + 2 * p_.columns * row;
+    for (int64_t i = 0; i < p_.width; i++) {
+      const float *node = nodes + 2 * p_.column[i], across = p_.across[i];
+      line.x[i] = node[0] + across * (node[2] - node[0]);
+      line.y[i] = node[1] + across * (node[3] - node[1]);
     }
+    return line;
   }
 
-  // The positions of a row of a tile.
-  void locate(int64_t left, int columns, int y) {
-    const float *x_nodes = &x_nodes_[y * p_.columns], *y_nodes = &y_nodes_[y * p_.columns];
+  // The positions of a row of the result.
+  void locate(int64_t row, int y) {
+    const Line &upper = line_of(p_.row[row]), &lower = line_of(p_.row[row] + 1);
+    const float down = p_.down[row];
     const float right = float(p_.source_width + 3), bottom = float(p_.source_height + 3);
-    for (int x = 0; x < columns; x++) {
-      const int32_t node = p_.column[left + x];
-      const float across = p_.across[left + x];
-      x_[y][x] = fixed_point(x_nodes[node] + across * (x_nodes[node + 1] - x_nodes[node]), right);
-      y_[y][x] = fixed_point(y_nodes[node] + across * (y_nodes[node + 1] - y_nodes[node]), bottom);
+    int32_t *to_x = &x_[y * p_.width], *to_y = &y_[y * p_.width];
+    const float *x0 = upper.x.data(), *x1 = lower.x.data();
+    const float *y0 = upper.y.data(), *y1 = lower.y.data();
+    for (int64_t i = 0; i < p_.width; i++) {
+      to_x[i] = fixed_point(x0[i] + down * (x1[i] - x0[i]), right);
+      to_y[i] = fixed_point(y0[i] + down * (y1[i] - y0[i]), bottom);
     }
   }
   // In phases, from 2 pixels before the centre of the first pixel; limited to 2 pixels beside the
@@ -96,36 +106,41 @@ class Resampler {
     return int32_t(from * kPhases + 0.5f);
   }
 
-  // A part of a tile.
-  void draw(int x0, int y0, int columns, int rows) {
+  // A part of the tile that begins at column `tile`.
+  void draw(int64_t tile, int64_t begin, int columns, int first, int rows) {
     int32_t left = INT32_MAX, top = INT32_MAX, right = 0, bottom = 0;
-    for (int y = y0; y < y0 + rows; y++)
-      for (int x = x0; x < x0 + columns; x++) {
-        left = std::min(left, x_[y][x]), right = std::max(right, x_[y][x]);
-        top = std::min(top, y_[y][x]), bottom = std::max(bottom, y_[y][x]);
+    for (int y = first; y < first + rows; y++) {
+      const int32_t *x_row = &x_[y * p_.width + begin], *y_row = &y_[y * p_.width + begin];
+      for (int x = 0; x < columns; x++) {
+        left = std::min(left, x_row[x]), right = std::max(right, x_row[x]);
+        top = std::min(top, y_row[x]), bottom = std::max(bottom, y_row[x]);
       }
+    }
     left /= kPhases, top /= kPhases, right /= kPhases, bottom /= kPhases;
     const int64_t width = right - left + kTaps, height = bottom - top + kTaps;
     if (width * height > kCapacity) {
-      const int first_columns = columns > rows ? columns / 2 : columns;
-      const int first_rows = columns > rows ? rows : rows / 2;
-      draw(x0, y0, first_columns, first_rows);
-      if (first_columns < columns)
-        draw(x0 + first_columns, y0, columns - first_columns, rows);
-      else
-        draw(x0, y0 + first_rows, columns, rows - first_rows);
+      if (columns > rows) {
+        draw(tile, begin, columns / 2, first, rows);
+        draw(tile, begin + columns / 2, columns - columns / 2, first, rows);
+      } else {
+        draw(tile, begin, columns, first, rows / 2);
+        draw(tile, begin, columns, first + rows / 2, rows - rows / 2);
+      }
       return;
     }
     // The first pixel of a spline is the one before its position.
     for (int64_t y = 0; y < height; y++) fill(y * width, left - 3, top - 3 + y, int(width));
     const int stride = int(width) * kChannels;
-    for (int y = y0; y < y0 + rows; y++)
-      for (int x = x0; x < x0 + columns; x++) {
-        const int across = x_[y][x] / kPhases - left, down = y_[y][x] / kPhases - top;
-        spline(&buffer_[down * stride + across * kChannels], stride, weights.of[x_[y][x] % kPhases],
-               weights.of[y_[y][x] % kPhases])
-            .store(colours_[y][x]);
+    for (int y = first; y < first + rows; y++) {
+      const int32_t *x_row = &x_[y * p_.width + begin], *y_row = &y_[y * p_.width + begin];
+      for (int i = 0; i < columns; i++) {
+        const uint32_t x = x_row[i], y_position = y_row[i];
+        const int across = int(x / kPhases) - left, down = int(y_position / kPhases) - top;
+        spline(&buffer_[down * stride + across * kChannels], stride, weights.of[x % kPhases],
+               weights.of[y_position % kPhases])
+            .store(colours_[y][begin - tile + i]);
       }
+    }
   }
 
   SNOW_INLINE static Simd<float, kChannels> spline(const float* at, int stride, const float* across,
@@ -176,10 +191,10 @@ class Resampler {
   }
 
   const ResampleParams& p_;
-  std::vector<float> x_nodes_, y_nodes_;  // (kRows, columns), of the rows of a tile
+  Line lines_[2];               // of the nodes above and below a row, at their number modulo 2
+  std::vector<int32_t> x_, y_;  // (kRows, width): positions of the rows of the tiles
   std::vector<float> buffer_;
   std::vector<uint32_t> packed_;  // a row of the buffer in bytes
-  int32_t x_[kRows][kColumns], y_[kRows][kColumns];
   alignas(64) float colours_[kRows][kColumns][kChannels] = {};
 };
 
