@@ -8,6 +8,7 @@ import pytest
 
 from snowsplat.data.colmap.types import CAMERA_MODELS
 from snowsplat.data.lens.circle import image_circle
+from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.project import project, unproject
 from snowsplat.data.lens.resample import nearest, resampled
@@ -104,6 +105,17 @@ def test_several_views_cover_the_photo_and_each_pixel_has_its_ray(name):
     elif lens.model == "FISHEYE":  # the corners are more than 180° apart
         wanted = np.hypot(x - lens.params[-2], (y - lens.params[-1])[:, None]) < 440
     assert reached[wanted].mean() > 0.98
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_shown_pixels_have_all_samples_in_the_photo_and_its_circle(name):
+    for view in lens_views(*WIDE[name])[:2]:
+        width, height = view.width // 3, view.height // 3
+        samples = np.zeros((2 * height, 2 * width), bool)
+        for rows, found in view.strips(2 * width, 2 * height):
+            samples[rows] = view.covered(found)
+        expected = samples.reshape(height, 2, width, 2).all((1, 3))
+        assert np.array_equal(shown(view, width, height), expected)
 
 
 @pytest.mark.parametrize("name", ["circle of 220°", "panorama"])
