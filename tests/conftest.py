@@ -63,11 +63,11 @@ def pytest_sessionstart() -> None:
     """With SNOWSPLAT_NEON, the kernels for Arm replace those of this machine: `make neon`."""
     if os.environ.get("SNOWSPLAT_NEON"):
         from snowsplat.ops.native import LAUNCHERS
-        from snowsplat.sfm.colmap import kernels
+        from snowsplat.util import array_kernels
 
         from .ops import neon
 
-        LAUNCHERS["cpu"] = kernels.call = neon.launch
+        LAUNCHERS["cpu"] = array_kernels.call = neon.launch
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

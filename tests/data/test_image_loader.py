@@ -1,5 +1,6 @@
 """Decoding, scaling, alpha, and the cache of the loader: same pixels, within the budget."""
 
+import dataclasses
 import os
 import threading
 from concurrent.futures import Future
@@ -10,8 +11,10 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, ImageSource, View
-from snowsplat.data.decode import load_image, load_mask, resize_area
+from snowsplat.data.decode import load_image, load_mask, load_views, resize_area
 from snowsplat.data.image_loader import available_memory
+from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.views import lens_views
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 
@@ -171,12 +174,12 @@ def test_images_within_the_budget_are_decoded_once(views, monkeypatch):
     decoded = []
     lock = threading.Lock()
 
-    def counting(source, background=None):
+    def counting(sources, background=None):
         with lock:
-            decoded.append(source.path.name)
-        return load_image(source, background)
+            decoded.append(sources[0][0].path.name)
+        return load_views(sources, background)
 
-    monkeypatch.setattr("snowsplat.data.image_loader.load_image", counting)
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", counting)
     with ImageLoader(views) as loader:
         for _ in range(3):
             loader.prefetch(reversed(views))
@@ -186,6 +189,35 @@ def test_images_within_the_budget_are_decoded_once(views, monkeypatch):
             loader.get(view, 2)
         assert loader.cached_bytes == 10 * 3 * (16 * 20 + 8 * 10)
     assert sorted(decoded) == [f"{i}.png" for i in range(10)]
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_a_photo_of_several_views_is_decoded_once_if_all_views_stay(tmp_path, monkeypatch, fits):
+    pixels = np.random.default_rng(0).integers(0, 256, (60, 60, 3)).astype(np.uint8)
+    photo = make_view(tmp_path / "a.png", pixels)
+    mask = ImageSource(tmp_path / "mask.png", 60, 60)
+    Image.fromarray(pixels[..., 0]).save(mask.path)
+    views = []
+    for part in lens_views(LensModel("FISHEYE", 60, 60, (20.0, 20.0, 30.0, 30.0))):
+        size = {"width": part.width, "height": part.height, "view": part}
+        shown = dataclasses.replace(photo.image, **size), dataclasses.replace(mask, **size)
+        views.append(View(part.name, photo.camera, *shown))
+    decoded = []
+
+    def counting(sources, background=None):
+        decoded.append(len(sources))
+        return load_views(sources, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", counting)
+    with ImageLoader(views, threads=3, budget_bytes=None if fits else 8000) as loader:
+        for _ in range(2):
+            loader.prefetch(views)
+            for view in views:
+                image = loader.get(view)
+                assert torch.equal(image.planes, load_image(view.image))
+                assert torch.equal(image.mask, load_mask(view.mask))
+    assert len(views) > 2
+    assert decoded == ([len(views)] if fits else [1] * len(decoded))
 
 
 def test_prefetching_stays_within_half_of_the_budget(views):
@@ -203,11 +235,11 @@ def test_an_image_decoded_ahead_makes_room_for_the_next_when_it_is_requested(vie
     """The request for a view outside of the order changes nothing."""
     decoded = []
 
-    def counting(source, background=None):
-        decoded.append(source.path.name)
-        return load_image(source, background)
+    def counting(sources, background=None):
+        decoded.append(sources[0][0].path.name)
+        return load_views(sources, background)
 
-    monkeypatch.setattr("snowsplat.data.image_loader.load_image", counting)
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", counting)
     one = 4 * 16 * 20
     with ImageLoader(views, budget_bytes=2 * one) as loader:
         loader.prefetch(views[:3])
@@ -221,11 +253,11 @@ def test_an_image_decoded_ahead_makes_room_for_the_next_when_it_is_requested(vie
 def test_images_that_are_cached_or_being_decoded_are_not_submitted_again(views, monkeypatch):
     release = threading.Event()
 
-    def slow(source, background=None):
+    def slow(sources, background=None):
         release.wait(10)
-        return load_image(source, background)
+        return load_views(sources, background)
 
-    monkeypatch.setattr("snowsplat.data.image_loader.load_image", slow)
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", slow)
     with ImageLoader(views) as loader:
         submit, submitted = loader._pool.submit, []
         monkeypatch.setattr(
@@ -303,17 +335,17 @@ def test_a_closed_loader_has_no_threads_and_no_images(views):
 def test_closing_cancels_images_that_no_thread_decodes_yet(views, monkeypatch):
     started, decoded = threading.Event(), []
 
-    def until_cancelled(source, background=None):
-        decoded.append(source.path.name)
+    def until_cancelled(sources, background=None):
+        decoded.append(sources[0][0].path.name)
         started.set()
         for _ in range(1000):
             with loader._lock:
                 if len(loader._running) == 1:
                     break
             threading.Event().wait(0.01)
-        return load_image(source, background)
+        return load_views(sources, background)
 
-    monkeypatch.setattr("snowsplat.data.image_loader.load_image", until_cancelled)
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", until_cancelled)
     loader = ImageLoader(views, threads=1)
     loader.prefetch(views)
     assert len(loader._running) == 2
@@ -336,14 +368,14 @@ def test_an_image_that_a_thread_decodes_is_awaited(views, monkeypatch):
     started, release = threading.Event(), threading.Event()
     decoded = []
 
-    def slow(source, background=None):
-        decoded.append(source.path.name)
+    def slow(sources, background=None):
+        decoded.append(sources[0][0].path.name)
         if len(decoded) == 1:
             started.set()
             release.wait(10)
-        return load_image(source, background)
+        return load_views(sources, background)
 
-    monkeypatch.setattr("snowsplat.data.image_loader.load_image", slow)
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", slow)
     with ImageLoader(views) as loader:
         loader.prefetch(views[:1])
         assert started.wait(10)

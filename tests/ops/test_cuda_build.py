@@ -18,7 +18,7 @@ import snowsplat
 from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.launches import KERNELS, SEQUENCES
 from snowsplat.ops.params import ENTRIES
-from snowsplat.sfm.colmap.kernels import ENTRIES as CPU_ENTRIES
+from snowsplat.util.array_kernels import ENTRIES as CPU_ENTRIES
 from snowsplat.util.native_layout import layout_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -19,6 +19,7 @@ from snowsplat.data.bit_depth import eight_bits
 from snowsplat.data.colour_profile import is_transparent, to_srgb
 from snowsplat.data.files.mask_pixels import mask_levels
 from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of
+from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.resample import resampled
 from snowsplat.data.lens.views import LensView
 from snowsplat.util.errors import UserError
@@ -129,14 +130,28 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
     Raises:
         UserError: the file is missing, damaged, or not an image.
     """
-    try:
-        with open_image(source.path, _FORMATS) as opened:
-            planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
-    except Exception as error:  # as above
-        raise _unreadable(source.path, error) from None
-    if planes.shape[0] == 4:
-        planes = _with_alpha(planes, background)
+    planes = _decoded(source, background)
     return torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
+
+
+def load_views(
+    sources: Sequence[tuple[ImageSource, ImageSource | None]],
+    background: Sequence[float] | None = None,
+) -> list[LoadedImage]:
+    """Several views of one photo with their masks. Each file is decoded once.
+
+    ``background`` and the errors are those of `load_image`.
+    """
+    planes = _decoded(sources[0][0], background)
+    levels: dict[Path, np.ndarray] = {}
+    made = []
+    for source, mask in sources:
+        image = torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
+        if mask is not None and not mask.blank and mask.path not in levels:
+            levels[mask.path] = _decoded_mask(mask)
+        shown = None if mask is None else _mask_of(levels.get(mask.path), mask)
+        made.append(LoadedImage(image, shown))
+    return made
 
 
 def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
@@ -161,8 +176,8 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
         small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in pictures]
     else:
         small = list(_scaled(planes, source.view, *size))
-    shown = np.uint8(255) * _covered(source.view, *size)
-    return np.stack([*small[:3], np.minimum(small[3], shown) if len(small) == 4 else shown])
+    alpha = np.uint8(255) * shown(source.view, *size)
+    return np.stack([*small[:3], np.minimum(small[3], alpha) if len(small) == 4 else alpha])
 
 
 def load_mask(source: ImageSource) -> Tensor:
@@ -173,16 +188,7 @@ def load_mask(source: ImageSource) -> Tensor:
     Raises:
         UserError: see `load_image`.
     """
-    covered = torch.from_numpy(_covered(source.view, source.width, source.height))
-    if source.blank:
-        return covered
-    try:
-        with open_image(source.path, _FORMATS) as opened:
-            levels = mask_levels(_upright(opened, source))
-    except Exception as error:  # as above
-        raise _unreadable(source.path, error) from None
-    scaled = _scaled(levels[None], source.view, source.width, source.height)[0]
-    return torch.from_numpy(scaled >= 128) & covered
+    return _mask_of(None if source.blank else _decoded_mask(source), source)
 
 
 def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
@@ -221,6 +227,34 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
     return resized
 
 
+def _decoded(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:
+    """The photo of a source as stored: planes of `load_image` before they are scaled."""
+    try:
+        with open_image(source.path, _FORMATS) as opened:
+            planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
+    except Exception as error:  # as above
+        raise _unreadable(source.path, error) from None
+    return _with_alpha(planes, background) if planes.shape[0] == 4 else planes
+
+
+def _decoded_mask(source: ImageSource) -> np.ndarray:
+    """(H, W) uint8: the levels of a mask as stored."""
+    try:
+        with open_image(source.path, _FORMATS) as opened:
+            return mask_levels(_upright(opened, source))
+    except Exception as error:  # as above
+        raise _unreadable(source.path, error) from None
+
+
+def _mask_of(levels: np.ndarray | None, source: ImageSource) -> Tensor:
+    """`load_mask` from levels as stored. None: the mask is white."""
+    covered = torch.from_numpy(shown(source.view, source.width, source.height))
+    if levels is None:
+        return covered
+    scaled = _scaled(levels[None], source.view, source.width, source.height)[0]
+    return torch.from_numpy(scaled >= 128) & covered
+
+
 def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) -> np.ndarray:
     """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down.
 
@@ -239,16 +273,6 @@ def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) 
     if len(made) == 4:  # premultiplied colours
         made[:3] = np.minimum(made[:3], made[3])
     return resize_area(made, width, height)
-
-
-def _covered(view: LensView | None, width: int, height: int) -> np.ndarray:
-    """(height, width) bool: the pixels of a view that lie completely in the photo."""
-    if view is None or not view.partial:
-        return np.ones((height, width), bool)
-    fine: np.ndarray = np.empty((_SAMPLES * height, _SAMPLES * width), bool)
-    for rows, position in view.strips(_SAMPLES * width, _SAMPLES * height):
-        fine[rows] = view.covered(position)
-    return np.logical_and.reduce(fine.reshape(height, _SAMPLES, width, _SAMPLES), axis=(1, 3))
 
 
 def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import Protocol
 import torch
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import ImageSource, LoadedImage, box_downscale, load_image, load_mask
+from snowsplat.data.decode import ImageSource, LoadedImage, box_downscale, load_views
 
 #: Default number of threads that decode ahead.
 DECODERS = min(4, os.cpu_count() or 1)
@@ -85,6 +85,15 @@ class ImageLoader:
         self._running: dict[_Key, Future[LoadedImage]] = {}
         self._ahead: dict[_Key, int] = {}  # bytes of images decoded ahead and not yet requested
         self._submitting = False
+        # The views of each photo that has several, and a lock: only one thread decodes the photo.
+        photos: dict[Path, dict[tuple[ImageSource, ImageSource | None], None]] = {}
+        for view in views:
+            photos.setdefault(view.image.path, {})[view.image, view.mask] = None
+        self._photos = {
+            path: (threading.Lock(), list(found))
+            for path, found in photos.items()
+            if len(found) > 1
+        }
 
     def prefetch(self, order: Iterable[View], downscale: int | None = None) -> None:
         """Start decoding these views in the background, in this order.
@@ -156,13 +165,36 @@ class ImageLoader:
         return view.image, view.mask, factor
 
     def _decode(self, key: _Key) -> LoadedImage:
-        source, mask, factor = key
+        source, _, factor = key
+        if source.path not in self._photos or not self._fits(factor):
+            return self._load([key])[0]
+        lock, views = self._photos[source.path]
+        with lock:
+            with self._lock:
+                if key in self._cache:  # another thread has decoded the photo
+                    return self._cache[key]
+                found = dict.fromkeys([key, *((*view, factor) for view in views)])
+                keys = [one for one in found if one not in self._cache]
+            images = self._load(keys)
+            with self._lock:
+                for one, image in zip(keys, images, strict=True):
+                    self._store(one, image)
+        return images[0]
+
+    def _load(self, keys: Sequence[_Key]) -> list[LoadedImage]:
+        """Images of views of one photo, at one downscale factor."""
         with self._lock:
-            image = self._cache.get((source, mask, 1))
-        if image is None or image.planes.device.type != "cpu":
-            planes = load_image(source, self._background)
-            image = LoadedImage(planes, None if mask is None else load_mask(mask))
-        return box_downscale(image, factor).to(self._device)
+            whole = [self._cache.get((source, mask, 1)) for source, mask, _ in keys]
+        if any(image is None or image.planes.device.type != "cpu" for image in whole):
+            sources = [(source, mask) for source, mask, _ in keys]
+            whole = [*load_views(sources, self._background)]
+        factor = keys[0][2]
+        return [box_downscale(image, factor).to(self._device) for image in whole if image]
+
+    def _fits(self, factor: int) -> bool:
+        """Whether all views stay in the cache, so that none is resampled in vain."""
+        sizes = (_estimated_bytes((view.image, view.mask, factor)) for view in self.views)
+        return sum(sizes) <= self.budget_bytes
 
     def _store(self, key: _Key, image: LoadedImage) -> None:
         """Add an image to the cache and remove others until the budget holds. Needs the lock.

@@ -389,6 +389,32 @@ struct AlignPatchesParams {
   SNOW_FIELDS(n, side, patches, pairs, transform, correlation)
 };
 
+// ---- resample (CPU only) ------------------------------------------------------------------------
+
+// The colours of a photo at positions between nodes. Pixel (x, y) of the result is at the bilinear
+// interpolation, with the fractions across[x] and down[y], of the nodes column[x], column[x] + 1 of
+// the rows row[y], row[y] + 1.
+struct ResampleParams {
+  int64_t channels;      // 1 to 4
+  int64_t source_width;  // of the photo in pixels, below 2^16
+  int64_t source_height;
+  const uint8_t* source;  // (channels, source_height, source_width)
+  int64_t wraps;       // beside the photo: 0: its border, 1: its other side; then 0 <= x <= width
+  int64_t columns;     // of the nodes
+  const float* nodes;  // (rows, columns, 2): x, y in pixels of the photo; NaN as (-inf, -inf)
+  const int32_t* column;  // (width,), at most columns - 2
+  const float* across;    // (width,), 0 to 1
+  const int32_t* row;     // (count,)
+  const float* down;      // (count,), 0 to 1
+  int64_t width;          // of the result in pixels
+  int64_t height;
+  int64_t first;  // row of the result; this row and those after it are written
+  int64_t count;  // of the rows that are written
+  uint8_t* made;  // out, (channels, height, width)
+  SNOW_FIELDS(channels, source_width, source_height, source, wraps, columns, nodes, column, across,
+              row, down, width, height, first, count, made)
+};
+
 // ---- sizes --------------------------------------------------------------------------------------
 
 // Parameters of the entries that return a size, such as that of a scratch tensor.

@@ -93,6 +93,11 @@ struct Simd {
     for (int l = 0; l < W; l++) r.v[l] = T(p[l]);
     return r;
   }
+  // The sum of the groups of four lanes.
+  SNOW_INLINE Simd<T, 4> sum_of_quads() const {
+    static_assert(W == 4);
+    return v;
+  }
   SNOW_INLINE static Simd iota() {
     Simd r;
     for (int l = 0; l < W; l++) r.v[l] = T(l);

@@ -56,6 +56,9 @@ struct Simd<float, 8> {
   SNOW_INLINE static Simd load_bytes(const uint8_t* p) {
     return _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i*)p)));
   }
+  SNOW_INLINE Simd<float, 4> sum_of_quads() const {
+    return _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+  }
   SNOW_INLINE static Simd iota() { return _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7); }
   SNOW_INLINE static Mask first(int n) { return {_mm256_castsi256_ps(first_lanes(n))}; }
   SNOW_INLINE static uint32_t bits(Mask m) { return uint32_t(_mm256_movemask_ps(m.m)); }

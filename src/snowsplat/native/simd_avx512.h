@@ -58,6 +58,10 @@ struct Simd<float, 16> {
   SNOW_INLINE static Simd load_bytes(const uint8_t* p) {
     return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_loadu_si128((const __m128i*)p)));
   }
+  SNOW_INLINE Simd<float, 4> sum_of_quads() const {
+    const __m256 high = _mm512_extractf32x8_ps(v, 1);
+    return Simd<float, 8>(_mm256_add_ps(_mm512_castps512_ps256(v), high)).sum_of_quads();
+  }
   SNOW_INLINE static Simd iota() {
     return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
   }

@@ -28,6 +28,7 @@ from PIL import Image
 from snowsplat.data.decode import resize_area
 from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
+from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
@@ -301,9 +302,7 @@ def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int
 def _with_blank(mask: Image.Image | None, view: LensView) -> Image.Image | None:
     """``mask`` of a view, with the pixels masked that show nothing of the photo; None: nothing."""
     used = np.ones((view.height, view.width), bool) if mask is None else np.asarray(mask) >= 128
-    if view.partial:
-        for rows, position in view.strips(view.width, view.height):
-            used[rows] &= view.covered(position)
+    used &= shown(view, view.width, view.height)
     return None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
 
 

@@ -1,5 +1,7 @@
 """Undistortion compared with an analytic image: no shift, no change of brightness, little blur."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pycolmap
 import pytest
@@ -8,7 +10,9 @@ from PIL import Image
 from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
-from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.positions import Positions
+from snowsplat.data.lens.project import project
+from snowsplat.data.lens.resample import resampled, undistort_image, undistort_mask
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
@@ -105,10 +109,86 @@ def test_without_distortion_the_photo_is_unchanged():
     assert undistort_image(image, pinhole) is image
 
 
-@pytest.mark.parametrize("strip", [100, 5000, 1 << 30])
-def test_the_strip_size_does_not_change_the_result(strip, monkeypatch):
-    camera = lens(*LENSES["tangential"])
-    image, pinhole = to_image(photograph(camera, 110)), pinhole_of(camera)
-    whole = np.asarray(undistort_image(image, pinhole), np.int64)
-    monkeypatch.setattr("snowsplat.data.lens.pinhole._STRIP_PIXELS", strip)
-    assert np.abs(np.asarray(undistort_image(image, pinhole), np.int64) - whole).max() <= 1
+@dataclass
+class Grid:
+    """A map with any positions of nodes."""
+
+    nodes: np.ndarray
+    wraps: bool = False
+
+    def positions(self, width, height):
+        yield slice(0, height), Positions.between(self.nodes, width, height)
+
+
+def reference(planes: np.ndarray, at: np.ndarray, wraps: bool) -> np.ndarray:
+    """(C, H, W): Catmull-Rom splines at positions (H, W, 2) in float64, before rounding."""
+    size = planes.shape[:0:-1]
+    first = np.floor(at - 0.5).astype(int)
+    f = (at - 0.5 - first)[..., None]
+    weights = [-(f**3) + 2 * f**2 - f, 3 * f**3 - 5 * f**2 + 2, -3 * f**3 + 4 * f**2 + f]
+    weights = np.concatenate([*weights, f**3 - f**2], -1) / 2  # (H, W, 2, 4)
+    x, y = (first[..., k, None] + np.arange(-1, 3) for k in (0, 1))
+    x = x % size[0] if wraps else x.clip(0, size[0] - 1)
+    taps = planes[:, y.clip(0, size[1] - 1)[..., None], x[..., None, :]].astype(float)
+    return np.einsum("chwij,hwi,hwj->chw", taps, weights[..., 1, :], weights[..., 0, :])
+
+
+def check(planes: np.ndarray, at: np.ndarray, wraps: bool = False) -> None:
+    """`resampled` at positions (H, W, 2), which are multiples of 1/256 pixel, is the reference."""
+    height, width = at.shape[:2]
+
+    class Exact(Grid):
+        def positions(self, width, height):
+            yield slice(0, height), Positions.exact(at.astype(np.float32))
+
+    made = resampled(planes, Exact(at, wraps), width, height).astype(float)
+    assert np.abs(made - reference(planes, at, wraps).clip(0, 255)).max() <= 0.501
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 2), (200, 150)])
+def test_each_pixel_is_that_of_the_spline(channels, size):
+    """At any positions: tiles that need the whole photo, its borders, and what is beyond them."""
+    random = np.random.default_rng(channels)
+    planes = random.integers(0, 256, (channels, *size[::-1]), dtype=np.uint8)
+    low, high = (-600, -600), (256 * (size[0] + 3), 256 * (size[1] + 3))
+    check(planes, random.integers(low, high, (19, 131, 2)) / 256)
+    smooth = np.stack(np.meshgrid(np.arange(131) * 1.25, np.arange(40) * 0.5), -1)
+    check(planes, smooth + random.integers(0, 256, 2) / 256)
+    turned = smooth @ np.array([[0.75, 0.5], [-0.5, 0.75]]) + (20, 0)
+    check(planes, np.rint(256 * turned) / 256)
+    turned[..., 0] %= size[0]  # with a seam
+    check(planes, np.rint(256 * turned) / 256, wraps=True)
+
+
+@pytest.mark.isa
+def test_positions_without_a_value_do_not_disturb_others():
+    planes = np.random.default_rng(0).integers(0, 256, (3, 50, 60), dtype=np.uint8)
+    nodes = np.stack(np.meshgrid(np.linspace(0, 60, 7), np.linspace(0, 50, 6)), -1)
+    nodes = nodes.astype(np.float32)
+    whole = resampled(planes, Grid(nodes), 60, 50)
+    assert np.array_equal(whole, planes)  # each pixel is at its own position
+    nodes[2, 3] = np.nan
+    made = resampled(planes, Grid(nodes), 60, 50)
+    near = np.zeros((50, 60), bool)
+    near[10:30, 20:40] = True
+    assert np.array_equal(made[:, ~near], planes[:, ~near])
+    assert (made[:, near] == planes[:, :1, 0]).all()
+    nodes[2, 3] = np.inf
+    assert (resampled(planes, Grid(nodes), 60, 50)[:, near] >= 0).all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_positions_between_nodes_are_exact_to_a_hundredth_of_a_pixel(name):
+    model, params = LENSES[name]
+    camera = LensModel(model, 1280, 960, (*(4 * np.array(params[: -4 if len(params) > 4 else 3])),))
+    camera = LensModel(model, 1280, 960, (*camera.params, *params[len(camera.params) :]))
+    pinhole = pinhole_of_lens(camera)
+    fx, fy, cx, cy = pinhole.params
+    ((_, positions),) = pinhole.positions(pinhole.width, pinhole.height)
+    for rows, found in positions.strips():
+        x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height)[rows] + 0.5
+        across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
+        true = project(camera, np.stack([across, down, np.ones_like(across)], -1))
+        assert np.abs(found - true).max() < 0.011  # with the rounding to float32

@@ -6,20 +6,18 @@ calibration that SfM may return.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.positions import Positions, node_grid
 from snowsplat.data.lens.project import BROWN, intrinsics, project, unproject
 
-_MAP_ERROR = 0.02  # pixels: largest error of the bilinear interpolation between nodes
-_CELLS = (64, 32, 16, 8, 4)  # pixels: approximate cell sizes, tried in this order
 _CROPPED = 0.95  # of width and height; without blank borders, an image shows more of the photo
 _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle
-_STRIP_PIXELS = 1 << 18  # processed at a time: limits the memory and fits the caches
 # Models that are pinhole cameras if their coefficients are 0.
 _PINHOLES = frozenset(
     {
@@ -41,9 +39,7 @@ _MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the cali
 class Pinhole:
     """A camera without distortion, and the map from its pixels to those of the distorted photo.
 
-    The undistorted image is divided into n × m equal cells. ``nodes`` (n + 1, m + 1, 2) holds the
-    positions x, y in the photo, in pixels, of the corners of the cells. Positions within a cell are
-    interpolated bilinearly. ``nodes`` is None if there is no distortion.
+    ``nodes`` is that of `Positions`, for the whole image; None if there is no distortion.
     """
 
     width: int  # pixels
@@ -53,12 +49,10 @@ class Pinhole:
     cropped: bool = False  # the outer part is cut off, because the calibration is invalid there
     wraps: ClassVar[bool] = False  # see `LensView.wraps`
 
-    def strips(self, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
-        """Rows of this image at the size ``width`` × ``height``, and the positions of their pixels
-        in the photo: (H, W, 2) float32 x, y in pixels.
-        """
+    def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
+        """See `LensView.positions`."""
         assert self.nodes is not None
-        return interpolated(self.nodes, width, height)
+        yield slice(0, height), Positions.between(self.nodes, width, height)
 
 
 def is_pinhole(lens: LensModel) -> bool:
@@ -160,49 +154,3 @@ def _is_valid(lens: LensModel, pinhole: Pinhole) -> bool:
     # A cell must have at least 1% of the area of the central cell: if it is stretched more, it has
     # no usable detail.
     return bool(area.min() > 0.01 * area[32, 32] > 0)
-
-
-def node_grid(
-    width: int, height: int, positions: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """`Pinhole.nodes`, with the largest cells for which the error is below `_MAP_ERROR`.
-
-    Args:
-        width, height: of the image in pixels.
-        positions: of columns x and rows y, in pixels, to positions (len(y), len(x), 2) in the
-            photo; NaN where there are none.
-    """
-    for cell in _CELLS:
-        x, y = (np.linspace(0, size, -(-size // cell) + 1) for size in (width, height))
-        nodes = positions(x, y)
-        middles = positions((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
-        means = (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4
-        error = np.abs(means - middles)
-        if not (error > _MAP_ERROR).any():
-            break
-    return nodes.astype(np.float32)
-
-
-def interpolated(nodes: np.ndarray, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
-    """Rows of an image, and the positions (H, W, 2) float32 of their pixels between the nodes."""
-    column, across = _cells(width, nodes.shape[1] - 1)
-    row, down = _cells(height, nodes.shape[0] - 1)
-    lines = nodes[:, column]
-    lines += (nodes[:, column + 1] - lines) * across[:, None]
-    step = max(1, _STRIP_PIXELS // width)
-    for first in range(0, height, step):
-        last = min(first + step, height)
-        position = np.empty((last - first, width, 2), np.float32)
-        for cell in range(row[first], row[last - 1] + 1):
-            start, end = np.searchsorted(row, (cell, cell + 1)).clip(first, last)
-            part = position[start - first : end - first]
-            np.multiply(lines[cell + 1] - lines[cell], down[start:end, None, None], out=part)
-            part += lines[cell]
-        yield slice(first, last), position
-
-
-def _cells(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The cell (of ``count``) of each of ``size`` pixels, and the position in the cell, 0..1."""
-    position = (np.arange(size) + 0.5) * (count / size)
-    cell = np.minimum(position.astype(np.int64), count - 1)
-    return cell, (position - cell).astype(np.float32)

@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
-import cv2
 import numpy as np
 from PIL import Image
 
 from snowsplat.data.lens.pinhole import Pinhole
+from snowsplat.data.lens.positions import Positions
 from snowsplat.data.lens.views import LensView
-
-_STEPS = 32  # OpenCV divides a pixel into so many positions along each axis
-_MARGIN = 3  # pixels beside a pixel that its spline may need
+from snowsplat.util import array_kernels
+from snowsplat.util.native_library import ArrayPointer
 
 
 class PixelMap(Protocol):
@@ -32,8 +31,8 @@ class PixelMap(Protocol):
     @property
     def wraps(self) -> bool: ...
 
-    def strips(self, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
-        """See `LensView.strips`."""
+    def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
+        """See `LensView.positions`."""
         ...
 
 
@@ -63,17 +62,28 @@ def resampled(
     the photo get the colour of its border.
     """
     made: np.ndarray = np.empty((len(planes), height, width), np.uint8)
-    margin = _MARGIN if view.wraps else 0
-    pixels = np.atleast_3d(cv2.merge([np.ascontiguousarray(plane) for plane in planes]))
-    if margin:
-        pixels = np.pad(pixels, ((0, 0), (margin, margin), (0, 0)), mode="wrap")
-    for rows, position in view.strips(width, height):
-        if scale != (1, 1) or margin:
-            position *= np.array(scale, np.float32)
-            position[..., 0] += margin
-        if np.isnan(position.sum()):
-            np.nan_to_num(position, copy=False, nan=-1.0)
-        made[:, rows] = _catmull_rom(pixels, position).transpose(2, 0, 1)
+    source = ArrayPointer(np.ascontiguousarray(planes))
+    for rows, positions in view.positions(width, height):
+        nodes = positions.nodes * np.array(scale, np.float32)
+        params = array_kernels.ResampleParams(
+            channels=len(planes),
+            source_width=planes.shape[2],
+            source_height=planes.shape[1],
+            source=source,
+            wraps=view.wraps,
+            columns=nodes.shape[1],
+            nodes=ArrayPointer(nodes),
+            column=ArrayPointer(positions.column),
+            across=ArrayPointer(positions.across),
+            row=ArrayPointer(positions.row),
+            down=ArrayPointer(positions.down),
+            width=width,
+            height=height,
+            first=rows.start,
+            count=rows.stop - rows.start,
+            made=ArrayPointer(made),
+        )
+        array_kernels.call("resample", params)
     return made
 
 
@@ -90,42 +100,3 @@ def nearest(values: np.ndarray, view: LensView, width: int, height: int) -> np.n
         column, row = column.clip(0, values.shape[1] - 1), row.clip(0, values.shape[0] - 1)
         made[rows][shown] = values[row, column]
     return made
-
-
-def _catmull_rom(pixels: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(H, W, C): a photo (h, w, C) uint8 at positions (H, W, 2) float32, to 1/32 of a pixel.
-
-    Kernels of cubic convolution have a free parameter a: the kernel is K₀ + a·G. OpenCV uses
-    a = −0.75, which sharpens. Catmull-Rom uses a = −0.5, which is exact for quadratics (Keys 1981).
-    So the kernel of Catmull-Rom is 1/3 of K₀ plus 2/3 of OpenCV's. K₀ uses two pixels: it is
-    bilinear interpolation with each fraction f replaced by 3f² − 2f³. (Here the results of the 2D
-    interpolations are added instead of the 1D kernels. This leaves an error of the fourth order.)
-
-    Changes ``position``.
-    """
-    top, bottom = _needed(position[..., 1], pixels.shape[0])
-    left, right = _needed(position[..., 0], pixels.shape[1])
-    part = pixels[top:bottom, left:right]
-    position -= np.array([left + 0.5, top + 0.5], np.float32)
-    whole, fraction = cv2.convertMaps(position, None, cv2.CV_16SC2)  # type: ignore[call-overload]
-    border = cv2.BORDER_REPLICATE
-    cubic = cv2.remap(part, whole, fraction, cv2.INTER_CUBIC, borderMode=border)
-    bent = cv2.remap(part, whole, _BENT[fraction], cv2.INTER_LINEAR, borderMode=border)
-    made: np.ndarray = cv2.addWeighted(cubic, 2 / 3, bent, 1 / 3, 0)
-    return made.reshape(*position.shape[:2], -1)
-
-
-def _needed(position: np.ndarray, size: int) -> tuple[int, int]:
-    """The pixels of an axis that positions need: the first, and one beyond the last."""
-    first = int(np.clip(position.min() - _MARGIN, 0, size - 1))
-    return first, int(np.clip(position.max() + _MARGIN, first + 1, size))
-
-
-def _bent_fractions() -> np.ndarray:
-    """For each of OpenCV's fractions, 32·y + x in 1/32 pixels, that of 3f² − 2f³ of both axes."""
-    f = np.arange(_STEPS) / _STEPS
-    bent = np.minimum(np.rint(_STEPS * f * f * (3 - 2 * f)), _STEPS - 1)
-    return (_STEPS * bent[:, None] + bent).ravel().astype(np.uint16)
-
-
-_BENT = _bent_fractions()

@@ -19,7 +19,8 @@ from functools import lru_cache
 import numpy as np
 
 from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import interpolated, node_grid, pinhole_of
+from snowsplat.data.lens.pinhole import pinhole_of
+from snowsplat.data.lens.positions import Positions, node_grid
 from snowsplat.data.lens.project import intrinsics, project
 
 # Radians: a pinhole image of a wider field has too many pixels near its border.
@@ -71,12 +72,12 @@ class LensView:
         """Whether the left border of the photo continues at its right border."""
         return self.lens.model == "EQUIRECTANGULAR"
 
-    def strips(self, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
+    def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
         """Rows of this view at the size ``width`` × ``height``, and the positions of their pixels
-        in the photo: (H, W, 2) float32 x, y in pixels of the lens; NaN where there are none.
+        in the photo, in pixels of the lens; NaN where there are none.
         """
         if not self.wraps:
-            yield from interpolated(_nodes(self), width, height)
+            yield slice(0, height), Positions.between(_nodes(self), width, height)
             return
         # Longitude has a seam and two poles, where it cannot be interpolated.
         for first in range(0, height, 64):
@@ -85,7 +86,13 @@ class LensView:
             y = (np.arange(*rows.indices(height), dtype=np.float32) + 0.5) * np.float32(
                 self.height / height
             )
-            yield rows, project(self.lens, self.rays(x, y)).astype(np.float32)
+            yield rows, Positions.exact(project(self.lens, self.rays(x, y)).astype(np.float32))
+
+    def strips(self, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
+        """As `positions`, in arrays (H, W, 2) float32."""
+        for rows, positions in self.positions(width, height):
+            for part, position in positions.strips():
+                yield slice(rows.start + part.start, rows.start + part.stop), position
 
     def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """(len(y), len(x), 3): directions in the frame of the lens of pixels of this view."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap import kernels
+from snowsplat.util import array_kernels
 from snowsplat.util.native_library import ArrayPointer
 
 #: Number of values of a descriptor.
@@ -70,7 +70,7 @@ def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Ne
             raise ValueError(f"two_nearest: {name} must be uint8, got {descriptors.dtype}")
     n, m = len(first), len(second)
     rows, columns = (Nearest(*(np.empty(k, np.int32) for _ in range(3))) for k in (n, m))
-    params = kernels.MatchDescriptorsParams(
+    params = array_kernels.MatchDescriptorsParams(
         n=n,
         m=m,
         first=ArrayPointer(np.ascontiguousarray(first)),
@@ -82,7 +82,7 @@ def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Ne
         column_best=ArrayPointer(columns.best),
         column_second=ArrayPointer(columns.second),
     )
-    kernels.call("match_descriptors", params)
+    array_kernels.call("match_descriptors", params)
     return rows, columns
 
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap import kernels
+from snowsplat.util import array_kernels
 from snowsplat.util.native_layout import ALIGNMENT_RADIUS
 from snowsplat.util.native_library import ArrayPointer
 
@@ -102,7 +102,7 @@ def align_patches(patches: NDArray[np.uint8], pairs: NDArray[np.int32]) -> Align
     if pairs.size and not (pairs.min() >= 0 and pairs.max() < len(patches)):
         raise ValueError(f"align_patches: pairs must be indices of {len(patches)} patches")
     aligned = Aligned(np.empty((len(pairs), 2, 3), np.float32), np.empty(len(pairs), np.float32))
-    params = kernels.AlignPatchesParams(
+    params = array_kernels.AlignPatchesParams(
         n=len(pairs),
         side=SIDE,
         patches=ArrayPointer(np.ascontiguousarray(patches)),
@@ -110,5 +110,5 @@ def align_patches(patches: NDArray[np.uint8], pairs: NDArray[np.int32]) -> Align
         transform=ArrayPointer(aligned.transform),
         correlation=ArrayPointer(aligned.correlation),
     )
-    kernels.call("align_patches", params)
+    array_kernels.call("align_patches", params)
     return aligned

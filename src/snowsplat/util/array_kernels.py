@@ -1,4 +1,4 @@
-"""Calls the native functions of structure from motion with NumPy arrays.
+"""Calls native functions with NumPy arrays: those of structure from motion and of undistortion.
 
 The child process of COLMAP does not import torch, so it cannot use `snowsplat.ops`. The functions
 exist for the CPU only; `native/params.h` documents their parameters.
@@ -45,9 +45,32 @@ class AlignPatchesParams(Params):
     correlation: ArrayPointer
 
 
+@dataclass(slots=True, kw_only=True)
+class ResampleParams(Params):
+    """The struct of the same name in `native/params.h`."""
+
+    channels: int
+    source_width: int
+    source_height: int
+    source: ArrayPointer
+    wraps: bool
+    columns: int
+    nodes: ArrayPointer
+    column: ArrayPointer
+    across: ArrayPointer
+    row: ArrayPointer
+    down: ArrayPointer
+    width: int
+    height: int
+    first: int
+    count: int
+    made: ArrayPointer
+
+
 ENTRIES: dict[str, type[Params]] = {
     "match_descriptors": MatchDescriptorsParams,
     "align_patches": AlignPatchesParams,
+    "resample": ResampleParams,
 }
 
 
