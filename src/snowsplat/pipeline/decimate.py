@@ -12,8 +12,9 @@ import torch
 from snowsplat.formats.origin_file import read_origin, write_origin
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.origin import HERE
+from snowsplat.scene.origin import HERE, Origin
 from snowsplat.scene.simplify import simplify
 from snowsplat.training.core.distillation import distill
 from snowsplat.training.core.progress import Progress
@@ -58,18 +59,20 @@ class Decimation:
     Attributes:
         cameras: the cameras of the photos; empty: unknown.
         background: the colour behind the scene.
+        origin: that of the cameras; None: that of the scene.
         refined: trains the result on the photos; None: it is trained on renderings of the whole
             scene from the cameras.
     """
 
     cameras: Sequence[Camera] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: Origin | None = None
     refined: Callable[[Gaussians], Gaussians] | None = None
     observer: Observer = SILENT
 
     def merged(self, scene: Gaussians, count: int) -> Gaussians:
         """``count`` Gaussians, see `simplify`; fewer if the scene has fewer."""
-        return simplify(scene, count, self.cameras)
+        return simplify(seen_from(scene, self.origin or scene.origin), count, self.cameras)
 
     def fitted(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         """Merged Gaussians that look more like ``scene``, of which they were made."""
