@@ -87,6 +87,9 @@ def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(garden, pho
     assert again.code == 0
     assert again.out.count("done before") == len(STAGES)
     assert times(out) == before
+    mine, out = mine.rename(tmp_path / "renamed"), out.rename(tmp_path / "moved")
+    again = run("sfm", mine, "-o", out, *QUICK)
+    assert again.out.count("done before") == len(STAGES), again.err
 
     again = run("sfm", mine, "-o", out, *QUICK, "--resize")
     assert "images: repeated (changed: resize)" in again.out
@@ -124,10 +127,12 @@ def test_photos_in_place(garden, photos, run, refused, tmp_path):
     assert result.code == 0, result.err
     assert times(place / "input") == before
     assert load_dataset(place).train
-    # The original photos are never replaced, not even by a subset of them.
-    for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
-        line = refused("sfm", *inputs, "-o", place, "--overwrite", *QUICK)
-        assert f"{place / 'input'}: contains the original photos" in line
+    # The original photos are never replaced, not even by a subset of them, or after a move.
+    for name in ("place", "moved"):
+        place = place.rename(tmp_path / name)
+        for inputs in (sorted((place / "input").iterdir())[:5], [photos]):
+            line = refused("sfm", *inputs, "-o", place, "--overwrite", *QUICK)
+            assert f"{place / 'input'}: contains the original photos" in line
     assert times(place / "input") == before
 
     # An existing model is only undistorted.

@@ -8,10 +8,15 @@ import shutil
 import pytest
 from PIL import Image, ImageOps
 
+from snowsplat.pipeline import make
+from snowsplat.pipeline.make_plan import MakePlan
+from snowsplat.pipeline.observer import SILENT
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.sfm.ingest.sources import Sources
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.util.stages import Outcome, Stages
 
 _SETTINGS = {"max_gaussians": 200, "init": "points", "checkpoint_every": 2}
 
@@ -74,3 +79,20 @@ def test_edited_photos(project, tmp_path, caplog):
     caplog.clear()
     resume(out, TrainOptions(settings={"iterations": 8}))
     assert "edited" not in caplog.text  # it is said once
+
+
+@pytest.mark.parametrize(
+    ("recorded", "same", "name"),
+    [("old", True, "old"), ("old", False, "new"), ("../old", True, "new"), (None, True, "new")],
+)
+def test_make_keeps_its_name_if_only_the_photos_were_renamed(
+    recorded, same, name, tmp_path, monkeypatch
+):
+    done = {"photos": Outcome({}, 0.0, same)}
+    monkeypatch.setattr(make, "make_dataset", lambda *args, **flags: done)
+    job = make._Job([tmp_path], "new", tmp_path, make.MakeOptions(), False, SILENT, None, 0.0)
+    job.sources, job.plan = Sources((tmp_path,), [], [], []), MakePlan("draft", 9)
+    job.stages = Stages(tmp_path / "make.json", make.STAGES)
+    job.stages.about = {"name": recorded}
+    job._make_dataset()
+    assert (job.file, job.stages.about["name"]) == (tmp_path / f"{name}.ply", name)

@@ -14,8 +14,9 @@ from snowsplat.data.dataset import scene_extent
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.near_plane import near_plane
 
-# At most this number of cameras and of points is used, evenly chosen, to limit the time.
-_CAMERAS, _POINTS = 64, 10_000
+# At most this number of cameras is used, evenly chosen, to limit the time; of the points about this
+# number, and more if that is too few for most cameras: each may see a small part of a large scene.
+_CAMERAS, _POINTS, _MORE = 64, 10_000, 8
 # The nearest points of a camera are ignored, because some points are wrong; and so are the cameras
 # with the nearest points, of which some may be wrong.
 _NEAREST, _NEAREST_CAMERAS = 0.02, 0.1
@@ -35,7 +36,11 @@ def near_of(cameras: Sequence[Camera], points: Tensor | None) -> float:
         points: (P, 3) in the world frame, or None.
     """
     used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
-    depths = [] if points is None else _depths(used, points)
+    depths = []
+    if points is not None:
+        step = max(1, len(points) // _POINTS)
+        while len(depths := _depths(used, points[::step])) < len(used) / 2 and step > 1:
+            step = max(1, step // _MORE)
     if depths:
         nearest, medians = np.array(depths).T
         return near_plane(float(np.median(medians)), float(np.quantile(nearest, _NEAREST_CAMERAS)))
@@ -46,7 +51,7 @@ def near_of(cameras: Sequence[Camera], points: Tensor | None) -> float:
 
 def _depths(cameras: Sequence[Camera], points: Tensor) -> list[tuple[float, float]]:
     """For each camera that sees enough points: their 2% quantile and their median depth."""
-    points = points.detach().cpu().double()[:: max(1, len(points) // _POINTS)]
+    points = points.detach().cpu().double()
     levels = torch.tensor([_NEAREST, 0.5], dtype=torch.float64)
     found = []
     for camera in cameras:

@@ -20,6 +20,7 @@ from snowsplat.pipeline.output.scene_paths import folder_around
 from snowsplat.pipeline.output.scene_source import Color, load_viewable
 from snowsplat.pipeline.refine import photos_of
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
@@ -85,14 +86,15 @@ def clean(
     device = (compute or Compute()).apply()
     source = load_viewable(scene)
     photos = _photos(source.file, None if dataset is None else Path(dataset))
-    cameras = source.cameras
-    if photos is not None and not cameras:
-        cameras = [view.camera for view in photos.train]
+    gaussians, cameras = source.gaussians, source.cameras
+    if photos is not None:
+        gaussians = seen_from(gaussians, photos.origin)
+        cameras = [view.camera for view in [*photos.train, *photos.test]]
     if not cameras:
         raise UserError(
             f"{scene}: the cameras are unknown, because it is in no output folder; set `dataset`"
         )
-    gaussians = source.gaussians.to(device)
+    gaussians = gaussians.to(device)
     cameras = [camera.to(device) for camera in cameras]
     with single_threaded():
         judge = _judge(gaussians, cameras, photos, source.background)

@@ -235,7 +235,8 @@ def _decimation(
         raise SettingError("refine", "the photos show the whole scene; crop it later")
     photos, background = photos_of(scenes[0], Path(dataset))
     refined = partial(refine, dataset=photos, background=background, observer=observer)
-    return Decimation([view.camera for view in photos.train], refined=refined)
+    cameras = [view.camera for view in photos.train]
+    return Decimation(cameras, origin=photos.origin, refined=refined)
 
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:

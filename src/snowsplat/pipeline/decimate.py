@@ -12,8 +12,9 @@ import torch
 from snowsplat.formats.origin_file import read_origin, write_origin
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.origin import HERE
+from snowsplat.scene.origin import HERE, Origin
 from snowsplat.scene.simplify import simplify
 from snowsplat.training.core.distillation import distill
 from snowsplat.training.core.progress import Progress
@@ -57,6 +58,7 @@ class Decimation:
 
     cameras: Sequence[Camera] = ()  # the cameras of the photos; empty: unknown
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the colour behind the scene
+    origin: Origin | None = None  # that of the cameras; None: that of the scene
     # Trains the result on the photos; None: it is trained on renderings of the whole scene from the
     # cameras.
     refined: Callable[[Gaussians], Gaussians] | None = None
@@ -64,7 +66,7 @@ class Decimation:
 
     def merged(self, scene: Gaussians, count: int) -> Gaussians:
         """``count`` Gaussians, see `simplify`; fewer if the scene has fewer."""
-        return simplify(scene, count, self.cameras)
+        return simplify(seen_from(scene, self.origin or scene.origin), count, self.cameras)
 
     def fitted(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         """Merged Gaussians that look more like ``scene``, of which they were made."""

@@ -291,7 +291,7 @@ class _Job:
                 seconds=self.options.minutes and POSES_SHARE * 60.0 * self.options.minutes,
             ),
         )
-        make_dataset(
+        outcomes = make_dataset(
             self.sources,
             self.dataset,
             options,
@@ -299,6 +299,10 @@ class _Job:
             overwrite=self.overwrite,
             later=self._later(),
         )
+        before = self.stages.about.get("name")
+        if outcomes["photos"].again and isinstance(before, str) and Path(before).name == before:
+            self.name = before  # the photos are the same, if their folder was renamed, too
+        self.stages.about["name"] = self.name
 
     def _later(self) -> Later:
         """The work after the dataset is made, for the estimate of the time left."""

@@ -9,6 +9,7 @@ from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings
 from snowsplat.pipeline.output.scene_paths import folder_around
+from snowsplat.pipeline.run.refined_cameras import with_refined
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.distillation import MERGED_RATES
 from snowsplat.training.core.trainer import Trainer
@@ -23,8 +24,8 @@ _RATES = replace(MERGED_RATES, means=1.44e-4, means_final=4.8e-6, anneal=0.1, an
 def photos_of(scene: Path, dataset: Path) -> tuple[Dataset, str]:
     """The photos for `refine`, and the colour behind them.
 
-    If ``scene`` is in an output folder, the photos have the size of its training, and those that it
-    held out are held out.
+    If ``scene`` is in an output folder, the photos have the size of its training, those that it
+    held out are held out, and the cameras are those that it has refined.
 
     Raises:
         UserError: ``dataset`` is not a dataset.
@@ -35,7 +36,7 @@ def photos_of(scene: Path, dataset: Path) -> tuple[Dataset, str]:
         trained, color = folder.settings()
         settings = replace(trained, path=settings.path)
         background = "white" if min(color) == 1.0 else "black"
-    return settings.load(), background
+    return with_refined(folder.path, settings.load()), background
 
 
 def refine(

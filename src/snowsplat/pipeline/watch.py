@@ -15,7 +15,9 @@ from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
 from snowsplat.pipeline.output.scene_paths import existing_folder
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.run.live_page import LivePage
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.live.viewer import Scene
@@ -48,7 +50,7 @@ def watch(
     """
     folder = watched_folder(Path(output))
     data, background = load_dataset_of(folder, dataset, resolution)
-    newest = NewestScene(folder, iteration, (compute or Compute()).apply())
+    newest = NewestScene(folder, iteration, (compute or Compute()).apply(), data.origin)
     newest()  # a scene that cannot be shown is reported before the page opens
     with suppress(KeyboardInterrupt):  # Ctrl-C is the normal end as soon as the page is open
         page.open(data, background, folder.path.absolute().name, observer)
@@ -66,14 +68,20 @@ class NewestScene:
     """The newest scene or checkpoint of a folder; each file is read once."""
 
     def __init__(
-        self, folder: OutputFolder, iteration: int | None, device: torch.device | None = None
+        self,
+        folder: OutputFolder,
+        iteration: int | None,
+        device: torch.device | None = None,
+        origin: Origin = HERE,
     ) -> None:
         """
         Args:
             iteration: show only the scene of this iteration; None: the newest.
             device: the device for the Gaussians; None: the CPU.
+            origin: that of the dataset, to which the Gaussians are moved.
         """
         self._folder, self._iteration, self._device = folder, iteration, device
+        self._origin = origin
         self._read: tuple[Path, int] | None = None  # the file shown, and when it was written
         self._scene: Scene | None = None
 
@@ -112,7 +120,7 @@ class NewestScene:
 
     def _gaussians(self, path: Path) -> Gaussians:
         if path.parent != self._folder.checkpoints:
-            return read_gaussians(path)
+            return seen_from(read_gaussians(path), self._origin)
         saved = checkpoint.load(path)
         part = "gaussians."
         own: dict[str, Any] = {
@@ -120,6 +128,6 @@ class NewestScene:
         }
         try:
             antialiased = saved.meta.get("training", {}).get("antialias", False)
-            return Gaussians(**own, antialiased=bool(antialiased))
+            return Gaussians(**own, antialiased=bool(antialiased), origin=self._origin)
         except (AttributeError, TypeError, ValueError):
             raise UserError(f"{path}: not a checkpoint of a training run") from None

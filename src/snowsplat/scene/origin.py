@@ -64,6 +64,11 @@ def stored_origin(value: object) -> Origin | None:
     return (x, y, z)
 
 
+def opposite(origin: Origin) -> Origin:
+    """Where 0 of the world is, seen from ``origin``."""
+    return (-origin[0], -origin[1], -origin[2])
+
+
 def added(a: Origin, b: Origin) -> Origin:
     """The origin of positions relative to ``a`` that are relative to ``b`` themselves."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])

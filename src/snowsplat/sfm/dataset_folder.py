@@ -18,8 +18,9 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
@@ -123,11 +124,12 @@ def make_dataset(
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     in_place = sources.contain(folder / "input")
     with one_run(folder):
-        _check_free(folder, in_place, sources.inputs, options, overwrite)
+        _check_free(folder, in_place, sources, options, overwrite)
         _rename_former_files(folder)
         with _remove_on_failure(folder):
             stages = Stages(folder / RECORD, STAGES)
-            stages.about = {"inputs": [str(path.absolute()) for path in sources.inputs]}
+            paths = [str(path.absolute()) for path in sources.inputs]
+            stages.about = {"inputs": paths, "in_place": in_place}
             stages.save()  # from here on the folder is recognised as a dataset
             left = _time_left(sources, options, later or Later())
             return _run(stages, sources, folder, options, watcher, in_place, left)
@@ -177,9 +179,12 @@ def _run(
     for name, default in (("photos", None), ("panoramas", False), ("as_stored", False)):
         if chosen[name] == default:  # earlier versions did not have these settings
             del chosen[name]
+    fingerprint, former = _fingerprints(sources.paths)
+    if stages.settings("photos").get("input") == former:
+        fingerprint = former
     stage(
         "photos",
-        {"input": _fingerprint(sources.paths), **chosen},
+        {"input": fingerprint, **chosen},
         ["input", "distorted/masks"],
         gather_photos,
     )
@@ -278,7 +283,7 @@ def _undistort(
 def _check_free(
     folder: Path,
     in_place: bool,
-    inputs: Sequence[Path],
+    sources: Sources,
     options: DatasetOptions,
     overwrite: bool,
 ) -> None:
@@ -286,13 +291,17 @@ def _check_free(
     remove_temporaries(folder, (RECORD, REPORT))
     record = next((folder / name for name in RECORDS if (folder / name).is_file()), None)
     if record is not None:
-        before = Stages(record, STAGES).about.get("inputs")
-        if not in_place and _were_in_place(before, folder):
+        stages = Stages(record, STAGES)
+        if not in_place and _were_in_place(stages.about, folder):
             raise UserError(
                 f"{folder / 'input'}: contains the original photos of this dataset, not copies; "
                 "use another folder"
             )
-        if before != [str(path.absolute()) for path in inputs] and not overwrite:
+        before = stages.about.get("inputs")
+        same = before == [str(path.absolute()) for path in sources.inputs]
+        # The photos may have been moved.
+        same |= stages.settings("photos").get("input") in _fingerprints(sources.paths)
+        if not same and not overwrite:
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
                 f"{folder}: contains a dataset made from {what}; use another folder, or set "
@@ -318,9 +327,11 @@ def _rename_former_files(folder: Path) -> None:
         (folder / FORMER_REPORT).unlink(missing_ok=True)
 
 
-def _were_in_place(inputs: Any, folder: Path) -> bool:
-    """Whether one of the recorded ``inputs`` is the ``input`` folder of the dataset itself."""
-    names = inputs if isinstance(inputs, list) else []
+def _were_in_place(about: Mapping[str, Any], folder: Path) -> bool:
+    """Whether the ``input`` folder of the dataset itself was an input, as its record says."""
+    if isinstance(about.get("in_place"), bool):  # also after the folder was moved
+        return bool(about["in_place"])
+    names = inputs if isinstance(inputs := about.get("inputs"), list) else []
     own = (folder / "input").resolve()
     return any(isinstance(name, str) and Path(name).resolve() == own for name in names)
 
@@ -359,13 +370,25 @@ def _remove(path: Path) -> None:
 # JSON
 
 
-def _fingerprint(files: Sequence[Path]) -> str:
-    """A hash of file names, sizes and times; it changes if a photo is added, removed or edited."""
-    entries = []
-    for file in files:
-        status = file.stat()
-        entries.append([str(file.absolute()), status.st_size, status.st_mtime_ns])
-    return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
+def _fingerprints(files: Sequence[Path]) -> tuple[str, str]:
+    """Hashes of file names, sizes and times; they change if a photo is added, removed or edited.
+
+    The names are relative to the folder of all files, which may be moved, and, in the second hash,
+    which earlier versions recorded, absolute.
+    """
+    paths = [file.absolute() for file in files]
+    try:
+        base = Path(os.path.commonpath([path.parent for path in paths]))
+    except ValueError:  # no files, or several drives of Windows
+        base = Path()
+    status = [path.stat() for path in paths]
+
+    def hashed(names: Sequence[str]) -> str:
+        entries = [[n, s.st_size, s.st_mtime_ns] for n, s in zip(names, status, strict=True)]
+        return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
+
+    relative = [os.path.relpath(path, base) if base.name else str(path) for path in paths]
+    return hashed(relative), hashed([str(path) for path in paths])
 
 
 def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:

@@ -120,6 +120,10 @@ class Stages:
         """Whether an earlier run finished this stage, with any settings."""
         return name in self._records
 
+    def settings(self, name: str) -> dict[str, Any]:
+        """The settings with which an earlier run finished this stage; empty if none did."""
+        return self._records[name]["settings"] if name in self._records else {}
+
     def save(self) -> None:
         """Write the record. `run` calls this after each stage."""
         write_json(self.file, {"snowsplat": __version__} | self.about | {"stages": self._records})

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from snowsplat.data.near import near_of
 from snowsplat.data.placement import PLACEMENT, Placement, placement_of, read_placement
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
-from snowsplat.scene.orientation import VIEWING_DISTANCE
 from snowsplat.sfm.gps import east_north_up, location_of
 from snowsplat.sfm.ingest.photo import Attitude, Photo
 from snowsplat.sfm.orient import orientation
@@ -193,16 +194,17 @@ def test_without_altitudes_gps_still_gives_the_scale(model_of):
     assert 4 < placement.level_error < 10  # the path may slope by a tenth
 
 
-def test_a_scene_that_is_nearer_than_a_metre_keeps_its_scale(model_of):
-    """A long shelf at 0.5 m: in metres, the near plane of training would cut it."""
+def test_a_near_scene_is_in_metres_and_not_cut(model_of):
+    """A long wall at 5 cm: the near plane is relative to the distance."""
     centres = np.stack([np.arange(160) * 0.5, np.zeros(160), np.ones(160)], 1)
     poses = poses_of(centres, centres + np.array([0, 1, 0]))
     random = np.random.default_rng(0)
-    points = torch.from_numpy(random.uniform((-1, 0.45, 0.7), (80, 0.55, 1.3), (4000, 3)))
+    points = torch.from_numpy(random.uniform((-1, 0.045, 0.9), (80, 0.055, 1.1), (40_000, 3)))
     found, placement = placed(model_of, poses, photos_of(poses, gps=2.0), points)
-    assert placement.metres_per_unit * found.scale == pytest.approx(1, rel=0.05)
-    assert found.scale * 0.5 == pytest.approx(VIEWING_DISTANCE, rel=0.2)
-    assert not placement.is_metric
+    assert placement.is_metric
+    assert found.scale == pytest.approx(1, rel=0.05)
+    cameras = [Camera(160, 120, 100.0, 100.0, 80.0, 60.0, pose) for pose in poses]
+    assert near_of(cameras, points) < 0.045 / 2
 
 
 def test_a_gimbal_levels_photos_that_look_straight_down(model_of):

@@ -20,7 +20,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
-from snowsplat.scene.initial_view import InitialView
+from snowsplat.scene.initial_view import InitialView, overview
 from snowsplat.scene.render import render
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import ready, site
@@ -83,6 +83,11 @@ def test_scenes_of_unusual_scale_are_rescaled(trained, scale):
     assert math.dist(start.position, start.target) == pytest.approx(3.0, abs=1e-3)
     ours = picture(trained.gaussians, wide(trained.cameras[0], start))
     assert psnr(picture(gaussians, camera_of(start)), ours) > 40
+    alone = transform(odd, _similarity(scale, torch.eye(3).tolist()))  # a file without cameras
+    gaussians, start, *_ = ready(alone, ())
+    assert math.dist(start.position, start.target) == pytest.approx(3.0, abs=1e-3)
+    there = overview(alone)
+    assert psnr(picture(gaussians, camera_of(start)), picture(alone, camera_of(there))) > 40
 
 
 def test_an_upright_scene_is_unchanged(trained):

@@ -74,7 +74,7 @@ def refine_photo(
     z = alignment.apply(z)
     limit = round(_LIFTED_SHARE * config.density.max_gaussians)
     options = replace(options, max_gaussians=min(options.max_gaussians or limit, limit))
-    lifted = lift(pixels, z, view.camera, options)
+    lifted = replace(lift(pixels, z, view.camera, options), origin=posed.origin)
     out.begin(posed, settings, config)
     source = "of the dataset"
     finish(out, 0, lifted, pixels, z, view.camera, source, swing=False, started=started)
@@ -137,8 +137,10 @@ def _with_unseen_points(
     unseen = ~(inside & (z > 0))
     if not bool(unseen.any()):
         return lifted
-    others = Points(points.xyz[unseen], points.rgb[unseen])
-    return lifted.append(Gaussians.from_points(others, sh_degree=0, initial_opacity=opacity))
+    others = Gaussians.from_points(
+        Points(points.xyz[unseen], points.rgb[unseen]), sh_degree=0, initial_opacity=opacity
+    )
+    return lifted.append(replace(others, origin=lifted.origin))
 
 
 def _with_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -16,6 +16,7 @@ from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.data.lens.brown import as_colmap
 from snowsplat.data.lens.model import LensModel
 from snowsplat.scene.geometry import quat_from_rotation
+from snowsplat.scene.origin import Origin, opposite
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,9 @@ logger = logging.getLogger(__name__)
 _LENS_ERROR = 0.1
 
 
-def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Points | None) -> None:
+def write_block_dataset(
+    folder: Path, posed: Iterable[PosedImage], points: Points | None, origin: Origin
+) -> None:
     """Write a COLMAP model of some views and points, and link their photos, masks and depth maps.
 
     The links are relative symbolic links; without the permission to create them, hard links; on
@@ -35,6 +38,7 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         posed: the images in their original size and, optionally, the same ones from the folders
             ``images_2`` ….
         points: with colours; None: the model has no points.
+        origin: that of poses and points; the model is in the world.
 
     Raises:
         OSError: a file cannot be written.
@@ -56,7 +60,7 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         worst = max(worst, error)
         colmap = ColmapCamera(lens.model, lens.width, lens.height, lens.params)
         number = cameras.setdefault(colmap, len(cameras) + 1)
-        pose = camera.cam_from_world.double()
+        pose = camera.seen_from(opposite(origin)).cam_from_world
         quat = quat_from_rotation(pose[:, :3]).tolist()
         images.append(ColmapImage(name, number, (*quat, *pose[:, 3].tolist())))
         _link(image.path, folder / "images" / name)
@@ -76,7 +80,7 @@ def write_block_dataset(folder: Path, posed: Iterable[PosedImage], points: Point
         folder / "sparse" / "0",
         {number: camera for camera, number in cameras.items()},
         images,
-        nothing if points is None else points.xyz.numpy(),
+        nothing if points is None else points.xyz.double().numpy() + origin,
         nothing.astype(np.uint8) if points is None else points.rgb.numpy(),
     )
 

@@ -83,7 +83,7 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
     scene = OutputFolder(folder).scene_path(max(steps))
     scene.parent.mkdir(parents=True, exist_ok=True)
     own_rows = (part()[1] for part in parts)
-    write_ply_parts(scene, sum(counts), rest, own_rows, antialiased=antialiased)
+    write_ply_parts(scene, sum(counts), rest, own_rows, antialiased=antialiased, origin=plan.origin)
     if output is not None:
         with atomic_path(output) as temporary:
             shutil.copyfile(scene, temporary)
@@ -101,7 +101,7 @@ def _own(plan: Plan, cell: Cell, file: Path) -> Callable[[], tuple[int, Gaussian
     """Reads a block: its number of Gaussians, and the Gaussians in its cell."""
 
     def read() -> tuple[int, GaussianArrays]:
-        arrays = read_ply(file)
+        arrays = read_ply(file).seen_from(plan.origin)
         gaussians = arrays.to_gaussians()
         reach = _REACH * _deviations(gaussians, plan.axes)
         own = cell.contains(plan.ground(gaussians.means), reach)

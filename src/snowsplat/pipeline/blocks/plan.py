@@ -24,6 +24,7 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.train import TrainOptions
+from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.parts.found_sky import sky_distance
 from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.recipes import check_recipe, recipe
@@ -66,6 +67,7 @@ class Plan:
         settings: changed settings of all blocks, see `TrainOptions`.
         axes: the axes of the ground plane.
         margin: the margin by which cells are expanded, as a share of their size.
+        origin: that of the whole dataset; cells and the merged scene are relative to it.
     """
 
     dataset: DatasetSettings
@@ -74,6 +76,7 @@ class Plan:
     axes: Axes
     margin: float
     blocks: list[Block]
+    origin: Origin = HERE
 
     @staticmethod
     def read(folder: Path) -> Plan:
@@ -99,7 +102,7 @@ class Plan:
         write_json(folder / PLAN, {"snowsplat": __version__} | asdict(self))
 
     def ground(self, positions: Tensor) -> Tensor:
-        """Positions (N, 3) in the world frame -> (N, 2) float64 in the ground plane."""
+        """Positions (N, 3) relative to `origin` -> (N, 2) float64 in the ground plane."""
         axes = torch.tensor(self.axes, dtype=torch.float64)
         return positions.to(torch.float64) @ axes.T
 
@@ -183,14 +186,14 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     if config.sky and not config.sky_distance:  # so that the parts of the sky fit
         distance = sky_distance([view.camera for view in whole.train])
         shared["sky_distance"] = float(f"{distance:.4g}")
-    plan = Plan(settings, options.recipe, shared, axes, options.margin, [])
+    plan = Plan(settings, options.recipe, shared, axes, options.margin, [], whole.origin)
     plan.write(folder)  # without blocks: it is unfinished
     limit, blocks, digits = config.density.max_gaussians, [], max(2, len(str(options.blocks)))
     for number, content in enumerate(contents, 1):
         name = f"block_{number:0{digits}d}"
         names = {view.name for view in content.views}
         own = [image for image in posed if image.name in names]
-        write_block_dataset(folder / name / "dataset", own, content.points)
+        write_block_dataset(folder / name / "dataset", own, content.points, whole.origin)
         own_limit = max(1, round(limit * content.share)) if limit else 0
         points = 0 if content.points is None else len(content.points)
         blocks.append(Block(name, content.cell, len(content.views), points, own_limit))

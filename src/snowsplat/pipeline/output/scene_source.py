@@ -18,6 +18,7 @@ from snowsplat.pipeline.output.scene_paths import (
 from snowsplat.pipeline.run.refined_cameras import with_refined
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 
@@ -30,7 +31,7 @@ class TrainedScene:
 
     Attributes:
         iteration: the step after which it was saved.
-        gaussians: on the device that was requested.
+        gaussians: on the device that was requested, with the origin of the dataset.
         dataset: its photos and cameras, split as in the training.
         background: red, green, blue in 0..1.
     """
@@ -64,8 +65,8 @@ def load_trained(
     folder = existing_folder(Path(output))
     data, background = load_dataset_of(folder, dataset, resolution)
     found, gaussians = folder.read_scene(iteration)
-    device = (compute or Compute()).apply()
-    return TrainedScene(folder, found, gaussians.to(device), data, background)
+    gaussians = seen_from(gaussians, data.origin).to((compute or Compute()).apply())
+    return TrainedScene(folder, found, gaussians, data, background)
 
 
 def load_dataset_of(

@@ -1,7 +1,8 @@
 """The refined cameras of a training run: a COLMAP model in its output folder.
 
 OUT/refined/sparse/0 has the cameras of all photos, at their full size, and the points of the
-dataset. `load_dataset_of` uses it, and so can other programs and further training runs.
+dataset, in the world frame of its files. `load_dataset_of` uses it, and so can other programs and
+further training runs.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from snowsplat.data import Dataset, View
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, posed_camera, read_model, write_model
 from snowsplat.scene.geometry import quat_from_rotation
+from snowsplat.scene.origin import opposite
 from snowsplat.util.errors import UserError
 
 #: The folder of the model in an output folder, beside which a link to the photos makes a dataset.
@@ -40,12 +42,12 @@ def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
         params = camera.fx, camera.fy, camera.cx, camera.cy
         pinhole = ColmapCamera("PINHOLE", camera.width, camera.height, params)
         number = numbers.setdefault(pinhole, len(numbers) + 1)
-        pose = camera.cam_from_world
+        pose = camera.seen_from(opposite(full.origin)).cam_from_world
         numbers_of_pose = (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist())
         images.append(ColmapImage(view.name, number, numbers_of_pose))
     xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if full.points is not None:
-        xyz, rgb = full.points.xyz.double().numpy(), full.points.rgb.numpy()
+        xyz, rgb = full.points.xyz.double().numpy() + full.origin, full.points.rgb.numpy()
     folder = output.joinpath(FOLDER, *_SPARSE)
     write_model(folder, {number: camera for camera, number in numbers.items()}, images, xyz, rgb)
     return folder
@@ -69,8 +71,9 @@ def with_refined(output: Path, dataset: Dataset) -> Dataset:
                 f"{folder}: has no camera for {view.name}; use the dataset of the training, or "
                 f"remove {output / FOLDER} to use the cameras of the dataset"
             )
-        camera = posed_camera(model, images[view.name])
-        return replace(view, camera=camera.scaled(view.camera.width, view.camera.height))
+        camera = posed_camera(model, images[view.name]).seen_from(dataset.origin)
+        camera = camera.scaled(view.camera.width, view.camera.height)
+        return replace(view, camera=replace(camera, near=view.camera.near))
 
     return replace(
         dataset,

@@ -40,9 +40,6 @@ _BETTER = 0.8
 _CONTRADICTION = 3.0
 # Positions are far apart if their standard deviation is this many times their expected error.
 _FAR_APART = 3.0
-# The scene is in metres unless its cameras are nearer than this to their points, in metres: in
-# training and in viewers, nothing is drawn within 0.2 units.
-_NEAREST = 1.0
 
 
 @dataclass(frozen=True)
@@ -111,12 +108,10 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
             north_error=math.degrees(north.error),
         )
     if gps is not None:
-        metres = gps.alignment.scale
-        if metres * cameras.distance >= _NEAREST:
-            scale = metres
+        scale = gps.alignment.scale
         placement = replace(
             placement,
-            metres_per_unit=metres / scale,
+            metres_per_unit=1.0,
             scale_from=gps.name,
             scale_error=gps.alignment.scale_error,
             position_error=gps.alignment.error,

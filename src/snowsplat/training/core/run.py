@@ -14,6 +14,7 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader, Photos, available_memory
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.background import Background
 from snowsplat.training.core.losses import view_loss
@@ -213,7 +214,7 @@ class Run:
         if self.shards.rank != 0:
             return None
         if self.initial is not None:
-            return self.initial.clone().to(self.device)
+            return seen_from(self.initial, self.dataset.origin).clone().to(self.device)
         # The Gaussians of a resumed training run are replaced by those of the state.
         config = replace(self.config, init="points") if self.resumed else self.config
         with single_threaded():

@@ -109,7 +109,7 @@ def _voxels(points: Tensor, widths: Tensor, multiple: float) -> tuple[Tensor, in
     """
     level = (widths.log2() + multiple).floor()
     cell = (points / torch.exp2(level)[:, None]).floor().to(torch.int64)
-    key = level.to(torch.int64)
+    key = (level - level[:1]).to(torch.int64)  # so the order of the points depends on no unit
     for axis in range(3):  # a hash; voxels that share one are merged, which is rare
         key = key * 6364136223846793005 + cell[:, axis]
     unique, voxel = key.unique(return_inverse=True)

@@ -39,7 +39,9 @@ PICTURES = "stops.webp"
 _KEYFRAMES = 121  # of the film; the viewer interpolates between them
 _LEVEL_ENOUGH = math.radians(3)  # a smaller tilt of the horizon is not visible
 _SURFACES = 20_000  # maximum number of surfaces that determine the up direction
+_UP = np.array([0.0, -1.0, 0.0])  # of the viewer
 _TOO_LARGE = 3.0  # maximum factor between the distances of the scene and the usual ones
+_TOO_FAR = 30.0  # the same for an overview: a house in metres is walked through in metres
 
 
 def site(
@@ -142,13 +144,16 @@ def ready(
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
-    Without cameras, the surfaces may imply another up direction. Otherwise, or if the scene must
-    stay ``in_place`` (only without cameras), it is unchanged.
+    Without cameras, the surfaces may imply another up direction, and the distance is that of
+    the `overview`. If the scene must stay ``in_place`` (only without cameras), it is unchanged.
     """
     if not cameras:
-        up = None if in_place else up_of_surfaces(*_surfaces(gaussians))
-        level = None if up is None else _viewing_frame(up, VIEWING_DISTANCE)
-        gaussians = gaussians if level is None else transform(gaussians, level)
+        if not in_place:
+            up = up_of_surfaces(*_surfaces(gaussians))
+            view = overview(gaussians)
+            depth = math.dist(view.position, view.target)
+            level = _viewing_frame(_UP if up is None else up, depth, _TOO_FAR)
+            gaussians = gaussians if level is None else transform(gaussians, level)
         stops = stops_of(gaussians, (), 1.0, background)
         hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=True)
         return ReadyScene(gaussians, overview(gaussians), [], stops, background, hiding)
@@ -182,13 +187,15 @@ def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
     return [view_of_camera(camera, depth) for camera in path]
 
 
-def _viewing_frame(direction: np.ndarray, depth: float) -> Similarity | None:
+def _viewing_frame(
+    direction: np.ndarray, depth: float, most: float = _TOO_LARGE
+) -> Similarity | None:
     """Transform to a frame with −y up and usual distances; None if the scene has both."""
     up = torch.from_numpy(direction)
-    rotation = _shortest_rotation(up, torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64))
+    rotation = _shortest_rotation(up, torch.from_numpy(_UP))
     tilt = math.acos(max(-1.0, min(1.0, -float(up[1]))))
     ratio = VIEWING_DISTANCE / depth
-    is_level, is_near = tilt < _LEVEL_ENOUGH, 1 / _TOO_LARGE < ratio < _TOO_LARGE
+    is_level, is_near = tilt < _LEVEL_ENOUGH, 1 / most < ratio < most
     if is_level and is_near:
         return None
     turn = torch.eye(3, dtype=torch.float64) if is_level else rotation
