@@ -43,9 +43,9 @@ _LARGE_MODEL = 40
 _GROWTH = 1.4
 _ITERATIONS = 20
 # Bundle adjustment ends when an iteration reduces the cost by less than this share. There is one
-# share for local and one for global bundle adjustment in the mapper, and one for the final bundle
-# adjustment of the result, another one before the last scale of its loss. By default, COLMAP goes on
-# until the gradient is small, which takes several times as long.
+# share for local and one for global bundle adjustment in the mapper, one for the final bundle
+# adjustment of the result, and one for this before the last scale of its loss. By default, COLMAP
+# goes on until the gradient is small, which takes several times as long.
 _LOCAL_TOLERANCE = 1e-4
 _GLOBAL_TOLERANCE = 1e-5
 _FINAL_TOLERANCE = 1e-4
