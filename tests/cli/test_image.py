@@ -90,7 +90,7 @@ def test_additive_gaussians_have_no_svg(run, fit, photo_file, tmp_path):
     result = run("image", photo_file, "-o", tmp_path / "out", *arguments)
     assert result.code == 0, result.err
     assert "30 Gaussians" in result.out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == set(FILES) - {"extras.image.svg"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(FILES) - {"image.svg"}
 
 
 def test_an_earlier_fit_is_not_replaced_by_mistake(refused, run, photo_file, tmp_path):

@@ -41,16 +41,12 @@ class Demo:
     def run(self) -> int:
         """Returns the exit code: 0; 1 if the poses are wrong; 130 after Ctrl-C."""
         from snowsplat.pipeline.demo import demo
-        from snowsplat.pipeline.run.train_result import TrainingStopped
 
         try:
             with TerminalObserver() as observer:
                 result = demo(self.output, observer=observer)
-        except TrainingStopped as stopped:
-            print(with_flags(str(stopped)))
-            return self._stopped()
-        except KeyboardInterrupt:
-            print("stopped")
+        except KeyboardInterrupt as stopped:
+            print(with_flags(str(stopped) or "stopped"))
             return self._stopped()
         print_summary(result.made)
         _print_errors(result.errors)

@@ -93,7 +93,6 @@ class Make:
         """Returns the exit code: 0, or 130 after Ctrl-C."""
         from snowsplat.pipeline.compute import Compute
         from snowsplat.pipeline.make import MakeOptions, make
-        from snowsplat.pipeline.run.train_result import TrainingStopped
 
         options = MakeOptions(
             quality=self.quality,
@@ -113,11 +112,8 @@ class Make:
                     observer=observer,
                     page=page,
                 )
-        except TrainingStopped as stopped:
-            print(with_flags(str(stopped)))
-            return self._stopped()
-        except KeyboardInterrupt:
-            print("stopped")
+        except KeyboardInterrupt as stopped:
+            print(with_flags(str(stopped) or "stopped"))
             return self._stopped()
         print_summary(result)
         if page is not None:

@@ -10,19 +10,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Subcommand:
-    """Where a subcommand is, and what the overview of all subcommands tells about it.
+    """Where a subcommand is, and what the overview of all subcommands tells about it."""
 
-    Attributes:
-        summary: the first line of the docstring of its dataclass.
-        usage: its arguments in an example.
-        result: what this example does.
-        module: defines its dataclass; ``Train`` for the subcommand ``train``.
-    """
-
-    summary: str
-    usage: str
-    result: str
-    module: str
+    summary: str  # the first line of the docstring of its dataclass
+    usage: str  # its arguments in an example
+    result: str  # what this example does
+    module: str  # defines its dataclass; ``Train`` for the subcommand ``train``
 
 
 def _own(name: str, summary: str, usage: str, result: str) -> tuple[str, Subcommand]:

@@ -41,18 +41,12 @@ _GROUPS, _TRIALS = 8, 40
 
 @dataclass
 class Coverage:
-    """What the views show of each of N Gaussians, in pixels of their reduced images.
+    """What the views show of each of N Gaussians, in pixels of their reduced images."""
 
-    Attributes:
-        weight: (N,) the sum of its blending weights, over the pixels of all views.
-        largest: (N,) the largest sum of a single view.
-        front: (N,) the part of ``weight`` of the views in which it is in front of a surface.
-        position: (N,) the weighted mean of its positions, see above; 1 where there is no surface.
-    """
-
-    weight: Tensor
-    largest: Tensor
-    front: Tensor
+    weight: Tensor  # (N,) the sum of its blending weights, over the pixels of all views
+    largest: Tensor  # (N,) the largest sum of a single view
+    front: Tensor  # (N,) the part of ``weight`` of the views in which it is in front of a surface
+    # (N,) the weighted mean of its positions, see above; 1 where there is no surface.
     position: Tensor
 
     @property

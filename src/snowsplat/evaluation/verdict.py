@@ -36,30 +36,19 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Reason:
-    """One reason.
+    """One reason."""
 
-    Attributes:
-        grade: the best grade that is possible with this reason; "good": only a remark.
-        text: a clause without a full stop.
-        advice: what to do next time, as an imperative clause; empty: nothing.
-    """
-
-    grade: Grade
-    text: str
-    advice: str = ""
+    grade: Grade  # the best grade that is possible with this reason; "good": only a remark
+    text: str  # a clause without a full stop
+    advice: str = ""  # what to do next time, as an imperative clause; empty: nothing
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A verdict. All fields can be stored as JSON.
+    """A verdict. All fields can be stored as JSON."""
 
-    Attributes:
-        grade: of what is judged.
-        reasons: all reasons, the worst first; remarks are last.
-    """
-
-    grade: Grade
-    reasons: tuple[Reason, ...]
+    grade: Grade  # of what is judged
+    reasons: tuple[Reason, ...]  # all reasons, the worst first; remarks are last
 
     @classmethod
     def of(cls, reasons: Sequence[Reason]) -> Verdict:
@@ -91,11 +80,7 @@ class Verdict:
         return list(dict.fromkeys(reason.advice for reason in self.told if reason.advice))
 
     def lines(self, what: str) -> list[str]:
-        """The verdict as lines for a terminal.
-
-        Args:
-            what: what is judged, such as "the photos".
-        """
+        """The verdict as lines for a terminal. ``what``: what is judged, such as "the photos"."""
         return [
             f"{what}: {self.grade}{_MEANING[self.grade]}",
             *(f"  - {reason.text}" for reason in self.told),

@@ -159,11 +159,7 @@ def _differs(value: object, neutral: object) -> bool:
 
 
 def _place(scene: GaussianArrays, settings: dict[str, Any]) -> GaussianArrays:
-    """The splats in the frame of a PLY.
-
-    Raises:
-        Damaged: the settings are no similarity.
-    """
+    """The splats in the frame of a PLY. Raises: Damaged: the settings are no similarity."""
     if "position" not in settings:
         return scene
     import torch

@@ -77,11 +77,7 @@ def _load(path: Path) -> Any:
 
 
 def _splats(path: Path, content: Any) -> dict[Any, Any]:
-    """The tensors by name.
-
-    Raises:
-        UserError: another kind of checkpoint.
-    """
+    """The tensors by name. Raises: UserError: another kind of checkpoint."""
     splats = content.get("splats", content) if isinstance(content, dict) else None
     if isinstance(splats, dict) and all(name in splats for name in _NAMES[:4]):
         if "sh0" in splats:

@@ -47,19 +47,14 @@ class Run:
 
 @dataclass(frozen=True)
 class LodIndex:
-    """The content of `lod-meta.json`.
+    """The content of `lod-meta.json`."""
 
-    Attributes:
-        levels: the number of levels, at least 1.
-        files: the SOG scenes. All of them are inside of the folder.
-        leaves: for each leaf, its runs by level; runs without Gaussians are left out.
-        environment: the SOG scene that is always shown, if there is one.
-    """
-
-    levels: int
+    levels: int  # the number of levels, at least 1
+    # The SOG scenes. All of them are inside of the folder.
     files: list[Path]
+    # For each leaf, its runs by level; runs without Gaussians are left out.
     leaves: list[dict[int, Run]]
-    environment: Path | None
+    environment: Path | None  # the SOG scene that is always shown, if there is one
 
     def counts(self) -> list[int]:
         """The number of Gaussians of each level."""

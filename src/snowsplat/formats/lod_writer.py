@@ -45,17 +45,12 @@ _FOLDERS = re.compile(rf"{_FOLDER}(_\d+)?")
 
 @dataclass(frozen=True)
 class LodSizes:
-    """Numbers of Gaussians.
+    """Numbers of Gaussians."""
 
-    Attributes:
-        leaf: the most in a leaf, at level 0.
-        file: about as many are in a file. A viewer loads a file as a whole.
-        coarsest: the most in the coarsest level, which a viewer shows first.
-    """
-
-    leaf: int = 1 << 15
+    leaf: int = 1 << 15  # the most in a leaf, at level 0
+    # About as many are in a file. A viewer loads a file as a whole.
     file: int = 1 << 17
-    coarsest: int = 100_000
+    coarsest: int = 100_000  # the most in the coarsest level, which a viewer shows first
 
     def levels(self, count: int) -> int:
         """The number of levels of a scene with ``count`` Gaussians."""

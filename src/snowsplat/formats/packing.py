@@ -4,6 +4,8 @@ Arrays are NumPy, float32 unless stated otherwise, one row per Gaussian, with th
 fields of `GaussianArrays`.
 """
 
+from __future__ import annotations
+
 import logging
 import math
 from dataclasses import replace
@@ -29,11 +31,7 @@ _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no loga
 
 
 def read_file(path: Path) -> bytes:
-    """The content of the file.
-
-    Raises:
-        UserError: the file cannot be read.
-    """
+    """The content of the file. Raises: UserError: the file cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:

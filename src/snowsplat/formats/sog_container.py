@@ -46,11 +46,7 @@ class Bundle:
             self._zip.__exit__()
 
     def meta(self) -> dict[str, Any]:
-        """The content of `meta.json`.
-
-        Raises:
-            Damaged: it is missing, or not a JSON object.
-        """
+        """The content of `meta.json`. Raises: Damaged: it is missing, or not a JSON object."""
         data = self._member("meta.json") if self._zip else self._file(self._path)
         try:
             meta = parse_json(data)

@@ -539,18 +539,7 @@ def adam_step(
 ) -> None:
     """Propagates the gradient of the splats through `project` and takes one Adam step, in place.
 
-    Args:
-        gaussians, view: those of `project`. If `.grad` of a parameter is not None (from a
-            regulariser), it is added to the gradient.
-        moments: m and v, of the names and shapes of the parameters.
-        gradient: of the splats. If `gradient.packed` is None, the gradient is only `.grad`, and
-            `gradient.ids` are the visible rows.
-        rates: the learning rate of each parameter, β₁, β₂, ε, and the number of this step, from 1.
-        visible_only: whether rows that are not in `gradient.ids` keep their values and moments. If
-            False, their gradient is 0 (plus `.grad`), and their moments decay.
-        valid: (1,) bool; False: nothing is changed.
-        nonfinite_rows: (6,) int32 counts, one per parameter. If the step would make a value
-            infinite or NaN, the value and its moments stay unchanged, and its row is counted.
+    The arguments are those of `snowsplat.ops.adam_step`.
 
     Rows of sh_rest beyond `view.sh_degree` keep their values and moments. The step is
     p −= lr · m̂ / √(v̂ + eps²); the paper has the denominator √v̂ + eps. The steps with

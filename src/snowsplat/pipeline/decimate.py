@@ -53,17 +53,12 @@ def file_size(decimate: int | str | None) -> int | None:
 
 @dataclass(frozen=True)
 class Decimation:
-    """Makes fewer Gaussians of a scene: neighbours are merged, and the result is fitted to views.
+    """Makes fewer Gaussians of a scene: merges neighbours, and fits the result to views."""
 
-    Attributes:
-        cameras: the cameras of the photos; empty: unknown.
-        background: the colour behind the scene.
-        refined: trains the result on the photos; None: it is trained on renderings of the whole
-            scene from the cameras.
-    """
-
-    cameras: Sequence[Camera] = ()
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    cameras: Sequence[Camera] = ()  # the cameras of the photos; empty: unknown
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the colour behind the scene
+    # Trains the result on the photos; None: it is trained on renderings of the whole scene from the
+    # cameras.
     refined: Callable[[Gaussians], Gaussians] | None = None
     observer: Observer = SILENT
 

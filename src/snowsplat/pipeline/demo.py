@@ -27,19 +27,12 @@ _OPTIONS = MakeOptions(quality="normal", minutes=2.2)
 
 @dataclass(frozen=True)
 class DemoResult:
-    """A finished demo.
+    """A finished demo."""
 
-    Attributes:
-        photos: the folder of the photos.
-        truth: the folder of the true poses: a COLMAP text model.
-        made: the scene.
-        errors: the estimated poses, compared with the true ones.
-    """
-
-    photos: Path
-    truth: Path
-    made: MakeResult
-    errors: PoseErrors
+    photos: Path  # the folder of the photos
+    truth: Path  # the folder of the true poses: a COLMAP text model
+    made: MakeResult  # the scene
+    errors: PoseErrors  # the estimated poses, compared with the true ones
 
     @property
     def accurate(self) -> bool:

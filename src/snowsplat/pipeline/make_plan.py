@@ -39,19 +39,12 @@ _FEWEST = 20
 
 @dataclass(frozen=True)
 class MakePlan:
-    """The work of structure from motion in `make`.
+    """The work of structure from motion in `make`."""
 
-    Attributes:
-        quality: the effort to estimate the camera poses.
-        size: photos are reduced to this longer side, in pixels.
-        photos: number of photos to use; None: all.
-        frames: number of frames to use of each video; None: as many as usual.
-    """
-
-    quality: Quality
-    size: int
-    photos: int | None = None
-    frames: int | None = None
+    quality: Quality  # the effort to estimate the camera poses
+    size: int  # photos are reduced to this longer side, in pixels
+    photos: int | None = None  # number of photos to use; None: all
+    frames: int | None = None  # number of frames to use of each video; None: as many as usual
 
 
 def choose_plan(

@@ -10,25 +10,19 @@ Quality = Literal["draft", "normal", "best"]
 
 @dataclass(frozen=True)
 class Preset:
-    """The settings at one quality. A size is the length of the longer side, in pixels.
+    """The settings at one quality. A size is the length of the longer side, in pixels."""
 
-    Attributes:
-        photos: the size to which photos are reduced when they are copied into the dataset.
-        side: the size of the photos in training.
-        iterations: steps of the training.
-        max_gaussians, densify_interval: settings of the training; None: the value of the recipe.
-        stop_overfitting: whether the training ends earlier if the scene overfits. With few steps,
-            this would only cost time.
-        training: about the time of the training and of the test views, in seconds of one core of
-            the reference machine of `sfm.cost`.
-    """
-
-    photos: int
-    side: int
-    iterations: int
+    photos: int  # the size to which photos are reduced when they are copied into the dataset
+    side: int  # the size of the photos in training
+    iterations: int  # steps of the training
+    # max_gaussians, densify_interval: settings of the training; None: the value of the recipe.
     max_gaussians: int | None
     densify_interval: int | None
+    # Whether the training ends earlier if the scene overfits. With few steps, this would only cost
+    # time.
     stop_overfitting: bool
+    # About the time of the training and of the test views, in seconds of one core of the reference
+    # machine of `sfm.cost`.
     training: float
 
 

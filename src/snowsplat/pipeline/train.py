@@ -16,11 +16,10 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run import option
-from snowsplat.pipeline.run.camera_check import check_cameras
+from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.memory_use import MemoryUse
-from snowsplat.pipeline.run.photo_check import check_test_photos
 from snowsplat.pipeline.run.photo_stamps import Stamp, edited, stamps_of
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.time_budget import TimeBudget

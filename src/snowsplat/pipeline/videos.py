@@ -45,12 +45,9 @@ _RANGE_FRAMES = 8  # number of frames that determine the range of the depth colo
 
 @dataclass(frozen=True)
 class VideoSize:
-    """The requested size of a video.
+    """The requested size of a video."""
 
-    Attributes:
-        width, height: pixels; None if not requested.
-    """
-
+    # width, height: pixels; None if not requested.
     width: int | None = None
     height: int | None = None
 
@@ -313,24 +310,18 @@ def _in_frame_of(gaussians: Gaussians, cameras: list[Camera]) -> list[Camera]:
 
 @dataclass(frozen=True)
 class Video:
-    """A video to be rendered.
-
-    Attributes:
-        cameras: one per frame. All have the same size, with even width and height.
-        around: renders all directions from the places of the cameras; None: what the cameras see.
-        file: the file of the colour video; that of the depth has _depth in its name.
-        depth: also render a video of the depth.
-        side_by_side: one video instead, with colour on the left and depth on the right.
-    """
+    """A video to be rendered."""
 
     gaussians: Gaussians
+    # One per frame. All have the same size, with even width and height.
     cameras: Sequence[Camera]
+    # Renders all directions from the places of the cameras; None: what the cameras see.
     around: PanoramaRenderer | None
     background: tuple[float, float, float]
-    file: Path
+    file: Path  # the file of the colour video; that of the depth has _depth in its name
     fps: float
-    depth: bool
-    side_by_side: bool
+    depth: bool  # also render a video of the depth
+    side_by_side: bool  # one video instead, with colour on the left and depth on the right
 
     def write(self, observer: Observer = SILENT) -> list[Path]:
         """Render and write; returns the files.

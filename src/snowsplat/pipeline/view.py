@@ -25,19 +25,12 @@ _LARGE = 4_000_000
 
 @dataclass(frozen=True)
 class ViewedScene:
-    """The page of a scene.
+    """The page of a scene."""
 
-    Attributes:
-        file: the scene file.
-        gaussians: their number.
-        files: the files of the page, by name.
-        headers: HTTP headers of the page.
-    """
-
-    file: Path
-    gaussians: int
-    files: dict[str, Served]
-    headers: dict[str, str]
+    file: Path  # the scene file
+    gaussians: int  # their number
+    files: dict[str, Served]  # the files of the page, by name
+    headers: dict[str, str]  # HTTP headers of the page
 
 
 @contextmanager

@@ -28,18 +28,12 @@ class InitialView:
     """Position and target of a viewer's camera in the world frame. Up is −y.
 
     A window of any shape must show a rectangle around the target, such as that of a photo.
-
-    Attributes:
-        position: of the camera.
-        target: the viewer looks at this point and orbits it.
-        fov: the angle of the longer side of the rectangle, in degrees.
-        aspect: width / height of the rectangle.
     """
 
-    position: tuple[float, float, float]
-    target: tuple[float, float, float]
-    fov: float
-    aspect: float = 1.0
+    position: tuple[float, float, float]  # of the camera
+    target: tuple[float, float, float]  # the viewer looks at this point and orbits it
+    fov: float  # the angle of the longer side of the rectangle, in degrees
+    aspect: float = 1.0  # width / height of the rectangle
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of a window of this size, in pixels, that shows the complete rectangle."""

@@ -34,17 +34,13 @@ _SPACING = 0.15
 
 @dataclass
 class Sight:
-    """What the cameras see of each of N Gaussians; all tensors are float64.
+    """What the cameras see of each of N Gaussians; all tensors are float64."""
 
-    Attributes:
-        weights: (N,) the mean over the views of Σ w, in pixels; all 1 if unknown.
-        pixels: (N,) the area of a pixel at the Gaussian, in squared world units; 0: negligible.
-        directions: (6, N) three times the mean of d dᵀ, with the unit vectors d from the cameras;
-            the entries are `ENTRIES`. From everywhere, this is the identity.
-    """
-
-    weights: Tensor
+    weights: Tensor  # (N,) the mean over the views of Σ w, in pixels; all 1 if unknown
+    # (N,) the area of a pixel at the Gaussian, in squared world units; 0: negligible.
     pixels: Tensor
+    # (6, N) three times the mean of d dᵀ, with the unit vectors d from the cameras; the entries are
+    # `ENTRIES`. From everywhere, this is the identity.
     directions: Tensor
 
 

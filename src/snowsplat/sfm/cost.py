@@ -66,28 +66,19 @@ _MOST_THREADS = 16
 
 @dataclass(frozen=True)
 class Speed:
-    """The speed of this machine.
+    """The speed of this machine."""
 
-    Attributes:
-        slowness: time of one thread on this machine, divided by that on the reference machine.
-        cores: the work that all threads do in a second, divided by that of one thread.
-    """
-
+    # Time of one thread on this machine, divided by that on the reference machine.
     slowness: float = 1.0
-    cores: float = 1.0
+    cores: float = 1.0  # the work that all threads do in a second, divided by that of one thread
 
 
 @dataclass(frozen=True)
 class Step:
-    """The work of a step.
+    """The work of a step."""
 
-    Attributes:
-        work: seconds of one core of the reference machine.
-        threads: maximum number of threads.
-    """
-
-    work: float
-    threads: float = math.inf
+    work: float  # seconds of one core of the reference machine
+    threads: float = math.inf  # maximum number of threads
 
     def seconds(self, speed: Speed) -> float:
         """Predicted seconds on a machine with this speed."""

@@ -22,22 +22,16 @@ _NEIGHBOURS = 0.05
 
 @dataclass(frozen=True)
 class Coverage:
-    """The measures of N photos, in the order of their names.
+    """The measures of N photos, in the order of their names."""
 
-    Attributes:
-        names: of the photos.
-        confirmed: (N,) share of the points of a photo that at least two other photos observe. A
-            point of two photos has no third photo that could contradict a wrong match. NaN without
-            points.
-        step: (N,) distance to the nearest photo that shows the same, divided by the median depth
-            of the points; infinite if no photo shows the same.
-        directions: (N,) angle in degrees between the optical axis and the mean of all axes; 180
-            for a panorama.
-    """
-
-    names: list[str]
+    names: list[str]  # of the photos
+    # (N,) share of the points of a photo that at least two other photos observe. A point of two
+    # photos has no third photo that could contradict a wrong match. NaN without points.
     confirmed: np.ndarray
+    # (N,) distance to the nearest photo that shows the same, divided by the median depth of the
+    # points; infinite if no photo shows the same.
     step: np.ndarray
+    # (N,) angle in degrees between the optical axis and the mean of all axes; 180 for a panorama.
     directions: np.ndarray
 
 

@@ -35,17 +35,11 @@ _POINTS = 5000  # a sample
 
 @dataclass(frozen=True)
 class Advice:
-    """Where more photos would help.
+    """Where more photos would help."""
 
-    Attributes:
-        places: (K, 3) camera positions in the world frame, at most five.
-        reasons: for each of them, what is missing there, as a phrase.
-        seldom: share of the points, 0..1, that at most three photos show; 0 if it is below 5%.
-    """
-
-    places: np.ndarray
-    reasons: list[str]
-    seldom: float
+    places: np.ndarray  # (K, 3) camera positions in the world frame, at most five
+    reasons: list[str]  # for each of them, what is missing there, as a phrase
+    seldom: float  # share of the points, 0..1, that at most three photos show; 0 if it is below 5%
 
 
 def advice(photos: Sequence[PlacedPhoto], xyz: np.ndarray) -> Advice:

@@ -165,15 +165,11 @@ _STEPS_OF_STAGE = {
 
 @dataclass(frozen=True)
 class Later:
-    """The part of a job after structure from motion.
+    """The part of a job after structure from motion."""
 
-    Attributes:
-        work: seconds of one core of the reference machine; all threads work.
-        deadline: when the job will end because of its time budget, by `time.monotonic`; None: there
-            is no time budget.
-    """
-
-    work: float = 0.0
+    work: float = 0.0  # seconds of one core of the reference machine; all threads work
+    # When the job will end because of its time budget, by `time.monotonic`; None: there is no time
+    # budget.
     deadline: float | None = None
 
 

@@ -23,8 +23,8 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def test_one_ellipse_per_gaussian(tmp_path: Path) -> None:
     gaussians = random_gaussians("front-to-back", 25)
-    write_svg(tmp_path / "extras.image.svg", gaussians)
-    root = ElementTree.parse(tmp_path / "extras.image.svg").getroot()
+    write_svg(tmp_path / "image.svg", gaussians)
+    root = ElementTree.parse(tmp_path / "image.svg").getroot()
     assert root.get("viewBox") == "0 0 40 30"
     ellipses = root.findall(f"{SVG}ellipse")
     gradients = {gradient.get("id"): gradient for gradient in root.findall(f"{SVG}radialGradient")}
@@ -41,14 +41,14 @@ def test_one_ellipse_per_gaussian(tmp_path: Path) -> None:
 
 def test_additive_gaussians_have_no_svg(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="front-to-back"):
-        write_svg(tmp_path / "extras.image.svg", random_gaussians("additive"))
+        write_svg(tmp_path / "image.svg", random_gaussians("additive"))
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.browser
 def test_a_browser_shows_the_image(tmp_path: Path) -> None:
     gaussians = fitted(FitOptions(60, steps=100))
-    path = tmp_path / "extras.image.svg"
+    path = tmp_path / "image.svg"
     write_svg(path, gaussians)
     with Browser(200, 150) as browser:
         page = browser.open(path.as_uri())

@@ -18,19 +18,12 @@ WALL = 0.975
 
 @dataclass(frozen=True)
 class Ring:
-    """A part of the base: a solid of revolution whose profile is a rounded rectangle.
+    """A part of the base: a solid of revolution whose profile is a rounded rectangle."""
 
-    Attributes:
-        y: height of its middle; positive is down.
-        half: half of its height.
-        radius: its outer radius, including the rounded edge.
-        edge: radius of the rounded edge.
-    """
-
-    y: float
-    half: float
-    radius: float
-    edge: float
+    y: float  # height of its middle; positive is down
+    half: float  # half of its height
+    radius: float  # its outer radius, including the rounded edge
+    edge: float  # radius of the rounded edge
 
 
 #: The base from top to bottom: the collar that holds the glass, the body, and the foot.

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from snowsplat.extras.globe.dimensions import BASE, BLEND, FLOOR, FLOOR_RADIUS, GROUND
 from snowsplat.scene.camera import Camera
@@ -24,6 +25,11 @@ LIGHT = (-0.48, -0.76, -0.44)
 # The plate on the base: half its width (radians around the axis) and half its height.
 PLATE = (0.40, 0.088)
 PLATE_Y = BASE[1].y + 0.005
+# Its engraving, as an image.
+_PLATE_WIDTH = 1024  # pixels
+_PLATE_HEIGHT = round(_PLATE_WIDTH * PLATE[1] / (PLATE[0] * BASE[1].radius))
+_LARGEST_LETTERS, _SMALLEST_LETTERS = round(0.5 * _PLATE_HEIGHT), 12  # size of the letters
+_PLATE_MARGIN = 0.86  # the text fills at most this share of the width
 
 FRESNEL = 0.045  # reflectance of the glass for perpendicular rays
 _STEPS = 70  # of sphere tracing
@@ -33,18 +39,12 @@ _FAR = 12.0
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What is around the Gaussians, for one camera.
+    """What is around the Gaussians, for one camera."""
 
-    Attributes:
-        behind: (H, W, 3) sRGB in 0..1, behind the Gaussians.
-        keep: (H, W, 1): share of the light that the glass lets through; 0 where the base is in
-            front.
-        add: (H, W, 3) linear light that reflections or the base add.
-    """
-
-    behind: np.ndarray
+    behind: np.ndarray  # (H, W, 3) sRGB in 0..1, behind the Gaussians
+    # (H, W, 1): share of the light that the glass lets through; 0 where the base is in front.
     keep: np.ndarray
-    add: np.ndarray
+    add: np.ndarray  # (H, W, 3) linear light that reflections or the base add
 
     def around(self, color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         """The complete picture.
@@ -306,3 +306,18 @@ def _mix(low: tuple[float, ...], high: tuple[float, ...], share: np.ndarray) -> 
 
 def _blend(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     return a + (b - a) * share[:, None]
+
+
+def engraving(name: str) -> np.ndarray:
+    """(h, w) float32 in 0..1: 1 where the plate is engraved. A long name has smaller letters.
+
+    Letters that the font of Pillow does not have are drawn as boxes.
+    """
+    image = Image.new("L", (_PLATE_WIDTH, _PLATE_HEIGHT))
+    draw = ImageDraw.Draw(image)
+    for points in range(_LARGEST_LETTERS, _SMALLEST_LETTERS - 1, -2):
+        font = ImageFont.load_default(points)
+        if draw.textlength(name, font) <= _PLATE_MARGIN * _PLATE_WIDTH:
+            break
+    draw.text((_PLATE_WIDTH / 2, 0.52 * _PLATE_HEIGHT), name, font=font, anchor="mm", fill=255)
+    return np.asarray(image, dtype=np.float32) / 255.0

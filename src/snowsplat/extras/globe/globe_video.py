@@ -45,20 +45,14 @@ _SWING = math.radians(30)
 
 @dataclass(frozen=True)
 class GlobeVideo:
-    """A video of a globe.
+    """A video of a globe."""
 
-    Attributes:
-        arrangement: the Gaussians.
-        plate: (h, w) in 0..1: the text on the plate of the base; None: no plate.
-        width, height: pixels.
-        fps: frames per second.
-    """
-
-    arrangement: Arrangement
-    plate: np.ndarray | None
+    arrangement: Arrangement  # the Gaussians
+    plate: np.ndarray | None  # (h, w) in 0..1: the text on the plate of the base; None: no plate
+    # width, height: pixels.
     width: int
     height: int
-    fps: float
+    fps: float  # frames per second
 
     @property
     def count(self) -> int:

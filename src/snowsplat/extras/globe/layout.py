@@ -55,15 +55,11 @@ _WIDEST_GAP = math.radians(110)
 
 @dataclass(frozen=True)
 class Arrangement:
-    """The Gaussians in a globe.
+    """The Gaussians in a globe."""
 
-    Attributes:
-        gaussians: in the frame of the globe, by decreasing importance.
-        surrounded: whether the cameras of the photos surround the scene, or are unknown. Otherwise
-            its back was not photographed.
-    """
-
-    gaussians: Gaussians
+    gaussians: Gaussians  # in the frame of the globe, by decreasing importance
+    # Whether the cameras of the photos surround the scene, or are unknown. Otherwise its back was
+    # not photographed.
     surrounded: bool
 
 

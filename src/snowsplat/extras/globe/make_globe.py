@@ -6,10 +6,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from snowsplat.extras.globe.glass import engraving
 from snowsplat.extras.globe.globe_page import write_page
 from snowsplat.extras.globe.globe_video import GlobeVideo
 from snowsplat.extras.globe.layout import arrange
-from snowsplat.extras.globe.plate import engraving
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_paths import scene_name

@@ -142,30 +142,19 @@ def shake_offset(seconds: float) -> float:
 
 @dataclass
 class Snow:
-    """N Gaussians in motion. Coordinates are stored as three rows, x, y (down) and z.
+    """N Gaussians in motion. Coordinates are stored as three rows, x, y (down) and z."""
 
-    Attributes:
-        home: (3, N) float32: where they stand.
-        position: (3, N) float32.
-        velocity: (3, N) float32, per second.
-        angle: (N,) float32: radians around an axis of each flake.
-        morph: (N,) float32. 0: as in the scene; 1: a flake.
-        resting: (N,) bool: lies in the pile.
-        loosening: how much the scene was shaken.
-        strength: of the flow.
-        time: seconds since the start.
-        remembering: seconds since `remember`; None if the Gaussians do not fly home.
-    """
-
-    home: np.ndarray
-    position: np.ndarray = field(init=False)
-    velocity: np.ndarray = field(init=False)
-    angle: np.ndarray = field(init=False)
+    home: np.ndarray  # (3, N) float32: where they stand
+    position: np.ndarray = field(init=False)  # (3, N) float32
+    velocity: np.ndarray = field(init=False)  # (3, N) float32, per second
+    angle: np.ndarray = field(init=False)  # (N,) float32: radians around an axis of each flake
+    # (N,) float32. 0: as in the scene; 1: a flake.
     morph: np.ndarray = field(init=False)
-    resting: np.ndarray = field(init=False)
-    loosening: float = 0.0
-    strength: float = 0.0
-    time: float = 0.0
+    resting: np.ndarray = field(init=False)  # (N,) bool: lies in the pile
+    loosening: float = 0.0  # how much the scene was shaken
+    strength: float = 0.0  # of the flow
+    time: float = 0.0  # seconds since the start
+    # Seconds since `remember`; None if the Gaussians do not fly home.
     remembering: float | None = None
 
     def __post_init__(self) -> None:

@@ -15,8 +15,7 @@ from snowsplat.data.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.metrics import compare
 from snowsplat.extras.image.compact_file import read_compact, write_compact
 from snowsplat.extras.image.fit import FitOptions, Fitter
-from snowsplat.extras.image.history import Moment, recorded_steps
-from snowsplat.extras.image.image_report import Fitted, write_image_report
+from snowsplat.extras.image.image_report import Fitted, Moment, recorded_steps, write_image_report
 from snowsplat.extras.image.model import ImageGaussians
 from snowsplat.extras.image.svg import write_svg
 from snowsplat.pipeline.compute import Compute
@@ -32,7 +31,7 @@ from snowsplat.util.process import single_threaded
 FILES = {
     "image.png": "the image that the Gaussians approximate the photo with",
     "image.gimg": "the Gaussians, quantised: a compact file",
-    "extras.image.svg": "an ellipse with a gradient for each Gaussian",
+    "image.svg": "an ellipse with a gradient for each Gaussian",
     "forming.mp4": "a video of the fit",
     "metrics.json": "PSNR and SSIM, and their course",
     "report.html": "this page",
@@ -111,10 +110,10 @@ def fit_image(
         file_psnr = compare(stored.render(), target).psnr
         files = dict(FILES)
         if gaussians.blending == "front-to-back":
-            write_svg(output / "extras.image.svg", gaussians)
+            write_svg(output / "image.svg", gaussians)
         else:
-            (output / "extras.image.svg").unlink(missing_ok=True)  # of an earlier fit
-            del files["extras.image.svg"]
+            (output / "image.svg").unlink(missing_ok=True)  # of an earlier fit
+            del files["image.svg"]
         file_bytes = (output / "image.gimg").stat().st_size
         width, height = gaussians.width, gaussians.height
         bits = 8 * file_bytes / (width * height)

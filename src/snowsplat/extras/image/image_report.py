@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.extras.image.history import Moment
 from snowsplat.extras.image.model import COLORS, LOG_SIGMAS, OPACITY_LOGIT, ImageGaussians
 from snowsplat.util import charts
 from snowsplat.util.duration import duration
@@ -39,26 +38,35 @@ td { font-variant-numeric: tabular-nums; }
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """The content of the page.
+class Moment:
+    """The state of a fit after a step."""
 
-    Attributes:
-        name: of the photo.
-        photo: (H, W, 3) uint8.
-        gaussians: the result of the fit.
-        moments: the course of the fit; the last one is the result.
-        compact: PSNR in dB, bytes and bits per pixel of the compact file.
-        files: names and descriptions of the files beside the page.
-        video: the video of the fit.
+    step: int
+    seconds: float  # time spent in steps so far
+    gaussians: int
+    psnr: float  # dB
+    ssim: float
+
+
+def recorded_steps(steps: int, count: int) -> list[int]:
+    """At most `count` steps from 1 to `steps`, at first close together.
+
+    The k-th of them is proportional to k²: the image changes most in the first steps.
     """
+    return sorted({max(1, round(steps * (k / count) ** 2)) for k in range(1, count + 1)})
 
-    name: str
-    photo: Tensor
-    gaussians: ImageGaussians
-    moments: list[Moment]
-    compact: tuple[float, int, float]
-    files: dict[str, str]
-    video: Path
+
+@dataclass(frozen=True)
+class Fitted:
+    """The content of the page."""
+
+    name: str  # of the photo
+    photo: Tensor  # (H, W, 3) uint8
+    gaussians: ImageGaussians  # the result of the fit
+    moments: list[Moment]  # the course of the fit; the last one is the result
+    compact: tuple[float, int, float]  # PSNR in dB, bytes and bits per pixel of the compact file
+    files: dict[str, str]  # names and descriptions of the files beside the page
+    video: Path  # the video of the fit
 
 
 def write_image_report(path: Path, fitted: Fitted) -> None:

@@ -43,21 +43,15 @@ class ImageGaussians:
         4     angle between the x axis of the image and the first axis, in radians
         5:8   red, green, blue; 1 is white. Colours of additive Gaussians may be negative
         8     logit of the opacity; only for front-to-back blending
-
-    Attributes:
-        width: of the image, in pixels.
-        height: of the image, in pixels.
-        blending: how the Gaussians are blended.
-        rows: (N, 8) for additive, (N, 9) for front-to-back blending, float32. In the latter, the
-            first row is in front.
-        background: (3,) the colour behind the Gaussians, float32.
     """
 
-    width: int
-    height: int
-    blending: Blending
+    width: int  # of the image, in pixels
+    height: int  # of the image, in pixels
+    blending: Blending  # how the Gaussians are blended
+    # (N, 8) for additive, (N, 9) for front-to-back blending, float32. In the latter, the first row
+    # is in front.
     rows: Tensor
-    background: Tensor
+    background: Tensor  # (3,) the colour behind the Gaussians, float32
 
     def __post_init__(self) -> None:
         columns = column_count(self.blending)

@@ -19,15 +19,10 @@ _BISECTIONS = 40
 
 @dataclass(frozen=True)
 class Blocks:
-    """Square blocks of pixels, disjoint; together they are all pixels with a known depth.
+    """Square blocks of pixels, disjoint; together they are all pixels with a known depth."""
 
-    Attributes:
-        owner: (H, W) int64: the block of each pixel; −1 where the depth is unknown.
-        size: (B,) float32: the width of each block in pixels.
-    """
-
-    owner: Tensor
-    size: Tensor
+    owner: Tensor  # (H, W) int64: the block of each pixel; −1 where the depth is unknown
+    size: Tensor  # (B,) float32: the width of each block in pixels
 
     def __len__(self) -> int:
         return len(self.size)

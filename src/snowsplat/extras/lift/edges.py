@@ -22,15 +22,10 @@ _SNAP_RADIUS = 2
 
 @dataclass(frozen=True)
 class Links:
-    """Which neighbouring pixels are on the same surface.
+    """Which neighbouring pixels are on the same surface."""
 
-    Attributes:
-        right: (H, W - 1) bool: pixel (i, j) and pixel (i, j + 1).
-        down: (H - 1, W) bool: pixel (i, j) and pixel (i + 1, j).
-    """
-
-    right: Tensor
-    down: Tensor
+    right: Tensor  # (H, W - 1) bool: pixel (i, j) and pixel (i, j + 1)
+    down: Tensor  # (H - 1, W) bool: pixel (i, j) and pixel (i + 1, j)
 
 
 def find_links(depth: Tensor, threshold: float = EDGE_THRESHOLD) -> Links:

@@ -19,16 +19,13 @@ _STEEPEST = 4.0
 
 @dataclass(frozen=True)
 class Surface:
-    """A point and two tangents for each pixel, in the camera frame, in world units.
+    """A point and two tangents for each pixel, in the camera frame, in world units."""
 
-    Attributes:
-        points: (H, W, 3) the points at the centres of the pixels; differentiable with respect to
-            the depth. NaN where the depth is unknown.
-        tangents: (H, W, 3, 2) the derivatives of the points with respect to the column and the row,
-            in world units per pixel. They are constants for autograd.
-    """
-
+    # (H, W, 3) the points at the centres of the pixels; differentiable with respect to the depth.
+    # NaN where the depth is unknown.
     points: Tensor
+    # (H, W, 3, 2) the derivatives of the points with respect to the column and the row, in world
+    # units per pixel. They are constants for autograd.
     tangents: Tensor
 
 

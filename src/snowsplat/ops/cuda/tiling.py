@@ -28,7 +28,7 @@ from snowsplat.util.native_layout import SLOT_WIDTH, Params
 
 
 @dataclass(slots=True, kw_only=True)
-class TilesCountKernelParams(Params):
+class _RectangleParams(Params):
     n: int
     order: Tensor
     packed: Tensor
@@ -38,20 +38,15 @@ class TilesCountKernelParams(Params):
     corners: Tensor
     sizes: Tensor
     tiles: Tensor
+
+
+@dataclass(slots=True, kw_only=True)
+class TilesCountKernelParams(_RectangleParams):
     counts: Tensor
 
 
 @dataclass(slots=True, kw_only=True)
-class TilesFillKernelParams(Params):
-    n: int
-    order: Tensor
-    packed: Tensor
-    stride: int
-    tiles_x: int
-    tiles_y: int
-    corners: Tensor
-    sizes: Tensor
-    tiles: Tensor
+class TilesFillKernelParams(_RectangleParams):
     first_slots: Tensor
     tiles_16: Tensor | None
     tiles_32: Tensor | None

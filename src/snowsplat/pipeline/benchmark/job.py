@@ -67,29 +67,19 @@ class Job:
 
 @dataclass(frozen=True)
 class SceneResult:
-    """The result of a scene.
+    """The result of a scene."""
 
-    Attributes:
-        job: the settings with which it was made.
-        lpips: None if no weights were given.
-        seconds: duration of the training, including interrupted runs.
-        memory: peak memory of the process in bytes.
-        photos: number of training photos, and of test photos.
-        size: width and height of the first test photo.
-        machine: the processor or GPU.
-    """
-
-    job: Job
+    job: Job  # the settings with which it was made
     psnr: float
     ssim: float
-    lpips: float | None
+    lpips: float | None  # None if no weights were given
     gaussians: int
-    seconds: float
-    memory: int
-    photos: tuple[int, int]
-    size: tuple[int, int]
+    seconds: float  # duration of the training, including interrupted runs
+    memory: int  # peak memory of the process in bytes
+    photos: tuple[int, int]  # number of training photos, and of test photos
+    size: tuple[int, int]  # width and height of the first test photo
     worst: str
-    machine: str
+    machine: str  # the processor or GPU
 
     @staticmethod
     def read(job: Job) -> SceneResult | None:

@@ -23,28 +23,20 @@ class Figures:
 
 @dataclass(frozen=True)
 class Suite:
-    """A protocol.
+    """A protocol."""
 
-    Attributes:
-        title: the name for readers.
-        protocol: how photos are scaled and held out, in sentences.
-        resolutions: for each scene, the number by which the photos are divided. The official
-            smaller photos (such as images_4) are used if the dataset has them. Scenes that are not
-            listed have their full size.
-        hold_out: every ``hold_out``-th photo is a test photo, unless the dataset has a split of its
-            own.
-        settings: settings of the training that the protocol fixes.
-        published: figures of each scene.
-        source: the source of the published figures.
-    """
-
-    title: str
-    protocol: str
+    title: str  # the name for readers
+    protocol: str  # how photos are scaled and held out, in sentences
+    # For each scene, the number by which the photos are divided. The official smaller photos (such
+    # as images_4) are used if the dataset has them. Scenes that are not listed have their full
+    # size.
     resolutions: Mapping[str, int] = field(default_factory=dict)
+    # Every ``hold_out``-th photo is a test photo, unless the dataset has a split of its own.
     hold_out: int = 8
+    # Settings of the training that the protocol fixes.
     settings: Mapping[str, Any] = field(default_factory=dict)
-    published: Mapping[str, Figures] = field(default_factory=dict)
-    source: str = ""
+    published: Mapping[str, Figures] = field(default_factory=dict)  # figures of each scene
+    source: str = ""  # the source of the published figures
 
 
 SUITES = {

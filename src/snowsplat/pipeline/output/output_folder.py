@@ -86,11 +86,7 @@ class DatasetSettings:
     test_list: str | None = None
 
     def load(self) -> Dataset:
-        """Read the dataset.
-
-        Raises:
-            UserError: see `snowsplat.data.load_dataset`.
-        """
+        """Read the dataset. Raises: UserError: see `snowsplat.data.load_dataset`."""
         return self.read_files().dataset(self.resolution)
 
     def read_files(self) -> DatasetFiles:

@@ -100,16 +100,11 @@ def background_of(folder: OutputFolder) -> Color:
 
 @dataclass(frozen=True)
 class ViewableScene:
-    """A scene for a viewer, from a file or an output folder; its photos are not needed.
+    """A scene for a viewer, from a file or an output folder; its photos are not needed."""
 
-    Attributes:
-        file: the scene file.
-        cameras: the cameras of its photos; empty if unknown.
-    """
-
-    file: Path
+    file: Path  # the scene file
     gaussians: Gaussians
-    cameras: list[Camera]
+    cameras: list[Camera]  # the cameras of its photos; empty if unknown
     background: Color
 
 

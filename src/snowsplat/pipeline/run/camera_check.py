@@ -1,14 +1,20 @@
-"""`check_cameras`: before a training, refuses cameras that are impossible and warns of doubts."""
+"""Checks of a dataset before a training: impossible cameras, and damaged photos."""
 
 from __future__ import annotations
 
 import logging
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
-from snowsplat.data import Dataset
+from snowsplat.data import Dataset, View
+from snowsplat.data.decode import load_thumbnail
 from snowsplat.data.judge.verdict import judge
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
+
+_SIDE = 64  # pixels of the copies of photos, which are not used
 
 
 def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tuple[str, ...]:
@@ -33,3 +39,15 @@ def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tupl
     for finding in findings:
         logger.warning("warning: %s: %s", path, finding.text)
     return tuple(finding.text for finding in findings)
+
+
+def check_test_photos(views: Sequence[View]) -> None:
+    """Decode the held-out photos. The training itself decodes the others in its first steps.
+
+    Raises:
+        UserError: a photo cannot be decoded.
+    """
+    workers = min(4, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-check") as pool:
+        for _ in pool.map(lambda view: load_thumbnail(view.image, _SIDE), views):
+            pass

@@ -17,22 +17,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """The JSON object in a checkpoint; its keys are the names of the fields.
+    """The JSON object in a checkpoint; its keys are the names of the fields."""
 
-    Attributes:
-        dataset: how the dataset was read.
-        recipe: the recipe from which the configuration was derived.
-        training: the configuration, see `config_to_json`.
-        time: see `TimeBudget.as_json`; None without a time budget.
-        photos: stamps of the photos and masks; None in checkpoints of earlier versions.
-        schedule: the schedule, if it has changed: for a time budget, or because the scene overfits.
-    """
-
-    dataset: DatasetSettings
-    recipe: str
-    training: dict[str, Any]
-    time: dict[str, float] | None = None
+    dataset: DatasetSettings  # how the dataset was read
+    recipe: str  # the recipe from which the configuration was derived
+    training: dict[str, Any]  # the configuration, see `config_to_json`
+    time: dict[str, float] | None = None  # see `TimeBudget.as_json`; None without a time budget
+    # The schedule, if it has changed: for a time budget, or because the scene overfits.
     schedule: Schedule | None = None
+    # Stamps of the photos and masks; None in checkpoints of earlier versions.
     photos: dict[str, Stamp] | None = None
 
     @classmethod

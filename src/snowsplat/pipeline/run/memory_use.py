@@ -20,17 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MemoryUse:
-    """The memory plan of a training run, and its peak memory so far.
+    """The memory plan of a training run, and its peak memory so far."""
 
-    Attributes:
-        device: the device whose memory is planned.
-        plan: the memory plan, with the configuration that fits.
-        before: resident bytes of the process before the training: Python and its libraries.
-    """
-
-    device: torch.device
-    plan: MemoryPlan
-    before: int
+    device: torch.device  # the device whose memory is planned
+    plan: MemoryPlan  # the memory plan, with the configuration that fits
+    before: int  # resident bytes of the process before the training: Python and its libraries
 
     @classmethod
     def planned(

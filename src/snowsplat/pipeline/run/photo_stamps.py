@@ -15,16 +15,11 @@ _PART = 1 << 16  # bytes at the begin, the middle and the end of a file that its
 
 @dataclass(frozen=True)
 class Stamp:
-    """A file at one time.
+    """A file at one time."""
 
-    Attributes:
-        size: bytes.
-        time: of its last change, in nanoseconds; copies of a file may have another one.
-        digest: of parts of its content. An edited image is compressed anew, so all parts change.
-    """
-
-    size: int
-    time: int
+    size: int  # bytes
+    time: int  # of its last change, in nanoseconds; copies of a file may have another one
+    # Of parts of its content. An edited image is compressed anew, so all parts change.
     digest: str
 
 

@@ -53,16 +53,12 @@ class ProcessLost(UserError):
 
 @dataclass(frozen=True)
 class Setup:
-    """What the other processes need to create the same trainer as process 0.
-
-    Attributes:
-        checkpoint: the file of the state to continue from.
-    """
+    """What the other processes need to create the same trainer as process 0."""
 
     settings: DatasetSettings
     config: TrainConfig
     schedule: Schedule | None = None
-    checkpoint: Path | None = None
+    checkpoint: Path | None = None  # the file of the state to continue from
 
 
 def end_with_launcher() -> None:

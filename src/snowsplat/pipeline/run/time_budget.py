@@ -23,16 +23,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class TimeBudget:
-    """The time of one training run, from the start of the command to its end.
+    """The time of one training run, from the start of the command to its end."""
 
-    Attributes:
-        seconds: total time, including earlier runs.
-        spent: seconds in earlier runs, up to the checkpoint.
-        started: when this run started, by `time.monotonic`.
-    """
-
-    seconds: float
-    spent: float = 0.0
+    seconds: float  # total time, including earlier runs
+    spent: float = 0.0  # seconds in earlier runs, up to the checkpoint
+    # When this run started, by `time.monotonic`.
     started: float = field(default_factory=time.monotonic)
 
     @classmethod

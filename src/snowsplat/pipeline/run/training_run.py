@@ -52,32 +52,24 @@ _TRAINING_VIEWS = 4
 
 @dataclass
 class TrainingRun:
-    """One training run, to its end or to Ctrl-C.
-
-    Attributes:
-        settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
-        budget: the time budget; None: no time budget.
-        pace: adapts the number of steps to the time budget; None without a time budget.
-        save_iterations: steps after which the scene is written, in addition to the last step.
-        checkpoint_seconds: time between checkpoints, if the configuration has no checkpoint_every.
-        page: shows the training in the browser.
-        doubts: what is doubtful about the dataset, for the report.
-        photos: stamps of the photos and masks, for checkpoints.
-    """
+    """One training run, to its end or to Ctrl-C."""
 
     out: OutputFolder
+    # settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
     settings: DatasetSettings
     recipe: str
     trainer: Trainer
-    budget: TimeBudget | None
-    pace: Pace | None
+    budget: TimeBudget | None  # the time budget; None: no time budget
+    pace: Pace | None  # adapts the number of steps to the time budget; None without a time budget
     memory: MemoryUse
     observer: Observer
+    # Steps after which the scene is written, in addition to the last step.
     save_iterations: tuple[int, ...] = ()
+    # Time between checkpoints, if the configuration has no checkpoint_every.
     checkpoint_seconds: float | None = None
-    page: LivePage | None = None
-    doubts: tuple[str, ...] = ()
-    photos: dict[str, Stamp] | None = None
+    page: LivePage | None = None  # shows the training in the browser
+    doubts: tuple[str, ...] = ()  # what is doubtful about the dataset, for the report
+    photos: dict[str, Stamp] | None = None  # stamps of the photos and masks, for checkpoints
 
     def __post_init__(self) -> None:
         self.config = self.trainer.config

@@ -45,17 +45,11 @@ _TRIALS = 300
 
 @dataclass(frozen=True)
 class LensEvidence:
-    """What the matches say about the lens of a camera.
+    """What the matches say about the lens of a camera."""
 
-    Attributes:
-        focal: in pixels, of the equidistant fisheye lens with which the most matches agree.
-        gain: the number of these matches, divided by that of pinhole cameras.
-        fisheye: whether it is a fisheye lens.
-    """
-
-    focal: float
-    gain: float
-    fisheye: bool
+    focal: float  # in pixels, of the equidistant fisheye lens with which the most matches agree
+    gain: float  # the number of these matches, divided by that of pinhole cameras
+    fisheye: bool  # whether it is a fisheye lens
 
 
 def lens_evidence(database: Path, photos: Sequence[Photo], scale: float) -> dict[int, LensEvidence]:

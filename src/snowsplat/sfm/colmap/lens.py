@@ -63,20 +63,15 @@ _NEAR_EXIF = 0.1
 
 @dataclass(frozen=True)
 class Lens:
-    """How the cameras of an attempt begin, and what the mapper may change.
+    """How the cameras of an attempt begin, and what the mapper may change."""
 
-    Attributes:
-        model: a camera model of COLMAP; "auto": OPENCV if enough photos share a camera to determine
-            its eight parameters and ``held`` is false, else SIMPLE_RADIAL.
-        held: the focal length is not changed.
-        exif: the focal length is that in EXIF, where known.
-        focals: those with which cameras without EXIF begin, in pixels, by camera id; the others
-            begin with a guess.
-    """
-
+    # A camera model of COLMAP; "auto": OPENCV if enough photos share a camera to determine its
+    # eight parameters and ``held`` is false, else SIMPLE_RADIAL.
     model: str = "auto"
-    held: bool = False
-    exif: bool = True
+    held: bool = False  # the focal length is not changed
+    exif: bool = True  # the focal length is that in EXIF, where known
+    # Those with which cameras without EXIF begin, in pixels, by camera id; the others begin with a
+    # guess.
     focals: Mapping[int, float] = field(default_factory=dict)
     fisheyes: frozenset[int] = frozenset()
 
@@ -313,17 +308,11 @@ def _border(camera: pycolmap.Camera) -> NDArray[np.floating[Any]]:
 
 @dataclass(frozen=True)
 class Settled:
-    """A model whose lens is possible.
+    """A model whose lens is possible."""
 
-    Attributes:
-        model: None: no possible lens agrees with the matches.
-        held: whether the focal length is held from now on.
-        notes: what is in doubt about the lens, as text for users.
-    """
-
-    model: pycolmap.Reconstruction | None
-    held: bool
-    notes: list[str]
+    model: pycolmap.Reconstruction | None  # None: no possible lens agrees with the matches
+    held: bool  # whether the focal length is held from now on
+    notes: list[str]  # what is in doubt about the lens, as text for users
 
 
 #: Gives a model other cameras, runs bundle adjustment, and returns it. The last argument: whether

@@ -35,24 +35,16 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the cameras are on the earth.
+    """Where the cameras are on the earth."""
 
-    Attributes:
-        scale: metres per unit of SfM.
-        rotation: (3, 3), from the world frame of SfM to east, north, up.
-        translation: (3,) in metres.
-        covariance: (7, 7) of the rotation vector (rad), log of the scale, and translation (m).
-        error: standard deviation of a horizontal position from the cameras, in metres.
-        outliers: share of the positions, 0..1.
-        up_away: difference from the up direction that is known otherwise, in standard deviations.
-    """
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    scale: float  # metres per unit of SfM
+    rotation: np.ndarray  # (3, 3), from the world frame of SfM to east, north, up
+    translation: np.ndarray  # (3,) in metres
+    # (7, 7) of the rotation vector (rad), log of the scale, and translation (m).
     covariance: np.ndarray
-    error: float
-    outliers: float
+    error: float  # standard deviation of a horizontal position from the cameras, in metres
+    outliers: float  # share of the positions, 0..1
+    # Difference from the up direction that is known otherwise, in standard deviations.
     up_away: float
 
     @property

@@ -41,17 +41,11 @@ _SHARE = 0.2
 
 @dataclass(frozen=True)
 class Evidence:
-    """An up direction in the world frame of SfM, and how certain it is.
+    """An up direction in the world frame of SfM, and how certain it is."""
 
-    Attributes:
-        names: what it was found from, as text for users.
-        up: (3,) unit vector.
-        precision: (3, 3) inverse covariance in 1/rad², of which ``up`` is the null space.
-    """
-
-    names: tuple[str, ...]
-    up: np.ndarray
-    precision: np.ndarray
+    names: tuple[str, ...]  # what it was found from, as text for users
+    up: np.ndarray  # (3,) unit vector
+    precision: np.ndarray  # (3, 3) inverse covariance in 1/rad², of which ``up`` is the null space
 
     @property
     def error(self) -> float:

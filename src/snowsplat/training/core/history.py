@@ -17,21 +17,13 @@ _LARGEST_VALUE = 1e30
 
 @dataclass(frozen=True)
 class Stretch:
-    """A number of consecutive steps.
+    """A number of consecutive steps."""
 
-    Attributes:
-        step: the last step.
-        steps: number of steps.
-        loss: mean of the losses of the steps.
-        seconds: total time of the steps, without the time between steps.
-        gaussians: the number of Gaussians after the last step.
-    """
-
-    step: int
-    steps: int
-    loss: float
-    seconds: float
-    gaussians: int
+    step: int  # the last step
+    steps: int  # number of steps
+    loss: float  # mean of the losses of the steps
+    seconds: float  # total time of the steps, without the time between steps
+    gaussians: int  # the number of Gaussians after the last step
 
     def then(self, other: Stretch) -> Stretch:
         """This stretch and the next one, merged."""

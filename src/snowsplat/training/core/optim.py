@@ -1,8 +1,7 @@
 """`Adam` for Gaussians: its moments have the same rows as the Gaussians.
 
 `ops.adam_step` computes a step: it propagates the gradient of the splats through the projection and
-updates the parameters in the same pass. `Adam` stores the state between steps. Learning rates are
-in `lr_schedule`.
+updates the parameters in the same pass. `Adam` stores the state between steps.
 """
 
 from __future__ import annotations

@@ -24,8 +24,7 @@ from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_queue import ViewQueue
 from snowsplat.training.parts.part import Part
-from snowsplat.training.processes.sharded_render import sharded_render
-from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.processes.shards import ALONE, Shards, sharded_render
 from snowsplat.training.settings.config import TrainConfig, parts_of
 from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.util.errors import UserError

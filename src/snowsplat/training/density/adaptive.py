@@ -32,26 +32,19 @@ RESET_RECOVERY = 500
 
 @dataclass
 class AdaptiveDensityControl:
-    """State of adaptive density control.
-
-    Attributes:
-        first_reset: whether opacity is also reset at step ``first``.
-        grad_sum: (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1]; if
-            ``settings.abs_grad``, of the norm of the absolute gradients.
-        views: (N,) number of views in this sum: those in which the Gaussian was visible.
-        max_radii: (N,) largest 3σ radius in these views, in pixels.
-        shards: the processes; N is the number of rows of this process.
-    """
+    """State of adaptive density control."""
 
     settings: AdaptiveDensity
     schedule: Schedule
-    first_reset: bool
+    first_reset: bool  # whether opacity is also reset at step ``first``
     extent: float
     generator: torch.Generator
+    # (N,) sum over views of |∂L/∂mean2d|, with the image spanning [-1, 1]; if
+    # ``settings.abs_grad``, of the norm of the absolute gradients.
     grad_sum: Tensor
-    views: Tensor
-    max_radii: Tensor
-    shards: Shards = ALONE
+    views: Tensor  # (N,) number of views in this sum: those in which the Gaussian was visible
+    max_radii: Tensor  # (N,) largest 3σ radius in these views, in pixels
+    shards: Shards = ALONE  # the processes; N is the number of rows of this process
 
     @classmethod
     def begin(

@@ -19,9 +19,12 @@ from typing import Any
 
 from torch import Tensor
 
+from snowsplat import ops
 from snowsplat.ops.scratch import take_rows
 from snowsplat.ops.splats import Splats2D
+from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.render import Renderer, RenderOutput, project
 
 
 class Shards:
@@ -144,3 +147,16 @@ def share(rows: int, rank: int, size: int) -> tuple[int, int]:
 
 
 _ALIGNMENT = 64
+
+
+def sharded_render(shards: Shards) -> Renderer:
+    """A function that renders the Gaussians of all processes; each process must call it."""
+
+    def render(
+        gaussians: Gaussians, camera: Camera, background: Tensor, sh_degree: int | None
+    ) -> RenderOutput:
+        splats = shards.everywhere(project(gaussians, camera, sh_degree))
+        image, alpha, _ = ops.rasterize(splats, camera.width, camera.height, background)
+        return RenderOutput(image, alpha, None, splats)
+
+    return render

@@ -50,42 +50,29 @@ td { font-variant-numeric: tabular-nums; }
 
 @dataclass(frozen=True)
 class Trained:
-    """The content of the page.
+    """The content of the page."""
 
-    Attributes:
-        name: name of the scene.
-        step: the last step.
-        background: background colour of the views, RGB in 0..1.
-        evaluation: metrics of the held-out views; if there are none, some training views are
-            evaluated.
-        settings: the settings by name, as JSON values.
-        left_out: names of the training views that the training has left out.
-        exposures: the learnt exposure of each training view in EV; empty if none is learnt.
-        masks: the masks of what moves, by the name of the training view; see
-            `Transients.pictures`.
-        ended_early: why the training ended before its last planned step; None if it did not.
-        poses: the line about the camera poses; None if there is nothing to say.
-        doubts: what is doubtful about the cameras of the dataset, a sentence each.
-        verdict: the verdict on the scene; None if no photos were held out.
-        peak_bytes: peak memory; 0 if unknown.
-    """
-
-    name: str
+    name: str  # name of the scene
     dataset: Dataset
     gaussians: Gaussians
-    step: int
-    background: tuple[float, float, float]
+    step: int  # the last step
+    background: tuple[float, float, float]  # background colour of the views, RGB in 0..1
     history: History
+    # Metrics of the held-out views; if there are none, some training views are evaluated.
     evaluation: Evaluation | None
-    settings: dict[str, Any]
-    left_out: tuple[str, ...] = ()
+    settings: dict[str, Any]  # the settings by name, as JSON values
+    left_out: tuple[str, ...] = ()  # names of the training views that the training has left out
+    # The learnt exposure of each training view in EV; empty if none is learnt.
     exposures: tuple[float, ...] = ()
+    # The masks of what moves, by the name of the training view; see `Transients.pictures`.
     masks: Mapping[str, Image.Image] = field(default_factory=dict)
+    # Why the training ended before its last planned step; None if it did not.
     ended_early: str | None = None
-    poses: str | None = None
+    poses: str | None = None  # the line about the camera poses; None if there is nothing to say
+    # What is doubtful about the cameras of the dataset, a sentence each.
     doubts: tuple[str, ...] = ()
-    verdict: Verdict | None = None
-    peak_bytes: int = 0
+    verdict: Verdict | None = None  # the verdict on the scene; None if no photos were held out
+    peak_bytes: int = 0  # peak memory; 0 if unknown
 
 
 def write_training_report(path: Path, trained: Trained) -> None:

@@ -1,14 +1,5 @@
 """The settings of a training: the ground floor of `snowsplat.training`.
 
-declare.py   how a setting is declared: type, default, valid values, help and flag in its field
-config.py    `TrainConfig`
-rates.py     learning rates, and the rates of the decay
-density.py   the settings of density control; `DENSITY_CONTROLS`
-starts.py    the names of the starts; `STARTS`
-recipes.py   complete configurations by name; `RECIPES`
-names.py     changing settings by name
-stored.py    a configuration as JSON
-
 These modules import neither torch nor any other part of the training.
 """
 

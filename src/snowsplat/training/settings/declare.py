@@ -43,32 +43,26 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True)
 class Setting:
-    """What a field declares besides its type and its default.
+    """What a field declares besides its type and its default."""
 
-    Attributes:
-        help: one or two sentences. Names of other settings are in backquotes.
-        least, most, above, below: limits of a number; ``above`` and ``below`` are not included. If
-            a value is a list, they are limits of its items.
-        largest_fraction: the limit of a float, if the type is "a whole number or a fraction".
-        allowed: what is valid, if the limits cannot say it, for a message: "use <allowed>".
-        check: called with a value of the declared type; returns what is wrong with it, or None.
-        metavar: the placeholder of the value of the flag; "": a flag without a value; None: there
-            is no flag.
-        aliases: other spellings of the flag.
-        default: the default in the help text; None: it is set by the recipe.
-    """
-
+    # One or two sentences. Names of other settings are in backquotes.
     help: str = ""
+    # least, most, above, below: limits of a number; ``above`` and ``below`` are not included. If a
+    # value is a list, they are limits of its items.
     least: float | None = None
     most: float | None = None
     above: float | None = None
     below: float | None = None
+    # The limit of a float, if the type is "a whole number or a fraction".
     largest_fraction: float = 1.0
+    # What is valid, if the limits cannot say it, for a message: "use <allowed>".
     allowed: str | None = None
+    # Called with a value of the declared type; returns what is wrong with it, or None.
     check: Callable[[Any], str | None] | None = None
+    # The placeholder of the value of the flag; "": a flag without a value; None: there is no flag.
     metavar: str | None = None
-    aliases: tuple[str, ...] = ()
-    default: str | None = None
+    aliases: tuple[str, ...] = ()  # other spellings of the flag
+    default: str | None = None  # the default in the help text; None: it is set by the recipe
 
 
 _UNDECLARED = Setting()

@@ -21,41 +21,30 @@ _WIDEST = math.radians(170.0)
 
 @dataclass(frozen=True)
 class DisplaySettings:
-    """How Gaussians are displayed.
+    """How Gaussians are displayed."""
 
-    Attributes:
-        mode: what is displayed: colours, depth … "error" is the difference from a photo.
-        sh_degree: degree of the spherical harmonics that are used for colours.
-        scale: factor on the size of every Gaussian.
-        crop: lower and upper corner (x, y, z, world) of a box; Gaussians outside are hidden.
-        wipe: fraction of the width, from the left, in which the photo covers the rendering.
-    """
-
+    # What is displayed: colours, depth … "error" is the difference from a photo.
     mode: Mode = "color"
-    sh_degree: int = 3
-    scale: float = 1.0
+    sh_degree: int = 3  # degree of the spherical harmonics that are used for colours
+    scale: float = 1.0  # factor on the size of every Gaussian
+    # Lower and upper corner (x, y, z, world) of a box; Gaussians outside are hidden.
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    # Fraction of the width, from the left, in which the photo covers the rendering.
     wipe: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """The camera pose of a browser.
+    """The camera pose of a browser."""
 
-    Attributes:
-        quat: (4,) wxyz, float64, rotation of world_from_cam; x right, y down, z forward.
-        position: (3,) float64, camera centre in the world frame.
-        fov: vertical field of view in radians.
-        width, height: size of the window in pixels.
-        near: the near plane, in world units.
-    """
-
+    # (4,) wxyz, float64, rotation of world_from_cam; x right, y down, z forward.
     quat: Tensor = field(repr=False)
-    position: Tensor
-    fov: float
+    position: Tensor  # (3,) float64, camera centre in the world frame
+    fov: float  # vertical field of view in radians
+    # width, height: size of the window in pixels.
     width: int
     height: int
-    near: float = NEAR
+    near: float = NEAR  # the near plane, in world units
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of an image of this size."""

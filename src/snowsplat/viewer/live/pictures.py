@@ -34,15 +34,10 @@ _BRIGHTNESS_AROUND = 0.35  # factor for the rendering outside of the rectangle o
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo with which a rendering is compared.
+    """A photo with which a rendering is compared."""
 
-    Attributes:
-        pixels: (h, w, 3) uint8, at the size of ``placed``.
-        placed: the rectangle of the photo in the image.
-    """
-
-    pixels: Tensor
-    placed: PhotoRectangle
+    pixels: Tensor  # (h, w, 3) uint8, at the size of ``placed``
+    placed: PhotoRectangle  # the rectangle of the photo in the image
 
 
 @torch.no_grad()

@@ -32,36 +32,25 @@ _IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """A photo to whose pose a browser was moved, to compare the photo with its rendering.
+    """A photo to whose pose a browser was moved, to compare the photo with its rendering."""
 
-    Attributes:
-        index: index of the photo in the viewer's list.
-        camera: camera of the photo.
-        photo: (3, H, W) uint8.
-        pose: pose to which the browser was moved.
-    """
-
-    index: int
-    camera: Camera
-    photo: Tensor
-    pose: Pose
+    index: int  # index of the photo in the viewer's list
+    camera: Camera  # camera of the photo
+    photo: Tensor  # (3, H, W) uint8
+    pose: Pose  # pose to which the browser was moved
 
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """An image to render for a browser.
-
-    Attributes:
-        kind: "moving": a small image, because the camera moves; "still": full size; "idle": full
-            size, because only the scene has changed.
-        version: `Visitor.version` when the image was requested.
-    """
+    """An image to render for a browser."""
 
     visitor: Visitor
+    # "moving": a small image, because the camera moves; "still": full size; "idle": full size,
+    # because only the scene has changed.
     kind: Literal["moving", "still", "idle"]
     width: int
     height: int
-    version: int
+    version: int  # `Visitor.version` when the image was requested
     pose: Pose
     display: DisplaySettings
     photo_view: PhotoView | None
@@ -232,11 +221,6 @@ class Session:
                 self._steps -= 1
                 return True
             return not self._paused
-
-    def is_here(self, visitor: Visitor) -> bool:
-        """Whether the browser is still connected."""
-        with self._changed:
-            return visitor in self._visitors.values()
 
     def next_request(self, scene: int, training: bool) -> RenderRequest | None:
         """The next image to render; None if there is none, or if the training has to run first.

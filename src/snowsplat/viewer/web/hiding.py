@@ -27,17 +27,12 @@ _ROWS_SAMPLED = 1_000_000
 
 @dataclass(frozen=True)
 class Hiding:
-    """The ranges of the sliders, in world units.
+    """The ranges of the sliders, in world units."""
 
-    Attributes:
-        distance: from the subject; what a value just above 0 keeps, and what 100 keeps.
-        size: of the longest axis of a Gaussian, in standard deviations; likewise.
-        start: the value for the size at first.
-    """
-
+    # From the subject; what a value just above 0 keeps, and what 100 keeps.
     distance: tuple[float, float]
-    size: tuple[float, float]
-    start: int
+    size: tuple[float, float]  # of the longest axis of a Gaussian, in standard deviations; likewise
+    start: int  # the value for the size at first
 
     def settings(self) -> dict[str, Any]:
         """What `hiding.js` needs."""

@@ -21,17 +21,11 @@ _FOLDER = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Description:
-    """What a page says about its scene.
+    """What a page says about its scene."""
 
-    Attributes:
-        title: the name of the scene.
-        licence: the licence of the scene, such as "CC BY 4.0"; "" if it is not stated.
-        made: the day on which the scene was made; None if it is not known.
-    """
-
-    title: str
-    licence: str = ""
-    made: date | None = None
+    title: str  # the name of the scene
+    licence: str = ""  # the licence of the scene, such as "CC BY 4.0"; "" if it is not stated
+    made: date | None = None  # the day on which the scene was made; None if it is not known
 
     def facts(self, gaussians: int) -> str:
         """The facts in one line: number of Gaussians, date, licence."""

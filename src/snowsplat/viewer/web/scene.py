@@ -100,23 +100,16 @@ def _content(gaussians: Gaussians, levels: Callable[[Gaussians], Path] | None) -
 
 
 class ReadyScene(NamedTuple):
-    """A scene in a frame that suits the viewer.
-
-    Attributes:
-        start: the initial view.
-        film: views along the path of the photographer, at equal distances in time; empty if there
-            is no such path.
-        stops: views of some of the photos, and the subject of the scene.
-        background: red, green, blue in 0..1.
-        hiding: what the page can hide.
-    """
+    """A scene in a frame that suits the viewer."""
 
     gaussians: Gaussians
-    start: InitialView
+    start: InitialView  # the initial view
+    # Views along the path of the photographer, at equal distances in time; empty if there is no
+    # such path.
     film: list[InitialView]
-    stops: Stops
-    background: Sequence[float]
-    hiding: Hiding
+    stops: Stops  # views of some of the photos, and the subject of the scene
+    background: Sequence[float]  # red, green, blue in 0..1
+    hiding: Hiding  # what the page can hide
 
     def complete(self) -> ReadyScene:
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""

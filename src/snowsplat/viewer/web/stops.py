@@ -32,19 +32,12 @@ _SHARE = 0.9
 
 
 class Stops(NamedTuple):
-    """Stops and subject of a scene.
+    """Stops and subject of a scene."""
 
-    Attributes:
-        views: one per stop, in the order of the photos.
-        pictures: a WebP file with the pictures of all stops; empty if there are none.
-        middle: (3,) float64: the focus of the cameras.
-        radius: the distance from the middle that contains most of it.
-    """
-
-    views: list[InitialView]
-    pictures: bytes
-    middle: Tensor
-    radius: float
+    views: list[InitialView]  # one per stop, in the order of the photos
+    pictures: bytes  # a WebP file with the pictures of all stops; empty if there are none
+    middle: Tensor  # (3,) float64: the focus of the cameras
+    radius: float  # the distance from the middle that contains most of it
 
 
 def stops_of(
