@@ -246,11 +246,19 @@ def test_matches_do_not_agree_with_another_pose(two_views):
     assert agreement(wrong, rays1, rays2, 1e-3) < 0.1
 
 
-def test_agreement_of_a_model_is_that_of_the_strongest_pairs():
+def test_agreement_of_a_model_is_that_of_the_worst_of_the_strongest_pairs():
     """Pairs of photos that look alike have fewer matches, which may be false."""
-    right = [CheckedPair(i, i + 1, 300, 250, agreeing=1.0) for i in range(1, 9)]
-    false = [CheckedPair(1, i, 200, 0, agreeing=0.0) for i in range(4, 9)]
-    assert agreement_of(right + false) == 1.0
-    bent = [replace(pair, agreeing=0.8) if pair.first < 5 else pair for pair in right]
-    assert agreement_of(bent + false) == pytest.approx(0.9)
-    assert agreement_of([]) == 0.0
+    right = [CheckedPair(i, i + 1, 300, 250, agreeing=1.0) for i in range(1, 99)]
+    false = [CheckedPair(1, i, 200, 0, agreeing=0.0) for i in range(4, 99)]
+    assert agreement_of(right + false, lambda pair: 1.0) == 1.0
+    bent = [replace(pair, agreeing=0.8) if pair.first < 3 else pair for pair in right]
+    assert agreement_of(bent + false, lambda pair: 1.0) == pytest.approx((2 * 0.8 + 3) / 5)
+    assert agreement_of(bent[:5], lambda pair: 1.0) == pytest.approx((2 * 0.8 + 1) / 3)
+    assert agreement_of([], lambda pair: 1.0) == 0.0
+
+
+def test_matches_that_agree_with_no_pose_do_not_count():
+    """On repeating structures, some of the matches of neighbouring photos are false."""
+    pairs = [CheckedPair(i, i + 1, 300, 200, agreeing=0.7) for i in range(1, 9)]
+    assert agreement_of(pairs, lambda pair: 0.72) == pytest.approx(0.7 / 0.72)
+    assert agreement_of(pairs, lambda pair: 0.6) == 1.0

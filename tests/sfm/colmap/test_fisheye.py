@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.consistency import agreement, agreement_of, check_pairs
+from snowsplat.sfm.colmap.consistency import agreement, agreement_of_model
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.fisheye import lens_evidence
 from snowsplat.sfm.colmap.lens import Lens, cameras_of, findings_of, with_all_parameters
@@ -71,7 +71,7 @@ def test_photos_of_a_fisheye_lens_are_placed(tmp_path, lens):
     centres = np.array([image.projection_center() for image in images])
     steps, true = (np.linalg.norm(c[:, None] - c[None], axis=-1) for c in (centres, WALK.centres))
     np.testing.assert_allclose(steps / steps.max(), true / true.max(), atol=0.005)
-    assert agreement_of(check_pairs(model, database, 4.0)) > 0.99
+    assert agreement_of_model(model, database, 4.0) > 0.99
 
 
 def test_a_fisheye_lens_begins_with_few_parameters_and_a_prior():

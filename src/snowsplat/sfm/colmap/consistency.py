@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.lens import is_fisheye, lens_of, pixels_per_radian
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
@@ -73,6 +74,11 @@ _MIN_ANGLE = 2.0  # degrees: two rays with a smaller angle between them count as
 _MAX_SUPPORT = 0.5
 _MIN_TEARS = 3
 _MIN_FOLLOWING_TEARS = 2
+# `agreement_of`: the share of the pairs that is considered, and their least number. A pair whose
+# matches agree by `_AGREES` is right.
+_WORST, _MIN_WORST = 0.05, 3
+_AGREES = 0.98
+_MAX_TRIALS = 3000  # most samples of RANSAC for the best relative pose of a pair
 _VECTORS = 6  # number of eigenvectors that are tried
 _THRESHOLDS = 10  # number of thresholds that are tried for each eigenvector
 
@@ -109,11 +115,17 @@ class CheckedPair(VerifiedPair):
         return self.counts and self.contradicted
 
 
-def agreement_of(pairs: Sequence[CheckedPair]) -> float:
-    """The share of the matches of the strongest pairs that agree with the poses: 0 to 1.
+def agreement_of(pairs: Sequence[CheckedPair], possible: Callable[[CheckedPair], float]) -> float:
+    """How well the poses agree with the matches where they agree least: 0 to 1.
 
-    The strongest pair of each photo counts: its matches are rarely false. In a model that is bent,
-    or whose parts have different scales, a part of these matches does not agree.
+    The strongest pair of each photo counts: its matches are rarely false. Where a model is bent, or
+    where parts of different scales meet, many of these matches do not agree with the poses, but
+    with other ones. On repeating structures, some agree with no poses. So the number of matches
+    that agree is divided by the number that the best relative pose of the pair reaches. The result
+    is the mean of the pairs with the least quotients (`_WORST`, at least `_MIN_WORST` pairs): a
+    model of many photos may be bent in one place.
+
+    ``possible``: the share of the matches of a pair that agree with the best relative pose.
     """
     strongest: dict[int, CheckedPair] = {}
     for pair in pairs:
@@ -121,8 +133,42 @@ def agreement_of(pairs: Sequence[CheckedPair]) -> float:
             if photo not in strongest or pair.weight > strongest[photo].weight:
                 strongest[photo] = pair
     chosen = {(pair.first, pair.second): pair for pair in strongest.values()}.values()
-    total = sum(pair.matches for pair in chosen)
-    return sum(pair.matches * pair.agreeing for pair in chosen) / total if total else 0.0
+    shares = [
+        (p.agreeing / max(p.agreeing, possible(p), 1e-9) if p.agreeing < _AGREES else 1.0, p)
+        for p in chosen
+    ]
+    worst = sorted(shares, key=lambda entry: entry[0])[
+        : max(_MIN_WORST, round(_WORST * len(shares)))
+    ]
+    total = sum(pair.matches for _, pair in worst)
+    return sum(share * pair.matches for share, pair in worst) / total if total else 0.0
+
+
+def agreement_of_model(model: pycolmap.Reconstruction, database: Path, max_error: float) -> float:
+    """`agreement_of` the pairs of ``model``; ``max_error`` as in `check_pairs`."""
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.max_num_trials = max_error, _MAX_TRIALS
+    options.random_seed = SEED
+    with closing_database(database) as source:
+
+        def possible(pair: CheckedPair) -> float:
+            ids = pair.first, pair.second
+            one, two = (model.camera(model.image(i).camera_id) for i in ids)
+            if any(is_fisheye(c.model_name) or c.is_spherical() for c in (one, two)):
+                return 1.0  # COLMAP estimates their relative poses in the image plane
+            rows = source.read_two_view_geometry(*ids).inlier_matches
+            first, second = (
+                source.read_keypoints(i)[rows[:, k], :2].astype(np.float64)
+                for k, i in enumerate(ids)
+            )
+            found = pycolmap.estimate_essential_matrix(first, second, one, two, options)
+            if found is None:
+                return 1.0
+            error = max_error / float(np.mean([pixels_per_radian(c) for c in (one, two)]))
+            rays = _rays(one, first), _rays(two, second)
+            return agreement(found["cam2_from_cam1"], *rays, error)
+
+        return agreement_of(check_pairs(model, database, max_error), possible)
 
 
 def check_pairs(

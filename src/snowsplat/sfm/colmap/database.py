@@ -22,6 +22,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.lens import Lens, camera_ids, cameras_of
+from snowsplat.sfm.colmap.tracks import of_long_tracks
 from snowsplat.sfm.ingest.photo import Photo
 
 _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}
@@ -123,6 +124,25 @@ def copy_for_mapping(path: Path, target: Path, without: Iterable[tuple[int, int]
                 if kind == "table" and name not in ("descriptors", "matches"):
                     connection.execute(f'INSERT INTO main."{name}" SELECT * FROM source."{name}"')
             connection.executemany("DELETE FROM main.two_view_geometries WHERE pair_id = ?", ids)
+
+
+def keep_matches_of_long_tracks(path: Path) -> None:
+    """Remove the verified matches that `tracks.of_long_tracks` does not choose."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        found = connection.execute(
+            "SELECT pair_id, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+        ).fetchall()
+        counts = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
+        rows = [np.frombuffer(data, np.uint32).reshape(-1, 2) for _, data in found]
+        ids = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id, _ in found]
+        kept = of_long_tracks([(*i, r) for i, r in zip(ids, rows, strict=True)], counts)
+        connection.executemany(
+            "UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?",
+            [
+                (int(keep.sum()), matched[keep].tobytes(), pair_id)
+                for (pair_id, _), matched, keep in zip(found, rows, kept, strict=True)
+            ],
+        )
 
 
 @contextmanager

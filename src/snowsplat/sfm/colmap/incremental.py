@@ -39,13 +39,15 @@ ImagePair = tuple[int, int]
 class IncrementalMapper:
     """Makes models from the features and verified matches in a database.
 
-    ``registered`` is called with the number of registered photos of the model.
+    ``registered`` is called with the number of registered photos of the model. ``reduced`` is a
+    copy of the database with a part of the matches; photos are registered with these.
     """
 
     database: Path
     graph: ViewGraph
     options: pycolmap.IncrementalPipelineOptions
     registered: Callable[[int], None]
+    reduced: Path | None = None
     _tried: set[ImagePair] = field(default_factory=set)  # initial pairs
 
     def start(self, photos: Collection[int]) -> pycolmap.Reconstruction | None:
@@ -54,7 +56,7 @@ class IncrementalMapper:
         Each call starts with a pair of photos with which no earlier call started.
         """
         options = self.options.get_mapper()
-        with self._mapper(photos) as mapper:
+        with self._mapper(photos, self.database) as mapper:
             model = pycolmap.Reconstruction()
             mapper.begin_reconstruction(model)
             for pair, pose in self._initial_pairs(mapper, options, photos):
@@ -81,25 +83,27 @@ class IncrementalMapper:
         not change, and a photo takes about a third of the time.
         """
         graph = self.graph.of_photos({*photos, *model.reg_image_ids()})
-        with self._mapper(graph.names) as mapper:
+        with self._mapper(graph.names, self.reduced or self.database) as mapper:
             mapper.begin_reconstruction(model)
             _Growth(mapper, model, graph, self.options, adjust, self.registered).register_all()
             mapper.end_reconstruction(False)
 
-    def triangulate_pairs(self, model: pycolmap.Reconstruction) -> None:
-        """Add points that only two photos of ``model`` see. The poses do not change.
+    def triangulate_all(self, model: pycolmap.Reconstruction, pairs: bool) -> None:
+        """Add the points of all matches to ``model``. The poses do not change.
 
-        COLMAP does not use such matches (`ignore_two_view_tracks`), because they contribute little
-        to the poses, and more of them are false. With the final poses, a false match is recognised:
-        most of them are far from the epipolar line.
+        ``pairs``: also those that only two photos see. COLMAP does not use such matches for poses
+        (`ignore_two_view_tracks`), because they contribute little, and more of them are false. With
+        the final poses, a false match is recognised: most of them are far from the epipolar line.
         """
         options = self.options.get_triangulation()
-        options.ignore_two_view_tracks = False
+        options.ignore_two_view_tracks = not pairs
         photos = sorted(model.reg_image_ids())
-        with self._mapper(photos) as mapper:
+        with self._mapper(photos, self.database) as mapper:
             mapper.begin_reconstruction(model)
             for photo in photos:
                 mapper.triangulate_image(options, photo)
+            if not pairs:
+                mapper.complete_and_merge_tracks(options)
             mapper.end_reconstruction(False)
 
     def _initial_pairs(
@@ -127,13 +131,15 @@ class IncrementalMapper:
                 yield ids, pose
 
     @contextmanager
-    def _mapper(self, photos: Collection[int]) -> Iterator[pycolmap.IncrementalMapper]:
-        """COLMAP's mapper for ``photos``."""
+    def _mapper(
+        self, photos: Collection[int], database: Path
+    ) -> Iterator[pycolmap.IncrementalMapper]:
+        """COLMAP's mapper for ``photos``, with the matches of ``database``."""
         options = pycolmap.DatabaseCacheOptions()
         options.min_num_matches = self.options.min_num_matches
         options.image_names = {self.graph.names[photo] for photo in photos}
         options.load_all_images = True  # a model may contain photos without any match
-        with closing_database(self.database) as source:
+        with closing_database(database) as source:
             cache = pycolmap.DatabaseCache.create(source, options)
         yield pycolmap.IncrementalMapper(cache)
 

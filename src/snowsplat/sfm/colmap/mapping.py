@@ -5,14 +5,20 @@ from __future__ import annotations
 import copy
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import pycolmap
 
-from snowsplat.sfm.colmap.database import closing_database, count_rows
+from snowsplat.sfm.colmap.database import (
+    closing_database,
+    copy_for_mapping,
+    count_rows,
+    keep_matches_of_long_tracks,
+    remove_database,
+)
 from snowsplat.sfm.colmap.feature_alignment import align_features
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.incremental import IncrementalMapper
@@ -37,12 +43,13 @@ _LARGE_MODEL = 40
 _GROWTH = 1.4
 _ITERATIONS = 20
 # Bundle adjustment ends when an iteration reduces the cost by less than this share. There is one
-# share for local and one for global bundle adjustment in the mapper, and one for the final bundle
-# adjustment of the result. By default, COLMAP goes on until the gradient is small, which takes
-# several times as long.
+# share for local and one for global bundle adjustment in the mapper, one for the final bundle
+# adjustment of the result, and one for this before the last scale of its loss. By default, COLMAP
+# goes on until the gradient is small, which takes several times as long.
 _LOCAL_TOLERANCE = 1e-4
 _GLOBAL_TOLERANCE = 1e-5
 _FINAL_TOLERANCE = 1e-4
+_EARLY_TOLERANCE = 1e-3
 # The bundle adjustment of the result has a Cauchy loss, so false matches that became observations
 # have little effect on the poses. Its scale, in units of the mean reprojection error, is decreased:
 # with the small one alone, a model that is bent may remain bent. Before the check of the poses, the
@@ -77,12 +84,12 @@ class Mapping:
         ``mapper``: "plain" is the incremental mapper with COLMAP's own order of registration.
         ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
+        if mapper == "incremental":
+            return usable_models(self._map_incrementally(relaxed))
         if mapper == "global":
             models = self._map_globally()
-        elif mapper == "plain":
-            models = self._map_in_plain_order(relaxed)
         else:
-            models = self._map_incrementally(relaxed)
+            models = self._map_in_plain_order(relaxed)
         return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
 
     def extend(
@@ -144,7 +151,7 @@ class Mapping:
             for camera in model.cameras.values():
                 database.update_camera(camera)
         mapper = self._mapper(ViewGraph.read(self.database), relaxed=False)
-        mapper.triangulate_pairs(model)
+        mapper.triangulate_all(model, pairs=True)
         self._remove_outliers(model, _MIN_POINTS_ALIGNED)
 
     def _options(self, relaxed: bool) -> pycolmap.IncrementalPipelineOptions:
@@ -187,27 +194,49 @@ class Mapping:
     def _map_incrementally(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
         """Make models one after the other, each from the photos that are in no earlier model."""
         graph = ViewGraph.read(self.database)
-        mapper = self._mapper(graph, relaxed)
         models: list[pycolmap.Reconstruction] = []
         left, first = graph, self._first(graph)
-        for _ in range(_MAX_MODELS):
-            model = mapper.start(first) if len(left.names) >= MIN_PHOTOS else None
-            if model is None:
-                break
-            self._grow(mapper, model, left, first)
-            if model.num_reg_images() >= MIN_PHOTOS:
-                models.append(model)
-                left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
-                first = self._first(left)
+        # With weak matches, none can be spared.
+        with self._long_tracks() if not (relaxed or self.forward) else nullcontext() as reduced:
+            mapper = self._mapper(graph, relaxed, reduced)
+            for _ in range(_MAX_MODELS):
+                model = mapper.start(first) if len(left.names) >= MIN_PHOTOS else None
+                if model is None:
+                    break
+                self._grow(mapper, model, left, first)
+                if model.num_reg_images() >= MIN_PHOTOS:
+                    models.append(model)
+                    left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
+                    first = self._first(left)
+        if reduced is None:
+            return [self._refine(model, scales=_FIRST_LOSS_SCALES) for model in models]
+        for model in models:
+            self._adjust(model, _FIRST_LOSS_SCALES[0])
+            mapper.triangulate_all(model, pairs=False)
+            self._remove_outliers(model, MIN_POINTS)
         return models
 
-    def _mapper(self, graph: ViewGraph, relaxed: bool) -> IncrementalMapper:
+    @contextmanager
+    def _long_tracks(self) -> Iterator[Path]:
+        """A temporary copy of the database that has only the matches of long tracks."""
+        reduced = self.database.with_suffix(".tracks.db")
+        try:
+            copy_for_mapping(self.database, reduced, without=())
+            keep_matches_of_long_tracks(reduced)
+            yield reduced
+        finally:
+            remove_database(reduced)
+
+    def _mapper(
+        self, graph: ViewGraph, relaxed: bool, reduced: Path | None = None
+    ) -> IncrementalMapper:
         total = len(graph.names)
         return IncrementalMapper(
             self.database,
             graph,
             self._options(relaxed),
             lambda registered: self.report(registered, total, "registered photos"),
+            reduced,
         )
 
     def _first(self, graph: ViewGraph) -> set[int]:
@@ -272,17 +301,20 @@ class Mapping:
         for scale in scales:
             if model.num_reg_images() < MIN_PHOTOS:
                 break
-            self._adjust(model, scale)
+            last = scale == _FINAL_LOSS_SCALES[-1]
+            self._adjust(model, scale, _FINAL_TOLERANCE if last else _EARLY_TOLERANCE)
             self._remove_outliers(model, min_points)
         return model
 
-    def _adjust(self, model: pycolmap.Reconstruction, scale: float) -> None:
+    def _adjust(
+        self, model: pycolmap.Reconstruction, scale: float, tolerance: float = _FINAL_TOLERANCE
+    ) -> None:
         """Run bundle adjustment; ``scale`` of the loss, in units of the mean reprojection error."""
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary = False
         options.refine_focal_length = not self.held
         options.ceres.solver_options.num_threads = self.threads
-        options.ceres.solver_options.function_tolerance = _FINAL_TOLERANCE
+        options.ceres.solver_options.function_tolerance = tolerance
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
         pycolmap.bundle_adjustment(model, options)

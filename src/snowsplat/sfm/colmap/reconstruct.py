@@ -41,7 +41,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap import camera_groups
-from snowsplat.sfm.colmap.consistency import agreement_of, check_pairs
+from snowsplat.sfm.colmap.consistency import agreement_of_model
 from snowsplat.sfm.colmap.database import (
     fingerprint_of,
     forget_verification,
@@ -78,8 +78,8 @@ from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
-# A model is bent if a smaller share of its strongest matches agrees with it. Of ten models with
-# correct poses, the least value is 0.99; of two bent models, 0.91 and 0.94.
+# A model is bent if its agreement is less than this (`agreement_of`). That of right models is 0.99
+# or more; of three bent ones, it is 0.61 to 0.79.
 _CONSISTENT = 0.97
 # The expected time from the start of the job to the end of the next attempt, divided by the time
 # from the start of the job until now.
@@ -193,8 +193,8 @@ class PoseEstimation:
         doubts = list(best.doubts)
         if best.agreement < _CONSISTENT:
             doubts.append(
-                f"the poses may be bent: {best.agreement:.0%} of the matches between neighbouring "
-                "photos agree with them"
+                f"the poses may be bent: where they fit least, {best.agreement:.0%} of the matches "
+                "between neighbouring photos agree with them"
             )
         doubts = doubts or self._other_lens(best)
         return dataclasses.replace(
@@ -374,7 +374,7 @@ class PoseEstimation:
         agreement = 0.0
         if models:
             error = _MAX_ERROR * matched.scale
-            agreement = agreement_of(check_pairs(models[0], matched.database, error))
+            agreement = agreement_of_model(models[0], matched.database, error)
         attempt = Attempt(matched, lens, mapping, models, agreement, left_out, doubts)
         self.attempts.append(attempt)
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
