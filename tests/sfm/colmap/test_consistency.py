@@ -262,3 +262,5 @@ def test_matches_that_agree_with_no_pose_do_not_count():
     pairs = [CheckedPair(i, i + 1, 300, 200, agreeing=0.7) for i in range(1, 9)]
     assert agreement_of(pairs, lambda pair: 0.72) == pytest.approx(0.7 / 0.72)
     assert agreement_of(pairs, lambda pair: 0.6) == 1.0
+    missed = [replace(pair, miss_share=0.28) for pair in pairs]
+    assert agreement_of(missed, lambda pair: 1.0) == pytest.approx(0.7 / 0.72)

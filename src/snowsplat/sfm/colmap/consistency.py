@@ -120,10 +120,11 @@ def agreement_of(pairs: Sequence[CheckedPair], possible: Callable[[CheckedPair],
 
     The strongest pair of each photo counts: its matches are rarely false. Where a model is bent, or
     where parts of different scales meet, many of these matches do not agree with the poses, but
-    with other ones. On repeating structures, some agree with no poses. So the number of matches
-    that agree is divided by the number that the best relative pose of the pair reaches. The result
-    is the mean of the pairs with the least quotients (`_WORST`, at least `_MIN_WORST` pairs): a
-    model of many photos may be bent in one place.
+    with other ones, and their features observe no point. On repeating structures, some agree with
+    no poses, or with false ones: these are misses. So the number of matches that agree is divided
+    by the number that the best relative pose of the pair reaches, without the misses. The result is
+    the mean of the pairs with the least quotients (`_WORST`, at least `_MIN_WORST` pairs): a model
+    of many photos may be bent in one place.
 
     ``possible``: the share of the matches of a pair that agree with the best relative pose.
     """
@@ -133,10 +134,13 @@ def agreement_of(pairs: Sequence[CheckedPair], possible: Callable[[CheckedPair],
             if photo not in strongest or pair.weight > strongest[photo].weight:
                 strongest[photo] = pair
     chosen = {(pair.first, pair.second): pair for pair in strongest.values()}.values()
-    shares = [
-        (p.agreeing / max(p.agreeing, possible(p), 1e-9) if p.agreeing < _AGREES else 1.0, p)
-        for p in chosen
-    ]
+
+    def share(pair: CheckedPair) -> float:
+        if pair.agreeing >= _AGREES * (1 - pair.miss_share):
+            return 1.0
+        return min(1.0, pair.agreeing / max(1e-9, min(possible(pair), 1 - pair.miss_share)))
+
+    shares = [(share(pair), pair) for pair in chosen]
     worst = sorted(shares, key=lambda entry: entry[0])[
         : max(_MIN_WORST, round(_WORST * len(shares)))
     ]
