@@ -10,9 +10,8 @@ Gaussians in front of
 
 are removed, in the training views and in unseen views beside and between them. A Gaussian is in a
 view if its body reaches into the image, even if its centre is outside. With a narrow field of view,
-there is much empty space between the cameras that no photo shows. A Gaussian there tints the borders
-of some photos with its tails, for example where somebody walks past, and covers the views between
-them like a veil.
+no photo shows much of the empty space between the cameras. There, a group of small Gaussians tints
+the border of a photo with its tails, and covers a view between the photos like a veil.
 
 FreeNeRF (Yang et al., CVPR 2023) also penalises density near the cameras ("occlusion
 regularisation"). There, the range is a setting, and there are no unseen views.
