@@ -8,10 +8,7 @@ Gaussians in front of
 
     share · (the depth that 98% of the points in the view exceed)
 
-are removed, in the training views and in unseen views beside and between them. A Gaussian is in a
-view if its body reaches into the image, even if its centre is outside. With a narrow field of view,
-no photo shows much of the empty space between the cameras. There, a group of small Gaussians tints
-the border of a photo with its tails, and covers a view between the photos like a veil.
+are removed, in the training views and in unseen views beside and between them.
 
 FreeNeRF (Yang et al., CVPR 2023) also penalises density near the cameras ("occlusion
 regularisation"). There, the range is a setting, and there are no unseen views.
@@ -27,7 +24,6 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.training.parts.part import REMOVED, Part
 from snowsplat.training.parts.unseen_cameras import beside
 from snowsplat.training.starts.source_views import source_views
@@ -49,8 +45,6 @@ _PAIRING, _POINTS = 1000, 10_000
 _QUANTILE = 0.02
 #: Cameras that see fewer points have no limit.
 _FEWEST_POINTS = 50
-#: The body of a Gaussian ends at this number of standard deviations, at an eighth of its opacity.
-_BODY = 2.0
 #: This number of Gaussians is processed at a time, to limit the memory.
 _ROWS = 1 << 14
 
@@ -88,33 +82,20 @@ class NearLimit(Part):
     def between(self, run: Run) -> None:
         """Make the Gaussians that are too near transparent, in every `INTERVAL`-th step."""
         if self._views is not None and run.schedule.multiples(run.step, INTERVAL):
-            gaussians = run.gaussians
-            axes = rotation_from_quat(gaussians.quats) * gaussians.log_scales.exp()[:, None]
-            parts = zip(gaussians.means.split(_ROWS), axes.split(_ROWS), strict=True)
-            near = torch.cat([self._is_near(means, own) for means, own in parts])
-            gaussians.opacity_logits.masked_fill_(near, REMOVED)
+            near = torch.cat([self._is_near(means) for means in run.gaussians.means.split(_ROWS)])
+            run.gaussians.opacity_logits.masked_fill_(near, REMOVED)
 
-    def _is_near(self, means: Tensor, axes: Tensor) -> Tensor:
-        """(M,) bool: which Gaussians are in front of the limit of a view.
-
-        Args:
-            means: (M, 3), world units.
-            axes: (M, 3, 3), the columns are the principal axes; their lengths are the standard
-                deviations.
-        """
+    def _is_near(self, means: Tensor) -> Tensor:
+        """(M,) bool: which of the means (M, 3) are in front of the limit of a view."""
         assert self._views is not None
         limits, size = self._views[:, 0], self._views[:, 1:3]
         to_image = self._views[:, 3:].reshape(-1, 3, 4)
         depths = means @ to_image[:, 2, :3].T + to_image[:, 2, 3]
         row, view = torch.nonzero((depths > 0.0) & (depths < limits), as_tuple=True)
-        affine, depth, size = to_image[view], depths[row, view, None], size[view]
+        affine = to_image[view]
         projected = (affine[:, :2, :3] @ means[row, :, None])[:, :, 0] + affine[:, :2, 3]
-        pixel = projected / depth
-        # As in the projection, the Jacobian is evaluated in the image: beyond, it is unbounded.
-        clamped = torch.minimum(pixel.clamp(min=0.0), size)
-        jacobian = affine[:, :2, :3] - clamped[:, :, None] * affine[:, 2:, :3]
-        reach = _BODY * (jacobian @ axes[row]).norm(dim=2) / depth
-        inside = ((pixel + reach >= 0.0) & (pixel - reach < size)).all(1)
+        pixel = projected / depths[row, view, None]
+        inside = ((pixel >= 0.0) & (pixel < size[view])).all(1)
         near = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         near[row[inside]] = True
         return near
