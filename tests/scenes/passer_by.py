@@ -43,12 +43,21 @@ def _person(cam_from_world: Tensor, number: int, seed: int) -> Scene:
     x, y, _ = invert_rigid(cam_from_world)[:, 3].tolist()
     angle = math.atan2(-y, -x) + places.normal(0, _SPREAD)
     x, y = _DISTANCE * math.cos(angle), _DISTANCE * math.sin(angle)
-    trousers = paint.plain((128, 64), _TROUSERS, clothes)
-    stripes = paint.woven((256, 128), 14, [_SHIRT, (0.85, 0.82, 0.75)], clothes)
+    return Scene(figure((x, y, FLOOR), clothes, (_TROUSERS, _SHIRT)), LAMP)
+
+
+def figure(
+    feet: tuple[float, float, float],
+    clothes: np.random.Generator,
+    colours: tuple[paint.Colour, paint.Colour],
+) -> list[SceneObject]:
+    """A person 1.7 m tall who stands at ``feet``; ``colours``: of the trousers and of the shirt."""
+    x, y, floor = feet
+    trousers = paint.plain((128, 64), colours[0], clothes)
+    stripes = paint.woven((256, 128), 14, [colours[1], (0.85, 0.82, 0.75)], clothes)
     head = paint.plain((64, 64), _SKIN, clothes, stains=0.4)
-    parts = [
-        SceneObject(Frustum((x, y, FLOOR), 0.80, 0.13, 0.17), [trousers]),
-        SceneObject(Frustum((x, y, FLOOR + 0.80), 0.62, 0.17, 0.22), [stripes]),
-        SceneObject(Ellipsoid((x, y, FLOOR + 1.60), (0.10, 0.10, 0.13)), [head]),
+    return [
+        SceneObject(Frustum((x, y, floor), 0.80, 0.13, 0.17), [trousers]),
+        SceneObject(Frustum((x, y, floor + 0.80), 0.62, 0.17, 0.22), [stripes]),
+        SceneObject(Ellipsoid((x, y, floor + 1.60), (0.10, 0.10, 0.13)), [head]),
     ]
-    return Scene(parts, LAMP)

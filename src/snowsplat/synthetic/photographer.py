@@ -34,6 +34,7 @@ _WALK_HEIGHTS = (0.46, 0.92)  # metres above the table, first and second round
 _FULL_WELL = 15000.0  # electrons of a white pixel; the shot noise is their square root
 _READ_NOISE = 6.0  # electrons
 _JPEG_QUALITY = 92
+_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples are evenly distributed in time
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,27 @@ class Truth:
         camera = ColmapCamera(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
         nothing = np.zeros((0, 3))
         write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """A thin lens, and an exposure that takes time.
+
+    A point at the distance z is a disc in the photo, with a diameter of
+    aperture · focal · |1 / focus − 1 / z| pixels.
+    """
+
+    aperture: float  # diameter of the lens, metres
+    focus: float  # distance of the plane that is sharp, along the optical axis, metres
+    motion: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of what passes, metres per exposure
+    samples: int = 16  # positions on the lens; a pixel has one ray from each
+
+    def positions(self) -> np.ndarray:
+        """(samples, 2) float32 on the lens, evenly distributed, in metres from its middle."""
+        i = np.arange(self.samples) + 0.5
+        radius, angle = np.sqrt(i / self.samples), i * (math.pi * (3 - math.sqrt(5)))
+        disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        return (0.5 * self.aperture * disc).astype(np.float32)
 
 
 def write_synthetic_photos(
@@ -108,6 +130,7 @@ def take_photos(
     seed: int = 0,
     report: Report = silent,
     passing: Mapping[int, Scene] | None = None,
+    shutter: Shutter | None = None,
 ) -> Truth:
     """Render photos ``IMG_0001.jpg`` … of a scene into ``folder``; existing photos are kept.
 
@@ -118,6 +141,7 @@ def take_photos(
         report: progress callback.
         passing: what is in front of the camera in only one photo, by the index of its pose. It
             casts no shadow on the scene.
+        shutter: None: everything is sharp.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -131,7 +155,7 @@ def take_photos(
 
     def take(i: int) -> None:
         random = np.random.default_rng([seed, i])
-        pixels = photograph(scene, lens, poses[i], random, passing.get(i))
+        pixels = photograph(scene, lens, poses[i], random, passing.get(i), shutter)
         with atomic_path(folder / names[i]) as temporary:
             _save(temporary, pixels, lens)
 
@@ -177,27 +201,46 @@ def photograph(
     cam_from_world: Tensor,
     random: np.random.Generator,
     passing: Scene | None = None,
+    shutter: Shutter | None = None,
 ) -> np.ndarray:
     """(H, W, 3) uint8 sRGB, with the noise of a small image sensor.
 
     Args:
         random: draws the noise.
         passing: more objects, which cast no shadow on the scene.
+        shutter: None: everything is sharp.
     """
     world_from_cam = invert_rigid(cam_from_world).numpy()
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
     spread = 1 / (lens.focal * _RAYS)
     light = np.empty((lens.height, lens.width, 3), np.float32)
-    for rows, columns, rays in _tiles(lens):
+
+    def seen(origin: np.ndarray, rays: np.ndarray, moved: np.ndarray | float = 0.0) -> np.ndarray:
         directions = rotation @ rays
-        seen = scene.radiance(origin, directions, spread)
+        found = scene.radiance(origin, directions, spread)
         if passing is not None:
-            near = passing.distances(origin, directions) < scene.distances(origin, directions)
-            seen = np.where(near, passing.radiance(origin, directions, spread), seen)
+            start = origin - moved
+            near = passing.distances(start, directions) < scene.distances(origin, directions)
+            found = np.where(near, passing.radiance(start, directions, spread), found)
         # A sensor saturates: values above white are clipped before a pixel is averaged.
-        height, width = rows.stop - rows.start, columns.stop - columns.start
-        seen = seen.clip(0, 1).reshape(3, height, _RAYS, width, _RAYS).mean(axis=(2, 4))
-        light[rows, columns] = seen.transpose(1, 2, 0)
+        return found.clip(0, 1)
+
+    for rows, columns, rays in _tiles(lens):
+        shape = (3, rows.stop - rows.start, _RAYS, columns.stop - columns.start, _RAYS)
+        if shutter is None:
+            pixels = seen(origin, rays).reshape(shape).mean(axis=(2, 4))
+        else:
+            # All rays through one position on the lens have one origin, as those of a pinhole.
+            total = np.zeros((3, shape[1] * shape[3]), np.float32)
+            for i, position in enumerate(shutter.positions()):
+                own = rays.reshape(shape)[:, :, i // _RAYS % _RAYS, :, i % _RAYS].reshape(3, -1)
+                offset = np.array([[*position, 0.0]], np.float32).T
+                own = own * (shutter.focus / own[2]) - offset
+                moved = np.array([shutter.motion], np.float32).T * (i * _GOLDEN % 1 - 0.5)
+                own = own / np.sqrt((own * own).sum(axis=0))
+                total += seen(origin + rotation @ offset, own, moved)
+            pixels = (total / shutter.samples).reshape(3, shape[1], shape[3])
+        light[rows, columns] = pixels.transpose(1, 2, 0)
     electrons = _FULL_WELL * light
     electrons += np.sqrt(electrons + _READ_NOISE**2) * random.standard_normal(
         light.shape, np.float32

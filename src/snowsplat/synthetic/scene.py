@@ -3,7 +3,7 @@
 The lamp does not move and most surfaces are matt, so the radiance of a point does not depend on the
 viewing direction. Direct light with soft shadows and ambient light with occlusion are computed once
 (`light`) and multiplied into the textures. Then a ray needs only an intersection and a texture
-look-up. Only gloss depends on the viewing direction and needs one reflected ray.
+look-up. Only gloss and glass depend on the viewing direction and need one reflected ray.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class SceneObject:
     paint: Sequence[np.ndarray]  # one for each face, or one for all: sRGB (H, W, 3), 0 to 1
     gloss: float = 0.0  # reflectance at normal incidence (Schlick's approximation)
     emissive: bool = False  # whether it radiates the colour of its texture; then it casts no shadow
+    glass: bool = False  # whether it shows what is behind it, and reflects; it casts no shadow
 
 
 class Scene:
@@ -38,8 +39,11 @@ class Scene:
     def __init__(self, objects: Sequence[SceneObject], lamp: Lamp) -> None:
         self._shapes = [item.shape for item in objects]
         self._gloss = np.array([item.gloss for item in objects], np.float32)
+        self._panes = frozenset(i for i, item in enumerate(objects) if item.glass)
         blockers = [
-            item.shape for item in objects if math.isfinite(item.shape.radius) and not item.emissive
+            item.shape
+            for item in objects
+            if math.isfinite(item.shape.radius) and not (item.emissive or item.glass)
         ]  # infinite shapes are rooms, whose walls cast no shadow on the objects inside
         textures: list[np.ndarray] = []
         texels, wraps, firsts = [], [], []
@@ -94,12 +98,15 @@ class Scene:
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distances (R,) float32 to the first hits along rays, in metres; infinite without a hit.
 
+        Glass is no hit.
+
         Args:
             origins: (3, 1) or (3, R) float32, metres.
             directions: (3, R) float32, of length 1.
         """
         candidates = self._candidates(origins, directions)
-        return self._nearest(origins, directions, candidates)[0]
+        solid = [i for i in candidates if i not in self._panes]
+        return self._nearest(origins, directions, solid)[0]
 
     def _nearest(
         self, origins: np.ndarray, directions: np.ndarray, candidates: Sequence[int]
@@ -119,7 +126,8 @@ class Scene:
         self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool
     ) -> np.ndarray:
         count = directions.shape[1]
-        candidates = self._candidates(origins, directions)
+        every = self._candidates(origins, directions)
+        candidates = [i for i in every if i not in self._panes]
         nearest, owner = self._nearest(origins, directions, candidates)
         positions = origins + np.where(owner >= 0, nearest, 0) * directions
         texture = np.zeros(count, np.int64)
@@ -133,17 +141,50 @@ class Scene:
         footprint = nearest * np.float32(spread) / np.sqrt(cosine)
         colours = self._look_up(texture, uv, footprint)
         colours[:, owner < 0] = 0
-        glossy = np.flatnonzero((self._gloss[owner] > 0) & (owner >= 0)) if mirrored else ()
-        if len(glossy):
-            facing, normal = cosine[glossy], normals[:, glossy]
-            gloss = self._gloss[owner[glossy]]
-            share = gloss + (1 - gloss) * (1 - facing) ** 5
-            onward = directions[:, glossy] + 2 * facing * normal
-            onward /= np.sqrt((onward * onward).sum(axis=0))
-            start = positions[:, glossy] + np.float32(2e-3) * normal
-            seen = self._block(start, onward, 3 * spread, mirrored=False)
-            colours[:, glossy] += share * (seen - colours[:, glossy])
+        if mirrored:
+            glossy = np.flatnonzero((self._gloss[owner] > 0) & (owner >= 0))
+            self._mirror(
+                colours, glossy, owner[glossy], positions[:, glossy], normals, directions, spread
+            )
+            panes = [i for i in every if i in self._panes]
+            distance, pane = self._nearest(origins, directions, panes)
+            before = np.flatnonzero(distance < nearest)
+            positions = (origins + np.where(pane >= 0, distance, 0) * directions)[:, before]
+            for i in panes:
+                own = np.flatnonzero(pane[before] == i)
+                normals[:, before[own]] = self._shapes[i].surface(positions[:, own])[2]
+            self._mirror(colours, before, pane[before], positions, normals, directions, spread)
         return colours
+
+    def _mirror(
+        self,
+        colours: np.ndarray,
+        rays: np.ndarray,
+        owner: np.ndarray,
+        positions: np.ndarray,
+        normals: np.ndarray,
+        directions: np.ndarray,
+        spread: float,
+    ) -> None:
+        """Add the light that surfaces reflect to ``colours`` (3, R), in place.
+
+        Args:
+            rays: (M,) indices of the rays that hit the surfaces.
+            owner: (M,) indices of their shapes.
+            positions: (3, M).
+            normals: (3, R).
+            directions: (3, R).
+        """
+        if not len(rays):
+            return
+        normal, gloss = normals[:, rays], self._gloss[owner]
+        facing = np.maximum(-(directions[:, rays] * normal).sum(axis=0), np.float32(0.02))
+        share = gloss + (1 - gloss) * (1 - facing) ** 5
+        onward = directions[:, rays] + 2 * facing * normal
+        onward /= np.sqrt((onward * onward).sum(axis=0))
+        start = positions + np.float32(2e-3) * normal
+        seen = self._block(start, onward, 3 * spread, mirrored=False)
+        colours[:, rays] += share * (seen - colours[:, rays])
 
     def _candidates(self, origins: np.ndarray, directions: np.ndarray) -> list[int]:
         """Indices of shapes whose bounding sphere intersects the cone of the rays."""
