@@ -43,11 +43,11 @@ class ViewMetrics:
     ssim: float
     psnr_aligned: float  # dB; colour-aligned
     lpips: float | None = None
-    # Width and height of the compared images, in pixels; None: unknown.
-    size: tuple[int, int] | None = None
     # Share of the variance of the photo that the colour-aligned image explains, at most 1. Unlike a
     # PSNR, it does not depend on the contrast of the photo. None: not measured.
     explained: float | None = None
+    # Width and height of the compared images, in pixels; None: unknown.
+    size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)

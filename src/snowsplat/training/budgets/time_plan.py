@@ -24,13 +24,14 @@ from snowsplat.training.starts.init import initial_count
 
 # The size of the photos is reduced until there is time for both of these minimum numbers of steps.
 #: Minimum number of steps, per square root of the number of pixels of a photo. Larger photos show
-#: more detail, which more Gaussians have to represent. At 800x800 it is 2000, the number of the
-#: default recipe, whose settings were chosen for about this size.
-_MIN_STEPS_PER_SIDE = 2.5
-#: Minimum number of steps per training photo.
-_MIN_STEPS_PER_PHOTO = 10
+#: more detail, which more Gaussians have to represent. 2000, the number of the default recipe, is
+#: the minimum for half a megapixel.
+_MIN_STEPS_PER_SIDE = 3.0
+#: Minimum number of steps per training photo, for photos whose longer side has more than this number
+#: of pixels. A few passes over smaller photos would cost more detail than they gain.
+_MIN_STEPS_PER_PHOTO, _SIDE_FOR_PASSES = 10, 400
 #: Minimum and maximum of the longer side of the photos, in pixels.
-_MIN_SIDE = 400
+_MIN_SIDE = 200
 _MAX_SIDE = 1600
 #: The limit of the number of Gaussians is raised if there is time for more steps than this.
 _STEPS_FOR_MORE_GAUSSIANS = 3000
@@ -44,11 +45,10 @@ _MIN_DENSIFY_INTERVAL = 25
 #: Seconds before the first step, for preparation and for decoding the first photos.
 _SETUP_SECONDS = 0.5
 #: Seconds for a million pixels of depth maps, on the machine of `step_cost`.
-_SECONDS_PER_MAP_MEGAPIXEL = 0.4
+_SECONDS_PER_MAP_MEGAPIXEL = 0.2
 #: Depth maps are made smaller, so that they need at most this share of the time.
 _MAX_SHARE_OF_MAPS = 0.25
-#: Minimum of their longer side, in pixels. If there is no time for them, there is no dense
-#: initialisation.
+#: Minimum of their longer side, in pixels.
 _MIN_MAP_SIDE = 100
 
 # The speed of the machine is measured by a short training run, called the sample.
@@ -129,7 +129,7 @@ def make_plan(
         sized = _capped(config, width * height, gaussian_factor)
         per_pixel = 1e-6 * _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
         most = _MAX_SHARE_OF_MAPS * seconds / per_pixel
-        sized, maps = _with_maps(sized, len(dataset.train), width, height, most)
+        sized, maps = _with_maps(sized, dataset, width, height, most)
         left = seconds - _SETUP_SECONDS - per_pixel * maps
         work = Work(sized, width * height, len(dataset.test))
         initial = initial_count(dataset, sized)
@@ -145,14 +145,14 @@ def make_plan(
     if resize:
         side = min(longer, _MAX_SIDE)
         smallest = min(longer, _MIN_SIDE)
-        while side > smallest and not _enough_steps(plan(side), len(dataset.train)):
+        while side > smallest and (
+            (tried := plan(side)).config.iterations < _least_steps(tried, len(dataset.train))
+        ):
             side = max(smallest, min(side - 8, round(0.97 * side)))
     best = plan(side)
-    if more_gaussians and best.config.iterations > _STEPS_FOR_MORE_GAUSSIANS:
-        gaussian_factor = min(
-            _MAX_GAUSSIAN_FACTOR, best.config.iterations / _STEPS_FOR_MORE_GAUSSIANS
-        )
-        best = plan(side, gaussian_factor)
+    enough = max(_STEPS_FOR_MORE_GAUSSIANS, _least_steps(best, len(dataset.train)))
+    if more_gaussians and best.config.iterations > enough:
+        best = plan(side, min(_MAX_GAUSSIAN_FACTOR, best.config.iterations / enough))
     return best
 
 
@@ -235,28 +235,32 @@ def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainCo
     return config.capped(pixels, views=0)  # the limit follows the time, not the views
 
 
-def _enough_steps(plan: Plan, photos: int) -> bool:
+def _least_steps(plan: Plan, photos: int) -> float:
+    """The minimum number of steps for photos of the size of the plan."""
     least = _MIN_STEPS_PER_SIDE * math.sqrt(plan.width * plan.height)
-    return plan.config.iterations >= max(least, _MIN_STEPS_PER_PHOTO * photos)
+    if max(plan.width, plan.height) <= _SIDE_FOR_PASSES:
+        return least
+    return max(least, _MIN_STEPS_PER_PHOTO * photos)
 
 
 def _with_maps(
-    config: TrainConfig, photos: int, width: int, height: int, most: float
+    config: TrainConfig, dataset: Dataset, width: int, height: int, most: float
 ) -> tuple[TrainConfig, int]:
     """``config`` with depth maps of at most ``most`` pixels together, and their number of pixels.
 
-    If they would be too small, there are none, and no dense initialisation.
+    If they would be too small, there are none, and no dense initialisation; but a dataset without
+    points has no other start that a short training could use.
     """
     if "sweep" not in config.starts:
         return config, 0
-    longer = max(width, height)
-    fitting = int(longer * math.sqrt(most / (photos * width * height)))
-    whole = map_pixels(photos, width, height, config.sweep_side)
-    if whole > most:
-        config = replace(config, sweep_side=max(1, min(config.sweep_side, fitting)))
-    if min(config.sweep_side, longer) < min(_MIN_MAP_SIDE, longer):
-        init = "+".join(name for name in config.starts if name != "sweep") or "random"
-        return replace(config, init=init), 0
+    photos, longer = len(dataset.train), max(width, height)
+    if map_pixels(photos, width, height, config.sweep_side) > most:
+        fitting = int(longer * math.sqrt(most / (photos * width * height)))
+        if fitting < _MIN_MAP_SIDE and dataset.points is not None:
+            init = "+".join(name for name in config.starts if name != "sweep") or "points"
+            return replace(config, init=init), 0
+        side = min(config.sweep_side, max(fitting, _MIN_MAP_SIDE))
+        config = replace(config, sweep_side=side)
     return config, map_pixels(photos, width, height, config.sweep_side)
 
 
