@@ -27,8 +27,8 @@ from snowsplat.training.starts.init import initial_count
 #: more detail, which more Gaussians have to represent. 2000, the number of the default recipe, is
 #: the minimum for half a megapixel.
 _MIN_STEPS_PER_SIDE = 3.0
-#: Minimum number of steps per training photo, and the longer side in pixels down to which photos are
-#: reduced for it. A few more passes over even smaller photos would lose more than they gain.
+#: Minimum number of steps per training photo, and the longer side down to which photos are reduced
+#: for it. A few more passes over even smaller photos would lose more than they gain.
 _MIN_STEPS_PER_PHOTO, _SIDE_FOR_PASSES = 10, 400
 #: Minimum and maximum of the longer side of the photos, in pixels.
 _MIN_SIDE = 200
