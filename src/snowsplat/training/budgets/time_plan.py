@@ -66,7 +66,7 @@ _SAMPLE_POINTS = 20_000
 _SAMPLE_PIXELS = 500_000
 #: Factor of the scales in the sample if the dataset has no points. Random points are far apart, so
 #: their Gaussians would touch several times as many tiles as those of a scene.
-_SAMPLE_SCALE = 0.1
+_SAMPLE_SCALE = 0.2
 #: Time of a step with a trained scene, divided by that with the initial points. It is larger than
 #: 1, because more splats overlap in a trained scene. Measured with fox and fern: 1.5 to 1.9.
 _TRAINED_SLOWDOWN = 1.5
