@@ -63,6 +63,13 @@ def test_the_size_of_photos():
     assert planned(240, 552, 986, time_ratio=4.0).width > slow.width
 
 
+def test_no_time_left():
+    """Reading the photos on a busy machine may take longer than the whole budget."""
+    for seconds in (0.0, -3.0):
+        plan = planned(seconds, 552, 986)
+        assert (plan.config.iterations, plan.height, plan.config.init) == (1, 200, "points")
+
+
 def test_the_time_is_used():
     """Steps times seconds per step is the budget, except for the time before and after them."""
     for seconds in (20.0, 300.0):

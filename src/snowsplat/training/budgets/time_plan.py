@@ -128,7 +128,7 @@ def make_plan(
         height = round(camera.height * width / camera.width)
         sized = _capped(config, width * height, gaussian_factor)
         per_pixel = 1e-6 * _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
-        most = _MAX_SHARE_OF_MAPS * seconds / per_pixel
+        most = _MAX_SHARE_OF_MAPS * max(0.0, seconds) / per_pixel
         sized, maps = _with_maps(sized, dataset, width, height, most)
         left = seconds - _SETUP_SECONDS - per_pixel * maps
         work = Work(sized, width * height, len(dataset.test))
