@@ -174,7 +174,7 @@ def test_refinement_with_the_photos_of_a_dataset(dataset, run, tmp_path):
         assert "depth aligned to" in result.out
         error = float(result.out.partition("median error ")[2].partition("%")[0])
         assert error < 2
-        found[iterations] = float(result.out.partition("held-out photos: PSNR ")[2].split()[0])
+        found[iterations] = float(result.out.partition(": PSNR ")[2].split()[0])
     assert found[60] > found[1] + 2
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert (metrics["iteration"], metrics["split"]) == (60, "test")

@@ -301,6 +301,7 @@ def test_minutes(run, dataset, tmp_path):
     lines = result.out.splitlines()
     assert re.fullmatch(r"1.8 s on this machine: 48x36, at most 1,037 Gaussians, .*steps", lines[1])
     assert any(re.fullmatch(r"\S+ s in total, of 1.8 s", line) for line in lines)
+    assert any("views of 48x36  PSNR" in line for line in lines)
     step = json.loads((out / "metrics.json").read_text())["iteration"]
     assert len(scene(out, step)) > 1000
     training = json.loads((out / "config.json").read_text())["training"]

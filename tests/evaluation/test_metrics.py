@@ -117,7 +117,18 @@ def test_means_and_json():
         "psnr_aligned": 33.0,
         "lpips": 0.5,
         "explained": 0.9,
+        "size": None,
     }
     assert values["psnr_aligned"] == 27.0
     assert math.isnan(Evaluation([]).psnr)
     assert Evaluation([]).lpips is None
+
+
+def test_an_evaluation_says_the_size_of_its_images():
+    photos = [planar(height, width, 0) for height, width in ((20, 30), (20, 30), (40, 30))]
+    views = [compare(photo, photo) for photo in photos]
+    assert views[0].size == (30, 20)
+    assert Evaluation(views[:2]).size == "30x20"
+    assert Evaluation(views[::-1]).size == "30x20 to 30x40"
+    assert Evaluation(views[:2]).as_json()["size"] == "30x20"
+    assert Evaluation([]).size == "an unknown size"

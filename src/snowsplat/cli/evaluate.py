@@ -27,7 +27,8 @@ class Evaluate(SceneFlags):
       OUT/metrics.json. The values of renders are clamped to 0..1, but not rounded
       to 8 bits. "aligned" is the PSNR after a gain and an offset of each channel of
       the render were fitted to the photo, so that exposure and white balance of the
-      photo do not count.
+      photo do not count. The photos have the size of the training, which
+      --minutes may have reduced; -r 1: their own size.
 
     To create the file of weights for LPIPS, run this where lpips is installed:
       weights = lpips.LPIPS(net="vgg").state_dict()
@@ -68,5 +69,6 @@ class Evaluate(SceneFlags):
         if network is None:
             print("LPIPS was not measured: it needs a weights file, see --help")
         where = scene.folder.path / "metrics.json"
-        print(f"iteration {scene.iteration}, {len(views)} {self.split} views: {where}")
+        which = f"{len(views)} {self.split} views of {evaluation.size}"
+        print(f"iteration {scene.iteration}, {which}: {where}")
         return 0

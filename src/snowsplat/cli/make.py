@@ -156,7 +156,7 @@ def print_summary(made: MakeResult) -> None:
         f"Report on the training:     {made.folder.report}\n"
         f"Rendered test views:        {made.renders}\n"
         f" and held-out photos:       {made.photos}\n"
-        f"Quality of these views:     {figures} ({made.views} photos)\n"
+        f"Quality of these views:     {figures} ({made.views} photos of {made.size})\n"
         f"Time:                       {duration(made.seconds)}"
     )
     if made.verdict is not None:

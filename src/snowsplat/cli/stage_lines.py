@@ -64,7 +64,8 @@ def _report(written: dict[str, Any]) -> list[str]:
 
 
 def _scene(trained: dict[str, Any]) -> list[str]:
-    return [f"{trained['iteration']} steps, PSNR {trained['psnr']:.2f} dB"]
+    size = f" at {trained['size']}" if "size" in trained else ""  # earlier versions did not say it
+    return [f"{trained['iteration']} steps, PSNR {trained['psnr']:.2f} dB{size}"]
 
 
 def _pictures(rendered: dict[str, Any]) -> list[str]:

@@ -70,7 +70,7 @@ class StepProgress:
         self._update_rate(progress.step, now)
         done = progress.step >= self.total
         if progress.metrics is not None and progress.metrics.views:
-            self._psnr = f"  PSNR {progress.metrics.psnr:.2f}"
+            self._psnr = f"  PSNR {progress.metrics.psnr:.2f} at {progress.metrics.size}"
             self.say(held_out_line(progress.step, progress.metrics))
         if self._bar is not None:
             text = self._text(progress)
@@ -118,10 +118,10 @@ def _whole(total: int) -> Column:
 
 
 def held_out_line(step: int, evaluation: Evaluation) -> str:
-    """Step, number of views, and the mean figures."""
+    """Step, number and size of the views, and the mean figures."""
     count = len(evaluation.views)
     figures = f"PSNR {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.3f}"
     figures += f"  colour-aligned PSNR {evaluation.psnr_aligned:.2f} dB"
     if evaluation.lpips is not None:
         figures += f"  LPIPS {evaluation.lpips:.3f}"
-    return f"step {step}: {count} views  {figures}"
+    return f"step {step}: {count} views of {evaluation.size}  {figures}"

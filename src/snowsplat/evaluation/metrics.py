@@ -14,7 +14,7 @@ exposure or white balance than the scene. It is listed beside the PSNR and never
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -46,6 +46,8 @@ class ViewMetrics:
     # Share of the variance of the photo that the colour-aligned image explains, at most 1. Unlike a
     # PSNR, it does not depend on the contrast of the photo. None: not measured.
     explained: float | None = None
+    # Width and height of the compared images, in pixels; None: unknown.
+    size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,11 @@ class Evaluation:
         values = [view.lpips for view in self.views if view.lpips is not None]
         return _mean(values) if values else None
 
+    @property
+    def size(self) -> str:
+        """The size of the compared images as text: "800x600", or the range of the sizes."""
+        return size_text(view.size for view in self.views if view.size is not None)
+
     def as_json(self) -> dict[str, Any]:
         """The content of `metrics.json`: the means, and the metrics of each view by name."""
         views = {view.name: asdict(view) for view in self.views}
@@ -89,8 +96,18 @@ class Evaluation:
             "ssim": self.ssim,
             "psnr_aligned": self.psnr_aligned,
             "lpips": self.lpips,
+            "size": self.size,
         }
         return {**means, "views": views}
+
+
+def size_text(sizes: Iterable[tuple[int, int]]) -> str:
+    """The width and height of images as text; of several sizes, the smallest and the largest."""
+    ordered = sorted(sizes, key=math.prod)
+    if not ordered:
+        return "an unknown size"
+    ends = (ordered[0], ordered[-1])
+    return " to ".join(dict.fromkeys(f"{width}x{height}" for width, height in ends))
 
 
 def _mean(values: list[float]) -> float:
@@ -141,6 +158,7 @@ def compare(
         ssim=float(ops.ssim(image, target)),
         psnr_aligned=psnr(aligned, target, mask),
         lpips=None if lpips is None else lpips(image, target),
+        size=(image.shape[1], image.shape[0]),
         explained=_explained(aligned, target, mask),
     )
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from snowsplat.data import Dataset
 from snowsplat.evaluation.floaters import clean as without_floaters
-from snowsplat.evaluation.metrics import compare, evaluate_views
+from snowsplat.evaluation.metrics import compare, evaluate_views, size_text
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
 from snowsplat.pipeline.output.scene_paths import folder_around
@@ -125,9 +125,10 @@ def _judge(
     def psnr(scene: Gaussians) -> float:
         return evaluate_views(scene, views, background=background).psnr
 
+    size = size_text((view.camera.width, view.camera.height) for view in views)
     if held_out:
-        return _Judge(f"{len(views)} held-out photos", psnr, lambda before: math.inf)
-    return _Judge(f"{len(views)} training photos", psnr, lambda before: before - _LOST)
+        return _Judge(f"{len(views)} held-out photos of {size}", psnr, lambda before: math.inf)
+    return _Judge(f"{len(views)} training photos of {size}", psnr, lambda before: before - _LOST)
 
 
 def _judge_of_renderings(

@@ -117,6 +117,7 @@ class MakeResult:
         renders, photos: folders with the rendered test views and the held-out photos.
         psnr, ssim, psnr_aligned: means over the held-out photos; PSNR in dB. If gains of exposure
             are learnt, the colour-aligned PSNR tells the quality.
+        size: of the images of which these are the means, in pixels, as text.
         views: number of held-out photos.
         exposures: whether gains of exposure are learnt.
         verdict: whether the scene is good, usable or poor, and why; None if it is not known, as for
@@ -133,6 +134,7 @@ class MakeResult:
     psnr: float
     ssim: float
     psnr_aligned: float
+    size: str
     views: int
     exposures: bool
     verdict: Verdict | None
@@ -344,6 +346,7 @@ class _Job:
             psnr=scene["psnr"],
             ssim=scene["ssim"],
             psnr_aligned=scene["psnr_aligned"],
+            size=scene.get("size", "an unknown size"),
             views=scene["views"],
             exposures=scene["exposures"],
             verdict=Verdict.from_json(scene["verdict"]),
@@ -403,7 +406,9 @@ class _Job:
         metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
             shutil.copyfile(folder.scene_path(metrics["iteration"]), temporary)
-        result = {key: metrics[key] for key in ("iteration", "psnr", "ssim", "psnr_aligned")}
+        result = {
+            key: metrics[key] for key in ("iteration", "psnr", "ssim", "psnr_aligned", "size")
+        }
         return result | {
             "views": len(metrics["views"]),
             "exposures": (folder.path / "exposure.json").is_file(),

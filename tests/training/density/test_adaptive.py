@@ -385,6 +385,33 @@ def test_when_opacity_is_reset():
     assert resets(every_hundred[1:], random_init=True, iterations=999) == []
 
 
+@pytest.mark.parametrize(("interval", "left"), [(25, [4, 4, 2]), (100, [4, 2, 2])])
+def test_pruning_waits_until_opacities_could_recover_from_a_reset(interval, left):
+    """With a short interval, all Gaussians of a random start were removed directly after it."""
+    gaussians = gaussians_of([0.05] * 4)
+    control, adam = set_up(
+        gaussians,
+        random_init=True,
+        prune_opacity=0.1,
+        densify_from=interval,
+        densify_interval=interval,
+    )
+    gaussians = control.after_step(interval, gaussians, adam)
+    assert float(gaussians.opacities.max()) == pytest.approx(RESET_OPACITY)
+    found = [len(gaussians)]
+    gaussians.opacity_logits[:2] = 0.0  # half of them are needed
+    for step in (2 * interval, 8 * interval):
+        gaussians = control.after_step(step, gaussians, adam)
+        found.append(len(gaussians))
+    assert found == left
+
+
+def test_a_scene_never_becomes_empty():
+    gaussians = gaussians_of([0.05] * 3, opacity=0.001)
+    control, adam = set_up(gaussians)
+    assert len(control.after_step(600, gaussians, adam)) == 3
+
+
 def test_rows_are_kept_in_morton_order():
     generator = torch.Generator().manual_seed(3)
     gaussians = gaussians_of([0.05] * 500)

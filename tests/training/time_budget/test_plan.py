@@ -1,5 +1,6 @@
 """Plans for a given time, on simulated machines."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def test_the_size_of_photos():
     assert planned(3600, 4032, 3024).resolution == 1600  # no larger than that
     assert planned(3600, 552, 986).resolution is None  # and never enlarged
     little = planned(1, 552, 986)
-    assert (little.resolution, little.height) == (224, 400)  # no smaller
+    assert (little.resolution, little.height) == (112, 200)  # no smaller
     assert planned(1, 200, 150).resolution is None
     fixed = planned(1, 4032, 3024, resize=False)
     assert (fixed.resolution, fixed.width, fixed.height) == (None, 4032, 3024)
@@ -62,15 +63,30 @@ def test_the_size_of_photos():
     assert planned(240, 552, 986, time_ratio=4.0).width > slow.width
 
 
+def test_no_time_left():
+    """Reading the photos on a busy machine may take longer than the whole budget."""
+    for seconds in (0.0, -3.0):
+        plan = planned(seconds, 552, 986)
+        assert (plan.config.iterations, plan.height, plan.config.init) == (1, 200, "points")
+
+
 def test_the_time_is_used():
     """Steps times seconds per step is the budget, except for the time before and after them."""
     for seconds in (20.0, 300.0):
-        plan = planned(seconds, 552, 986, time_ratio=2.0)
+        config = recipe("default", init="points")  # depth maps take a part of the time
+        plan = make_plan(dataset(552, 986), config, seconds, 2.0)
         assert 0.85 * seconds < plan.config.iterations * plan.seconds < seconds
 
 
-def test_depth_maps_need_enough_time():
-    assert planned(10, 552, 986).config.init == "points"
+def test_depth_maps_are_as_large_as_there_is_time_for():
+    sides = [planned(seconds, 552, 986).config.sweep_side for seconds in (0.5, 1, 10, 120)]
+    assert sides == sorted(sides)
+    assert sides[0] < 200
+    assert sides[-1] == recipe("default").sweep_side
+    assert planned(0.2, 552, 986).config.init == "points"  # too short for maps of a useful size
+    without_points = replace(dataset(552, 986), points=None)
+    short = make_plan(without_points, recipe("default"), 0.2, 1.0).config
+    assert (short.init, short.sweep_side) == ("points+sweep", 100)  # random points need many steps
     assert planned(120, 552, 986).config.init == recipe("default").init == "points+sweep"
     without = make_plan(dataset(552, 986), recipe("default", init="points"), 60, 1.0)
     steps = without.config.iterations - planned(60, 552, 986).config.iterations
@@ -78,7 +94,7 @@ def test_depth_maps_need_enough_time():
 
 
 def test_the_number_of_gaussians():
-    assert planned(30, 552, 986).config.density.max_gaussians == 200_000
+    assert planned(60, 552, 986).config.density.max_gaussians == 200_000
     assert planned(3600, 552, 986).config.density.max_gaussians == 326_563
     assert planned(3600, 270, 480).config.density.max_gaussians == 77_760  # 0.6 per pixel
     named = changed(recipe("default"), max_gaussians=50_000)
@@ -92,6 +108,15 @@ def test_a_short_run_densifies_more_often():
         assert (density.densify_interval, density.densify_from) == (interval, interval)
     density = planned(3, 552, 986, more_often=False).config.density
     assert (density.densify_interval, density.densify_from) == (100, 100)
+
+
+def test_a_smaller_size_leaves_enough_steps():
+    """A training of 1173 steps at 1600 pixels was far from its end."""
+    for seconds in (5, 15, 30, 60, 180, 600):
+        for ratio in (1.0, 2.0, 4.0):
+            plan = planned(seconds, 4032, 3024, time_ratio=ratio)
+            if plan.width > 200:
+                assert plan.config.iterations >= 3 * math.sqrt(plan.width * plan.height)
 
 
 def test_many_photos_are_all_used():
@@ -111,6 +136,8 @@ def test_other_recipes():
 def test_plans_as_text():
     plan = replace(planned(60, 552, 986), config=recipe("default", iterations=8964))
     assert str(plan) == "552x986, at most 200,000 Gaussians, about 9,000 steps"
+    assert str(planned(1, 200, 150)).startswith("200x150, at most 18,000 Gaussians")
+    assert str(planned(1, 552, 986)).startswith("photos reduced to 112x200, at most 13,440")
 
 
 @pytest.mark.slow

@@ -112,7 +112,8 @@ class Lift:
             f"pose of the photo, {duration(result.seconds)}"
         )
         if result.evaluation is not None and result.evaluation.views:
-            print(f"held-out photos: PSNR {result.evaluation.psnr:.2f} dB")
+            evaluation = result.evaluation
+            print(f"held-out photos of {evaluation.size}: PSNR {evaluation.psnr:.2f} dB")
         if result.swing is not None:
             print(f"{result.swing}: the video")
         return 0

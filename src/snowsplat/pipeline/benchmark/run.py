@@ -167,7 +167,8 @@ def _run_all(
         result = SceneResult.read(job)
         assert result is not None
         on_line(
-            f"{job.scene}: {result.psnr:.2f} dB, SSIM {result.ssim:.4f}, "
+            f"{job.scene}: {result.psnr:.2f} dB at {result.size[0]}x{result.size[1]}, "
+            f"SSIM {result.ssim:.4f}, "
             f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
         )
 

@@ -23,12 +23,15 @@ from snowsplat.training.starts import map_pixels
 from snowsplat.training.starts.init import initial_count
 
 # The size of the photos is reduced until there is time for both of these minimum numbers of steps.
-#: Minimum number of steps.
-_MIN_STEPS = 1000
-#: Minimum number of steps per training photo.
-_MIN_STEPS_PER_PHOTO = 10
+#: Minimum number of steps, per square root of the number of pixels of a photo. Larger photos show
+#: more detail, which more Gaussians have to represent. 2000, the number of the default recipe, is
+#: the minimum for half a megapixel.
+_MIN_STEPS_PER_SIDE = 3.0
+#: Minimum number of steps per training photo, and the longer side down to which photos are reduced
+#: for it. A few more passes over even smaller photos would lose more than they gain.
+_MIN_STEPS_PER_PHOTO, _SIDE_FOR_PASSES = 10, 400
 #: Minimum and maximum of the longer side of the photos, in pixels.
-_MIN_SIDE = 400
+_MIN_SIDE = 200
 _MAX_SIDE = 1600
 #: The limit of the number of Gaussians is raised if there is time for more steps than this.
 _STEPS_FOR_MORE_GAUSSIANS = 3000
@@ -42,9 +45,11 @@ _MIN_DENSIFY_INTERVAL = 25
 #: Seconds before the first step, for preparation and for decoding the first photos.
 _SETUP_SECONDS = 0.5
 #: Seconds for a million pixels of depth maps, on the machine of `step_cost`.
-_SECONDS_PER_MAP_MEGAPIXEL = 0.4
-#: If depth maps would need more than this share of the time, there is no dense initialisation.
+_SECONDS_PER_MAP_MEGAPIXEL = 0.2
+#: Depth maps are made smaller, so that they need at most this share of the time.
 _MAX_SHARE_OF_MAPS = 0.25
+#: Minimum of their longer side, in pixels.
+_MIN_MAP_SIDE = 100
 
 # The speed of the machine is measured by a short training run, called the sample.
 #: Maximum duration of the sample, in seconds.
@@ -59,6 +64,9 @@ _SAMPLE_PHOTOS = 2
 _SAMPLE_POINTS = 20_000
 #: Photos with more pixels than this are reduced to half the width and height.
 _SAMPLE_PIXELS = 500_000
+#: Factor of the scales in the sample if the dataset has no points. Random points are far apart, so
+#: their Gaussians would touch several times as many tiles as those of a scene.
+_SAMPLE_SCALE = 0.2
 #: Time of a step with a trained scene, divided by that with the initial points. It is larger than
 #: 1, because more splats overlap in a trained scene. Measured with fox and fern: 1.5 to 1.9.
 _TRAINED_SLOWDOWN = 1.5
@@ -86,10 +94,10 @@ class Plan:
     def __str__(self) -> str:
         cap = self.config.density.max_gaussians
         gaussians = f"at most {cap:,} Gaussians" if cap else "no limit on the number of Gaussians"
-        return (
-            f"{self.width}x{self.height}, {gaussians}, about {_rounded(self.config.iterations):,} "
-            "steps"
-        )
+        size = f"{self.width}x{self.height}"
+        if self.resolution is not None:
+            size = f"photos reduced to {size}"
+        return f"{size}, {gaussians}, about {_rounded(self.config.iterations):,} steps"
 
 
 def make_plan(
@@ -114,17 +122,15 @@ def make_plan(
     """
     camera = max((view.camera for view in dataset.train), key=lambda c: c.width * c.height)
     longer = max(camera.width, camera.height)
-    enough = max(_MIN_STEPS, _MIN_STEPS_PER_PHOTO * len(dataset.train))
 
     def plan(side: int, gaussian_factor: float = 1.0) -> Plan:
         width = camera.width if side >= longer else max(1, round(camera.width * side / longer))
         height = round(camera.height * width / camera.width)
         sized = _capped(config, width * height, gaussian_factor)
-        maps = map_pixels(len(dataset.train), width, height) / 1e6
-        maps *= _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
-        if maps > _MAX_SHARE_OF_MAPS * seconds:
-            sized = replace(sized, init=_without_sweep(sized.init))
-        left = seconds - _SETUP_SECONDS - (maps if "sweep" in sized.starts else 0.0)
+        per_pixel = 1e-6 * _SECONDS_PER_MAP_MEGAPIXEL * time_ratio
+        most = _MAX_SHARE_OF_MAPS * max(0.0, seconds) / per_pixel
+        sized, maps = _with_maps(sized, dataset, width, height, most)
+        left = seconds - _SETUP_SECONDS - per_pixel * maps
         work = Work(sized, width * height, len(dataset.test))
         initial = initial_count(dataset, sized)
         steps, mean = _steps(work, left, time_ratio, initial)
@@ -139,14 +145,14 @@ def make_plan(
     if resize:
         side = min(longer, _MAX_SIDE)
         smallest = min(longer, _MIN_SIDE)
-        while side > smallest and plan(side).config.iterations < enough:
+        while side > smallest and (
+            (tried := plan(side)).config.iterations < _least_steps(tried, len(dataset.train))
+        ):
             side = max(smallest, min(side - 8, round(0.97 * side)))
     best = plan(side)
-    if more_gaussians and best.config.iterations > _STEPS_FOR_MORE_GAUSSIANS:
-        gaussian_factor = min(
-            _MAX_GAUSSIAN_FACTOR, best.config.iterations / _STEPS_FOR_MORE_GAUSSIANS
-        )
-        best = plan(side, gaussian_factor)
+    enough = max(_STEPS_FOR_MORE_GAUSSIANS, _least_steps(best, len(dataset.train)))
+    if more_gaussians and best.config.iterations > enough:
+        best = plan(side, min(_MAX_GAUSSIAN_FACTOR, best.config.iterations / enough))
     return best
 
 
@@ -179,6 +185,7 @@ def measure_time_ratio(
             config,
             init="points",
             initial_points=_SAMPLE_POINTS,
+            initial_scale=config.initial_scale if points is not None else _SAMPLE_SCALE,
             iterations=_SAMPLE_STEPS,
             coarse_to_fine=(0, 0) if downscale == 1 else (0, 1.0),
             sh_interval=0,
@@ -228,8 +235,33 @@ def _capped(config: TrainConfig, pixels: int, gaussian_factor: float) -> TrainCo
     return config.capped(pixels, views=0)  # the limit follows the time, not the views
 
 
-def _without_sweep(init: str) -> str:
-    return "+".join(name for name in init.split("+") if name != "sweep") or "random"
+def _least_steps(plan: Plan, photos: int) -> float:
+    """The minimum number of steps for photos of the size of the plan."""
+    least = _MIN_STEPS_PER_SIDE * math.sqrt(plan.width * plan.height)
+    if max(plan.width, plan.height) <= _SIDE_FOR_PASSES:
+        return least
+    return max(least, _MIN_STEPS_PER_PHOTO * photos)
+
+
+def _with_maps(
+    config: TrainConfig, dataset: Dataset, width: int, height: int, most: float
+) -> tuple[TrainConfig, int]:
+    """``config`` with depth maps of at most ``most`` pixels together, and their number of pixels.
+
+    If they would be too small, there are none, and no dense initialisation; but a dataset without
+    points has no other start that a short training could use.
+    """
+    if "sweep" not in config.starts:
+        return config, 0
+    photos, longer = len(dataset.train), max(width, height)
+    if map_pixels(photos, width, height, config.sweep_side) > most:
+        fitting = int(longer * math.sqrt(most / (photos * width * height)))
+        if fitting < _MIN_MAP_SIDE and dataset.points is not None:
+            init = "+".join(name for name in config.starts if name != "sweep") or "points"
+            return replace(config, init=init), 0
+        side = min(config.sweep_side, max(fitting, _MIN_MAP_SIDE))
+        config = replace(config, sweep_side=side)
+    return config, map_pixels(photos, width, height, config.sweep_side)
 
 
 def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:

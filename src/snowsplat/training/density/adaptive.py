@@ -28,6 +28,9 @@ SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
 #: Approximate number of steps that a scene needs to recover from an opacity reset.
 RESET_RECOVERY = 500
+#: After a reset, Gaussians are removed again when they could have regained the opacity
+#: `prune_opacity` in one of this number of steps; not every photo shows every Gaussian.
+_STEPS_PER_RECOVERY = 2
 
 
 @dataclass
@@ -111,12 +114,27 @@ class AdaptiveDensityControl:
             return False
         return self.schedule.multiples(step, every) > 0
 
+    def _recovers(self, step: int, optimizer: Adam) -> bool:
+        """Whether the last reset is so recent that no opacity can be `prune_opacity` again.
+
+        A step of Adam changes a logit by about its learning rate.
+        """
+        prune = self.settings.prune_opacity
+        if prune <= RESET_OPACITY:
+            return False
+        change = math.log(prune / (1.0 - prune)) - math.log(RESET_OPACITY / (1.0 - RESET_OPACITY))
+        rate = optimizer.rates_at(step)["opacity_logits"]
+        steps = math.ceil(_STEPS_PER_RECOVERY * change / rate) if rate > 0.0 else step
+        return any(self._resets_at(each) for each in range(max(1, step - steps + 1), step))
+
     def _refine(self, step: int, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         settings, shards = self.settings, self.shards
         # The choice depends on all rows. Every process makes it in the same way.
         grads = shards.all_rows(self.grad_sum / self.views.clamp_min(1.0))
         size = shards.all_rows(gaussians.log_scales.amax(dim=1).exp() / self.extent)
         alive = shards.all_rows(gaussians.opacities) >= settings.prune_opacity
+        if not bool(alive.any()) or self._recovers(step, optimizer):
+            alive = torch.ones_like(alive)
         dense = self._densified(grads, alive)
         split = dense & (size > settings.percent_dense)
 

@@ -118,17 +118,18 @@ def _headline(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
     count = len(evaluation.views)
     photos = f"{count} photo" if count == 1 else f"{count} photos"
     if held_out:
-        how = f"Evaluated on {photos} that were not used for training."
+        how = f"Evaluated on {photos} of {evaluation.size} that were not used for training."
     else:
         how = (
-            f"No photos were held out: these are the metrics of {photos} used for training, which "
-            "are better than those of new views. Use --eval to hold out every 8th photo."
+            f"No photos were held out: these are the metrics of {photos} of {evaluation.size} used "
+            "for training, which are better than those of new views. Use --eval to hold out every "
+            "8th photo."
         )
     return f"<h1>{text(trained.name)}</h1>\n<p>{how}</p>"
 
 
 def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
-    where = "held-out photos" if held_out else "training photos"
+    where = f"{'held-out' if held_out else 'training'} photos of {evaluation.size}"
     figures = [
         (f"{evaluation.psnr:.2f} dB", f"PSNR, {where}"),
         (f"{evaluation.ssim:.3f}", f"SSIM, {where}"),

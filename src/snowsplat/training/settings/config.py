@@ -164,6 +164,11 @@ class TrainConfig(Settings):
         allowed="a number such as 20000, or a share of the limit of Gaussians such as 0.4",
         metavar="N|F",
     )
+    sweep_side: int = setting(
+        640,
+        "Maximum width and height of the depth maps of the start `sweep`, in pixels.",
+        least=1,
+    )
     initial_opacity: float = setting(
         0.1, "Opacity of every Gaussian at initialisation.", above=0.0, below=1.0
     )

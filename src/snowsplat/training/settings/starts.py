@@ -30,8 +30,9 @@ class _OfPackage:
 
     function: str
 
-    def __call__(self, *arguments: Any) -> Any:
-        return getattr(import_module("snowsplat.training.starts"), self.function)(*arguments)
+    def __call__(self, *arguments: Any, **settings: Any) -> Any:
+        start = getattr(import_module("snowsplat.training.starts"), self.function)
+        return start(*arguments, **settings)
 
 
 STARTS: dict[str, Start] = {

@@ -15,7 +15,7 @@ from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo
 
 #: Photos are reduced so that their longer side has at most this number of pixels.
-_LONGER_SIDE = 640
+LONGER_SIDE = 640
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,13 @@ class DepthMap:
         return transform_points(camera.world_from_cam.to(torch.float32), cam)
 
 
-def map_size(width: int, height: int) -> tuple[int, int]:
+def map_size(width: int, height: int, longer_side: int = LONGER_SIDE) -> tuple[int, int]:
     """Width and height of the depth map of a view of this size, in pixels."""
-    scale = min(1.0, _LONGER_SIDE / max(width, height))
+    scale = min(1.0, longer_side / max(width, height))
     return max(1, round(scale * width)), max(1, round(scale * height))
 
 
-def photo_for_map(view: View, images: Photos) -> LoadedImage:
+def photo_for_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> LoadedImage:
     """The photo of a view at the size of its depth map, on the CPU."""
-    return reduced_photo(view, images, *map_size(view.camera.width, view.camera.height))
+    size = map_size(view.camera.width, view.camera.height, longer_side)
+    return reduced_photo(view, images, *size)

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from snowsplat.data.dataset import Points
 from snowsplat.data.image_loader import Photos
-from snowsplat.training.starts.depth_map import DepthMap, photo_for_map
+from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.training.starts.map_views import MapViews
+from snowsplat.training.starts.photos import reduced_photo
 
 #: Two inverse depths of one point agree if they differ by at most this share.
 _TOLERANCE = 0.02
@@ -44,7 +45,8 @@ def fused_points(
             continue
         pixels &= torch.rand(pixels.shape, generator=generator) < share
         points.append(depth_map.points(pixels))
-        colors.append(photo_for_map(view, images).rgb[pixels])
+        size = depth_map.camera.width, depth_map.camera.height
+        colors.append(reduced_photo(view, images, *size).rgb[pixels])
         widths.append(1.0 / (depth_map.inverse_depth[pixels] * depth_map.camera.fx))
     return thinned(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
 

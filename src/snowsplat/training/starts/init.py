@@ -85,5 +85,8 @@ def _points_of(
     generator: torch.Generator,
 ) -> Points:
     count = 0 if starts == ("points",) else config.points_per_start
-    found = [STARTS[name](dataset, images, count, generator) for name in starts]
+    sizes = {"sweep": {"longer_side": config.sweep_side}}
+    found = [
+        STARTS[name](dataset, images, count, generator, **sizes.get(name, {})) for name in starts
+    ]
     return Points(torch.cat([p.xyz for p in found]), torch.cat([p.rgb for p in found]))

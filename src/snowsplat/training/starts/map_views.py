@@ -10,7 +10,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, View
 from snowsplat.data.image_loader import Photos
-from snowsplat.training.starts.depth_map import map_size
+from snowsplat.training.starts.depth_map import LONGER_SIDE, map_size
 from snowsplat.training.starts.source_views import source_views
 
 #: Number of source views of each depth map.
@@ -40,10 +40,20 @@ class MapViews:
     points: Tensor
 
 
-def choose_views(dataset: Dataset, images: Photos, generator: torch.Generator) -> MapViews:
-    """Choose the views that get a depth map: all training views, if memory permits."""
+def choose_views(
+    dataset: Dataset,
+    images: Photos,
+    generator: torch.Generator,
+    longer_side: int = LONGER_SIDE,
+) -> MapViews:
+    """Choose the views that get a depth map: all training views, if memory permits.
+
+    Args:
+        longer_side: see `map_size`.
+    """
     cameras = [view.camera for view in dataset.train]
-    pixels = sum(math.prod(map_size(camera.width, camera.height)) for camera in cameras)
+    sizes = [map_size(camera.width, camera.height, longer_side) for camera in cameras]
+    pixels = sum(map(math.prod, sizes))
     limit = min(_MAX_PIXELS, images.budget_bytes // _BYTES_PER_PIXEL)
     views = dataset.train[:: math.ceil(pixels / max(limit, 1))]
     points = _points(dataset, generator)
@@ -51,9 +61,9 @@ def choose_views(dataset: Dataset, images: Photos, generator: torch.Generator) -
     return MapViews(views, source_views([view.camera for view in views], sample, _SOURCES), points)
 
 
-def map_pixels(views: int, width: int, height: int) -> int:
+def map_pixels(views: int, width: int, height: int, longer_side: int = LONGER_SIDE) -> int:
     """About the number of pixels of all depth maps for this number of views of this size."""
-    return min(_MAX_PIXELS, views * math.prod(map_size(width, height)))
+    return min(_MAX_PIXELS, views * math.prod(map_size(width, height, longer_side)))
 
 
 def _points(dataset: Dataset, generator: torch.Generator) -> Tensor:

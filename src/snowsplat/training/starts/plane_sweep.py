@@ -14,7 +14,7 @@ from snowsplat.data.dataset import View
 from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
-from snowsplat.training.starts.depth_map import DepthMap, photo_for_map
+from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, photo_for_map
 from snowsplat.training.starts.photos import usable_pixels
 
 #: Windows have (2 r + 1)² pixels.
@@ -37,7 +37,11 @@ _LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 
 
 def depth_maps(
-    views: Sequence[View], sources: Sequence[Sequence[int]], images: Photos, points: Tensor
+    views: Sequence[View],
+    sources: Sequence[Sequence[int]],
+    images: Photos,
+    points: Tensor,
+    longer_side: int = LONGER_SIDE,
 ) -> list[DepthMap | None]:
     """The depth map of each view; None for views without source views or visible points.
 
@@ -47,9 +51,10 @@ def depth_maps(
     Args:
         sources: the source views of each view; see `source_views`.
         points: (P, 3) in the world frame. Those that a view shows determine its range of depths.
+        longer_side: the maximum size of the maps, in pixels.
     """
     return [
-        _depth_map(views[i], [views[j] for j in chosen], images, points)
+        _depth_map(views[i], [views[j] for j in chosen], images, points, longer_side)
         for i, chosen in enumerate(sources)
     ]
 
@@ -63,21 +68,21 @@ class _Picture:
     usable: Tensor | None  # (H, W) bool: False for masked and transparent pixels
 
     @staticmethod
-    def from_view(view: View, images: Photos) -> _Picture:
-        photo = photo_for_map(view, images)
+    def from_view(view: View, images: Photos, longer_side: int) -> _Picture:
+        photo = photo_for_map(view, images, longer_side)
         luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
         height, width = luminance.shape
         return _Picture(view.camera.scaled(width, height), luminance, usable_pixels(photo))
 
 
 def _depth_map(
-    view: View, source_views: list[View], images: Photos, points: Tensor
+    view: View, source_views: list[View], images: Photos, points: Tensor, longer_side: int
 ) -> DepthMap | None:
     span = _inverse_depths(view.camera, points)
     if span is None or not source_views:
         return None
-    picture = _Picture.from_view(view, images)
-    sources = [_Picture.from_view(source, images) for source in source_views]
+    picture = _Picture.from_view(view, images, longer_side)
+    sources = [_Picture.from_view(source, images, longer_side) for source in source_views]
     low, high = span
     coarse, fine = _Level(picture, sources, 2), _Level(picture, sources, 1)
     shift = round(coarse.displacement(low, high))

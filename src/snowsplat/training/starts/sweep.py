@@ -6,13 +6,18 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.image_loader import Photos
+from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.plane_sweep import depth_maps
 
 
 def swept_points(
-    dataset: Dataset, images: Photos, count: int, generator: torch.Generator
+    dataset: Dataset,
+    images: Photos,
+    count: int,
+    generator: torch.Generator,
+    longer_side: int = LONGER_SIDE,
 ) -> Points:
     """At most ``count`` points on the surfaces that several photos show, in the world frame, on the
     CPU.
@@ -22,7 +27,8 @@ def swept_points(
 
     Args:
         generator: a random generator on the CPU.
+        longer_side: the maximum size of the maps, in pixels.
     """
-    chosen = choose_views(dataset, images, generator)
-    maps = depth_maps(chosen.views, chosen.sources, images, chosen.points)
+    chosen = choose_views(dataset, images, generator, longer_side)
+    maps = depth_maps(chosen.views, chosen.sources, images, chosen.points, longer_side)
     return fused_points(chosen, maps, images, count, generator)
