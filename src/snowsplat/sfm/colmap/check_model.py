@@ -1,22 +1,26 @@
 """Check in a child process whether COLMAP can read a model from an unknown source.
 
-    python -m snowsplat.sfm.colmap.check_model FOLDER BYTES
+    python -m snowsplat.sfm.colmap.check_model FOLDER BYTES SECONDS
 
 COLMAP does not check the counts in its files. With a damaged count, it may allocate all memory or
-run for hours. Therefore it reads the model in a child process, which has a time limit and a limit
-of BYTES of additional memory.
+run for hours. Therefore it reads the model in a child process, which has limits of SECONDS of
+processor time and of BYTES of additional memory.
 """
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from pathlib import Path
 
 from snowsplat.sfm.colmap.child import child_environment
 
-_SECONDS = 10.0  # time to start Python and COLMAP
+_SECONDS = 10.0  # processor time to start Python and COLMAP
 _BYTES_PER_SECOND = 1_000_000  # a low estimate of the reading speed
+# The longest time, divided by the processor time: other programs may need most of the processors.
+# Elsewhere, the processor time is not limited.
+_WAITING = 20 if sys.platform == "linux" else 1
 _MEMORY = 1 << 30  # bytes of address space that a model of any size may need
 _MEMORY_PER_BYTE = 16  # bytes of address space that are added for each byte of the files
 
@@ -28,26 +32,28 @@ def can_be_read(folder: Path) -> bool:
     """
     size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
     limit = _MEMORY + _MEMORY_PER_BYTE * size
+    seconds = _SECONDS + size / _BYTES_PER_SECOND
     try:
         done = subprocess.run(
-            [sys.executable, "-m", __name__, str(folder), str(limit)],
+            [sys.executable, "-m", __name__, str(folder), str(limit), str(math.ceil(seconds))],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env=child_environment(1),
-            timeout=_SECONDS + size / _BYTES_PER_SECOND,
+            timeout=_WAITING * seconds,
         )
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0
 
 
-def _main(folder: str, limit: int) -> None:
+def _main(folder: str, limit: int, seconds: int) -> None:
     import pycolmap
 
     if sys.platform == "linux":
         import resource
 
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         limit += pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -61,4 +67,4 @@ def _main(folder: str, limit: int) -> None:
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1], int(sys.argv[2]))
+    _main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
