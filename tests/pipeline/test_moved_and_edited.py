@@ -92,6 +92,7 @@ def test_make_keeps_its_name_if_only_the_photos_were_renamed(
     monkeypatch.setattr(make, "make_dataset", lambda *args, **flags: done)
     job = make._Job([tmp_path], "new", tmp_path, make.MakeOptions(), False, SILENT, None, 0.0)
     job.sources, job.plan = Sources((tmp_path,), [], [], []), MakePlan("draft", 9)
+    job.given = None
     job.stages = Stages(tmp_path / "make.json", make.STAGES)
     job.stages.about = {"name": recorded}
     job._make_dataset()

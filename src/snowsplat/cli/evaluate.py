@@ -28,7 +28,7 @@ class Evaluate(SceneFlags):
       to 8 bits. "aligned" is the PSNR after a gain and an offset of each channel of
       the render were fitted to the photo, so that exposure and white balance of the
       photo do not count. The photos have the size of the training, which
-      --minutes may have reduced; -r 1: their own size.
+      a time limit may have reduced; -r 1: their own size.
 
     To create the file of weights for LPIPS, run this where lpips is installed:
       weights = lpips.LPIPS(net="vgg").state_dict()

@@ -198,13 +198,18 @@ class _Poses:
     export: Export | None
 
 
-def _find_poses(root: Path, images: str) -> _Poses | None:
-    """What gives the poses of the images in a folder, or of a file; None if there is nothing."""
+def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
+    """What gives the poses of the images in a folder, or of a file; None if there is nothing.
+
+    ``deep``: also models further below, which may be those of other photos.
+    """
     export = find_export(root) if root.is_file() else None
     transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse") or ([] if transforms else find_models(root))
     models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
-    if not transforms and not (models and (root / images).is_dir()):  # dense/0/sparse, sfm …
+    if (
+        deep and not transforms and not (models and (root / images).is_dir())
+    ):  # dense/0/sparse, sfm …
         models = find_models_below(root, images) or models
     if models:
         return _Poses(models, [], None)
@@ -230,7 +235,8 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
     if root.is_file():
         raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
     if not poses or not ((root / images).is_dir() or photos_below(root)):
-        above = next((p for p in root.absolute().parents[:2] if poses_in(p)), None)
+        parents = root.absolute().parents[:2]
+        above = next((p for p in parents if _find_poses(p, images, deep=False)), None)
         if above is not None:
             raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
     if poses:

@@ -78,7 +78,7 @@ def test_the_page_contains_the_results(trained, tmp_path):
         f"{evaluation.psnr:.2f} dB",
         f"{evaluation.ssim:.3f}",
         f"{len(trained['gaussians']):,}",
-        "9 photos that were not used for training",
+        "9 photos of 48x36 that were not used for training",
         "8 to train on, 9 held out",
         "48 × 36",
         "a & b",
@@ -111,7 +111,7 @@ def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path
     write_training_report(tmp_path / "report.html", Trained(**changed))
     content = words(tmp_path / "report.html")
     assert "No photos were held out" in content
-    assert "8 photos used for training" in content
+    assert "8 photos of 48x36 used for training" in content
     assert "8 to train on, 0 held out" in content
 
 
@@ -123,7 +123,7 @@ def test_photos_that_are_left_out_are_named_and_not_evaluated(trained, tmp_path)
     write_training_report(tmp_path / "report.html", Trained(**changed))
     content = words(tmp_path / "report.html")
     assert f"camera poses are probably wrong: {names[0]}, {names[1]}." in content
-    assert "6 photos used for training" in content
+    assert "6 photos of 48x36 used for training" in content
     assert content.count(names[0]) == 1
 
 

@@ -208,12 +208,10 @@ class Mapping:
                     models.append(model)
                     left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
                     first = self._first(left)
-        if reduced is None:
-            return [self._refine(model, scales=_FIRST_LOSS_SCALES) for model in models]
         for model in models:
-            self._adjust(model, _FIRST_LOSS_SCALES[0])
-            mapper.triangulate_all(model, pairs=False)
-            self._remove_outliers(model, MIN_POINTS)
+            if reduced is not None:
+                mapper.triangulate_all(model, pairs=False)
+            self._refine(model, scales=_FIRST_LOSS_SCALES)
         return models
 
     @contextmanager
