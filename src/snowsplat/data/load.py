@@ -201,12 +201,13 @@ class _Poses:
 def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
     """What gives the poses of the images in a folder, or of a file; None if there is nothing.
 
-    ``deep``: also models further below, which may be those of other photos.
+    ``deep``: also models in other folders than ``sparse``, which may be those of other photos.
     """
     export = find_export(root) if root.is_file() else None
     transforms = [] if export else find_transforms(root)
-    models = find_models(root / "sparse") or ([] if transforms else find_models(root))
-    models = models or ([] if transforms else find_models(root / "colmap" / "sparse"))
+    models = find_models(root / "sparse")
+    if deep and not transforms:
+        models = models or find_models(root) or find_models(root / "colmap" / "sparse")
     if (
         deep and not transforms and not (models and (root / images).is_dir())
     ):  # dense/0/sparse, sfm …
