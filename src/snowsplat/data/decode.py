@@ -149,8 +149,8 @@ def load_views(
         image = torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
         if mask is not None and not mask.blank and mask.path not in levels:
             levels[mask.path] = _decoded_mask(mask)
-        shown = None if mask is None else _mask_of(levels.get(mask.path), mask)
-        made.append(LoadedImage(image, shown))
+        allowed = None if mask is None else _mask_of(levels.get(mask.path), mask)
+        made.append(LoadedImage(image, allowed))
     return made
 
 

@@ -56,7 +56,7 @@ def _why_not(dataset: Dataset, without: int, photos: int) -> str | None:
     """The reason why the poses are not used; None if they are."""
     impossible = [finding.text for finding in judge(dataset) if finding.impossible]
     if impossible:
-        return impossible[0].rpartition(";")[0]  # without the advice
+        return impossible[0].rsplit(";", 1)[0]  # without the advice
     if without > (1 - _LEAST_SHARE) * photos:
         return f"{without} of {photos} photos have no pose"
     return None

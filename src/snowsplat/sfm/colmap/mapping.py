@@ -84,12 +84,12 @@ class Mapping:
         ``mapper``: "plain" is the incremental mapper with COLMAP's own order of registration.
         ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
-        if mapper == "incremental":
-            return usable_models(self._map_incrementally(relaxed))
         if mapper == "global":
             models = self._map_globally()
-        else:
+        elif mapper == "plain":
             models = self._map_in_plain_order(relaxed)
+        else:
+            models = self._map_incrementally(relaxed)
         return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
 
     def extend(
@@ -197,7 +197,7 @@ class Mapping:
         models: list[pycolmap.Reconstruction] = []
         left, first = graph, self._first(graph)
         # With weak matches, none can be spared.
-        with self._long_tracks() if not (relaxed or self.forward) else nullcontext() as reduced:
+        with nullcontext() if relaxed or self.forward else self._long_tracks() as reduced:
             mapper = self._mapper(graph, relaxed, reduced)
             for _ in range(_MAX_MODELS):
                 model = mapper.start(first) if len(left.names) >= MIN_PHOTOS else None
@@ -208,10 +208,9 @@ class Mapping:
                     models.append(model)
                     left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
                     first = self._first(left)
-        for model in models:
-            if reduced is not None:
+        if reduced is not None:
+            for model in models:
                 mapper.triangulate_all(model, pairs=False)
-            self._refine(model, scales=_FIRST_LOSS_SCALES)
         return models
 
     @contextmanager
