@@ -16,6 +16,7 @@ from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.sfm.ingest.sources import Sources
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Outcome, Stages
 
 _SETTINGS = {"max_gaussians": 200, "init": "points", "checkpoint_every": 2}
@@ -97,3 +98,16 @@ def test_make_keeps_its_name_if_only_the_photos_were_renamed(
     job.stages.about = {"name": recorded}
     job._make_dataset()
     assert (job.file, job.stages.about["name"]) == (tmp_path / f"{name}.ply", name)
+
+
+def test_make_leaves_the_comparison_of_photos_to_their_dataset(tmp_path):
+    """Their folder may have been renamed. Without a dataset, the scene may be that of another."""
+    job = make._Job([tmp_path], "new", tmp_path, make.MakeOptions(), False, SILENT, None, 0.0)
+    job.sources = Sources((tmp_path,), [], [], [])
+    job.stages = Stages(tmp_path / "make.json", make.STAGES)
+    job.stages.about = {"inputs": ["/old"]}
+    with pytest.raises(UserError, match="contains a scene made from /old"):
+        job._check_inputs()
+    (tmp_path / "dataset").mkdir()
+    job._check_inputs()
+    assert job.stages.about["inputs"] == [str(tmp_path)]

@@ -236,7 +236,11 @@ class _Job:
         """Raises UserError if the folder has a scene of other photos that must not be replaced."""
         inputs = [str(path.absolute()) for path in self.inputs]
         before = self.stages.about.get("inputs", inputs)
-        if before != inputs and not self.overwrite:
+        # `make_dataset` compares the photos themselves, whose folder may have been renamed.
+        compared = self.sources.posed is None and any(
+            (self.out / name).is_dir() for name in (DATASET, FORMER_DATASET)
+        )
+        if before != inputs and not (compared or self.overwrite):
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
                 f"{self.out}: contains a scene made from {what}; use another folder, or set "
