@@ -245,11 +245,12 @@ def test_an_unknown_name_gets_the_nearest_one_as_a_suggestion(refused):
     assert line == "snowsplat: --iteratoins: unknown flag; did you mean --iterations?"
 
 
-def test_a_setting_of_another_density_control_says_so(refused):
+def test_a_setting_of_another_density_control_says_so(refused, tmp_path):
     message = "a setting of McmcDensity, but this training uses AdaptiveDensity; remove it"
     with pytest.raises(SettingError, match=f"^growth: {message}"):
         recipe("paper", growth=0.1)
-    line = refused("train", "x", "-o", "out", "--recipe", "mcmc", "--percent-dense", 0.1)
+    out = tmp_path / "out"  # `make demo` writes the folder out
+    line = refused("train", "x", "-o", out, "--recipe", "mcmc", "--percent-dense", 0.1)
     assert "--percent-dense: a setting of AdaptiveDensity, but this training uses McmcD" in line
 
 
