@@ -16,10 +16,13 @@ from snowsplat.training.settings.recipes import recipe
 from .stage import stage
 
 
-def camera(x: float) -> Camera:
-    """At (x, 0, 0), looking along z, with a field of view of 90° in both directions."""
+def camera(x: float, along: float = 1.0) -> Camera:
+    """At (x, 0, 0), looking along z or against it, with a field of view of 90° each way."""
     position = torch.tensor([x, 0.0, 0.0]).double()
-    forward, up = torch.tensor([0.0, 0.0, 9.0]).double(), torch.tensor([0.0, -1.0, 0.0]).double()
+    forward, up = (
+        torch.tensor([0.0, 0.0, 9.0 * along]).double(),
+        torch.tensor([0.0, -1.0, 0.0]).double(),
+    )
     return Camera(40, 40, 20.0, 20.0, 20.0, 20.0, look_at(position, position + forward, up))
 
 
@@ -30,7 +33,11 @@ def wall(depth: float = 10.0) -> Tensor:
     return torch.stack([x, y, torch.full_like(x, depth)], dim=2).reshape(-1, 3)
 
 
-def removed(cameras: list[Camera], points: Tensor | None, means: list[list[float]]) -> list[bool]:
+def removed(
+    cameras: list[Camera],
+    points: Tensor | None,
+    means: list[list[float]],
+) -> list[bool]:
     """Which Gaussians at ``means`` a limit of 0.5 removes."""
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
@@ -49,18 +56,28 @@ def removed(cameras: list[Camera], points: Tensor | None, means: list[list[float
 
 def test_gaussians_in_front_of_the_points_are_removed():
     near = [[0.0, 0.0, 4.9], [0.0, 0.0, 0.1], [4.8, -4.8, 4.9]]
-    kept = [[0.0, 0.0, 5.1], [0.0, 0.0, -1.0], [9.0, 0.0, 4.9], [0.0, 0.0, 10.0]]
+    kept = [[0.0, 0.0, 5.1], [0.0, 0.0, -5.1], [9.0, 0.0, 4.9], [0.0, 0.0, 10.0]]
     assert removed([camera(0.0)], wall(), near + kept) == [True] * 3 + [False] * 4
 
 
 def test_also_in_views_that_nobody_photographed():
     """A Gaussian between the fields of view of two cameras, and one beside the first of them."""
     first, second = camera(-3.0), camera(3.0)
-    between, beside, outside = [0.0, 0.0, 0.5], [-5.5, 0.0, 1.2], [-5.5, 0.0, 0.3]
-    assert removed([first], wall(), [between, beside, outside]) == [False] * 3
-    assert removed([first, second], wall(), [between, beside, outside]) == [True, True, False]
+    beside, outside = [-8.5, 0.0, 4.5], [-9.3, 0.0, 4.5]
+    assert removed([first], wall(), [beside, outside]) == [False] * 2
+    assert removed([first, second], wall(), [beside, outside]) == [True, False]
     positions = sorted(float(c.position[0]) for c in unseen_cameras([first, second], wall()))
     assert positions == pytest.approx([-4.5, 0.0, 0.0, 4.5], abs=1e-6)
+
+
+def test_near_a_camera_remains_what_two_photos_show():
+    """The other cameras look away from the points, so they have no limits themselves."""
+    front = [camera(0.0), camera(0.2), camera(0.4)]
+    back = [camera(x, along=-1.0) for x in (0.0, 0.2)]
+    behind = [[0.0, 0.0, -1.0], [0.0, 0.0, -4.9], [0.0, 0.0, -5.2]]
+    for others, expected in (([], True), (back[:1], True), (back, False)):
+        found = removed(front + others, wall(), behind)
+        assert found == [expected, expected, False]
 
 
 def test_a_few_wrong_points_do_not_matter():
@@ -91,7 +108,7 @@ def test_many_cameras_are_sampled():
     limit = NearLimit(0.5)
     limit.begin(stage(cameras=[camera(0.001 * i) for i in range(500)], points=wall()))
     assert limit._views is not None
-    assert len(limit._views) <= 64 * 5
+    assert len(limit._views.limit) <= 64 * 5
 
 
 def test_a_training_run_without_a_floater(tmp_path):

@@ -60,9 +60,11 @@ _FEWEST_VIEWS = {"auto": 30, "on": 8, "off": 0}
 _STEPS_PER_VIEW = 8
 #: With "auto", if nothing moves after this moment, the photos are not compared again.
 _NOTHING = MOMENTS[1]
-#: The residual of a cell is large if it is at least this, and at least this many times the quantile
-#: of the residuals of all cells. Early in the training, all residuals are larger.
-_LARGE, _LARGE_TIMES, _QUANTILE = 0.1, 2.0, 0.9
+#: The residual of a cell is large if it is at least this, and at least this many times one of two
+#: quantiles of the residuals of all cells. Early in the training, all residuals are larger. If what
+#: moves covers more than a tenth of the photos, the higher quantile is a residual of it, but the
+#: median is not.
+_LARGE, _TIMES_QUANTILE = 0.1, ((2.0, 0.9), (4.0, 0.5))
 #: Around cells with a large residual, this share of it is enough, up to this number of cells away.
 _NOTABLE, _RINGS = 0.5, 3
 #: If something moves in several photos, this share of a large residual is enough.
@@ -269,8 +271,11 @@ def _dilated(cells: Tensor) -> Tensor:
 def _large(residuals: Sequence[Tensor]) -> float:
     """The smallest large residual."""
     every = torch.cat([residual.flatten() for residual in residuals])
-    position = round(_QUANTILE * (len(every) - 1))
-    return max(_LARGE, _LARGE_TIMES * float(every.kthvalue(position + 1).values))
+
+    def quantile(share: float) -> float:
+        return float(every.kthvalue(round(share * (len(every) - 1)) + 1).values)
+
+    return max(_LARGE, min(times * quantile(share) for times, share in _TIMES_QUANTILE))
 
 
 def _significant(found: Sequence[Tensor]) -> bool:
