@@ -20,7 +20,12 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts.densification import delayed
-from snowsplat.training.parts.transients import MOMENTS, Transients, cells_that_move
+from snowsplat.training.parts.transients import (
+    MOMENTS,
+    Transients,
+    cells_that_move,
+    large_residual,
+)
 from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.util.errors import UserError
@@ -198,6 +203,14 @@ def test_residuals_of_the_same_places_in_other_views():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("moving", [0.0, 0.05, 0.2, 0.4])
+def test_people_in_a_tenth_of_all_cells_do_not_hide_themselves(moving):
+    """Static cells have residuals of 0.02 to 0.06, those that show people 0.5."""
+    still = torch.linspace(0.02, 0.06, 1000)
+    people = torch.full((round(1000 * moving / (1.0 - moving)),), 0.5)
+    assert 0.1 <= large_residual([still[:400], torch.cat([still[400:], people])]) <= 0.25
+
+
 def test_what_moves_is_found(trained):
     transients = trained.part(Transients)
     found = indexed(trained)

@@ -211,7 +211,7 @@ def _moving_cells(
     maps: Sequence[CellMap], before: Sequence[Tensor], mode: AutoOnOff
 ) -> list[Tensor]:
     """The cells (h, w) bool of each map in which something moves; ``before``: of the last time."""
-    large = _large([cells.residual for cells in maps])
+    large = large_residual([cells.residual for cells in maps])
 
     def found(ignored: Sequence[Tensor], large: float, alone: bool) -> list[Tensor]:
         return [
@@ -268,8 +268,8 @@ def _dilated(cells: Tensor) -> Tensor:
     return max_pool2d(cells[None].float(), 3, stride=1, padding=1)[0] > 0.0
 
 
-def _large(residuals: Sequence[Tensor]) -> float:
-    """The smallest large residual."""
+def large_residual(residuals: Sequence[Tensor]) -> float:
+    """The smallest large residual, for the residuals of the cells of all views."""
     every = torch.cat([residual.flatten() for residual in residuals])
 
     def quantile(share: float) -> float:
