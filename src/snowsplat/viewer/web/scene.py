@@ -163,14 +163,7 @@ def ready(
     if change is not None:
         gaussians = transform(gaussians, change)
         depth *= change.scale
-        cameras = [
-            replace(
-                camera,
-                cam_from_world=change.apply_to_poses(camera.cam_from_world),
-                near=change.scale * camera.near,
-            )
-            for camera in cameras
-        ]
+        cameras = [camera.transformed(change) for camera in cameras]
     stops = stops_of(gaussians, cameras, depth, background)
     hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=False)
     film = _film(cameras, depth)
