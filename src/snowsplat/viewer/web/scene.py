@@ -66,12 +66,8 @@ def site(
     if levels is not None:
         scene = scene.complete()
     content = _content(scene.gaussians, levels)
-    bootstrap = {
-        "settings": scene.settings(),
-        "contentUrl": f"./{next(iter(content))}",
-        "antialiased": scene.gaussians.antialiased,
-        "panel": scene.panel(about, f"./{PICTURES}", count),
-    }
+    bootstrap = scene.bootstrap(about, f"./{PICTURES}", count)
+    bootstrap["contentUrl"] = f"./{next(iter(content))}"
     index = page(f"{about.title} - snowsplat", bootstrap)
     files: dict[str, Served] = {
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
@@ -117,20 +113,25 @@ class ReadyScene(NamedTuple):
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
         return self._replace(hiding=replace(self.hiding, start=0))
 
-    def settings(self) -> dict[str, Any]:
-        """The settings of the viewer."""
-        return settings(self.start, self.background, self.film)
+    def bootstrap(
+        self, about: Description, pictures: str, count: int | None = None
+    ) -> dict[str, Any]:
+        """What `page` needs, except for the address of the scene.
 
-    def panel(self, about: Description, pictures: str, count: int | None = None) -> dict[str, Any]:
-        """What the panel shows; ``pictures`` is the address of the pictures of the stops.
-
-        ``count``: of the Gaussians, if those here are only a coarse level.
+        Args:
+            pictures: the address of the pictures of the stops.
+            count: the number of Gaussians, if those here are only a coarse level.
         """
         subject = self.stops.middle.tolist(), self.stops.radius
         count = count or len(self.gaussians)
-        return panel_settings(
-            about, count, self.start, subject, self.stops.views, pictures, self.hiding
-        )
+        stops = self.stops.views
+        return {
+            "settings": settings(self.start, self.background, self.film),
+            "antialiased": self.gaussians.antialiased,
+            "panel": panel_settings(
+                about, count, self.start, subject, stops, pictures, self.hiding
+            ),
+        }
 
 
 def ready(
