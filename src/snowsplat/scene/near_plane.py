@@ -28,7 +28,7 @@ def near_of_overview(distance: float) -> float:
 
     Such a scene is rendered as it is, so no compatibility with a training asks for `NEAR`.
     """
-    return _OF_DISTANCE * distance
+    return _OF_DISTANCE * distance if 0 < distance < math.inf else NEAR
 
 
 def near_plane(distance: float, nearest: float | None = None) -> float:
