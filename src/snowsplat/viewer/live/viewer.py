@@ -221,7 +221,8 @@ class NetworkViewer:
             camera = photo.placed.camera(request.photo_view.camera, width, height)
         if display.crop is not None:
             box = self._world_from_page.apply(torch.tensor(display.crop, dtype=torch.float64))
-            display = replace(display, crop=tuple(map(tuple, box.tolist())))
+            (x, y, z), (u, v, w) = box.tolist()
+            display = replace(display, crop=((x, y, z), (u, v, w)))
         camera = camera.transformed(self._world_from_page)
         return draw(gaussians, camera, display, self.background, photo)
 
