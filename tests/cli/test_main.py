@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from snowsplat._version import __version__
 from snowsplat.cli import main as module
 from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
@@ -137,6 +138,11 @@ def test_info_describes_each_kind_of_file_and_folder_without_torch(tmp_path):
     found = imported_by(*(["info", path] for path in described))
     for path, imported in zip(described, found, strict=True):
         assert "torch" not in imported, path
+
+
+def test_the_version_is_one_line(run):
+    result = run("--version")
+    assert (result.code, result.out, result.err) == (0, f"snowsplat {__version__}\n", "")
 
 
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):

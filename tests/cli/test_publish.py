@@ -130,3 +130,12 @@ def test_errors(refused, scene, tmp_path):
     write_gaussians(empty, nothing)
     assert "contains no Gaussians" in refused("publish", empty, "-o", tmp_path / "b")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.ply"]
+
+
+def test_the_place_of_a_scene_is_said(run, scene, tmp_path):
+    far = read_gaussians(scene)
+    far.origin = (500_000.0, 5_400_000.0, 300.0)
+    write_gaussians(tmp_path / "far.ply", far)
+    result = run("publish", tmp_path / "far.ply", "-o", tmp_path / "site")
+    assert result.code == 0
+    assert "the origin 500000 5400000 300" in result.out + result.err

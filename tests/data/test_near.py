@@ -7,7 +7,8 @@ import torch
 
 from snowsplat.data.near import near_of
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.near_plane import NEAR, near_plane
+from snowsplat.scene.near_plane import NEAR, near_of_overview, near_plane
+from snowsplat.trajectory import orbit_path
 
 
 def cameras(scale=1.0, count=12):
@@ -36,6 +37,14 @@ def test_the_near_plane_is_scaled_with_the_scene(power, has_points):
     points = plane(scale) if has_points else None
     unscaled = near_of(cameras(), plane() if has_points else None)
     assert near_of(cameras(scale), points) == scale * unscaled
+
+
+@pytest.mark.parametrize("scale", [1e-4, 0.7, 1e4])
+def test_that_of_an_orbit_is_scaled_by_any_factor(scale):
+    weights = torch.ones(6400)
+    usual, scaled = (orbit_path(plane(s), weights, 3, 64, 48)[0] for s in (1.0, scale))
+    assert scaled.near == pytest.approx(scale * usual.near, rel=1e-5)
+    assert near_of_overview(0.0) == near_of_overview(float("nan")) == NEAR
 
 
 def test_what_is_close_to_the_cameras_is_not_cut_off():

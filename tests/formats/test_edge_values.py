@@ -79,6 +79,12 @@ def test_what_spz_cannot_hold_is_counted_with_advice(tmp_path, make_scene, caplo
     scene.log_scales[:, 1] = -14.0  # thin axes that are not visible
     write_gaussians(tmp_path / "a.spz", scene)
     assert caplog.text == ""
+    scene.sh_dc[:9] = 4.0
+    write_gaussians(tmp_path / "a.spz", scene)
+    assert "colours of 9 (from -0.44 to 1.44) of 3,000 Gaussians" in caplog.text
+    read = read_gaussians(tmp_path / "a.spz")
+    assert float(0.5 + SH_C0 * read.sh_dc.max()) == pytest.approx(1.44, abs=0.01)
+    scene.sh_dc[:9] = 0.0
     scene.log_scales[:7] = math.log(1500)
     write_gaussians(tmp_path / "a.spz", scene)
     expected = "scales of 7 (up to 1500, at most 379) of 3,000 Gaussians; scaled by 0.1, all"

@@ -11,16 +11,17 @@ import torch
 
 from snowsplat.data import load_dataset
 from snowsplat.data.colmap import posed_camera, read_model, read_points, write_model
-from snowsplat.formats import read_gaussians
+from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.pipeline.blocks.merge import merge_blocks
 from snowsplat.pipeline.blocks.plan import PlanOptions, plan_blocks
 from snowsplat.pipeline.blocks.train import train_blocks
 from snowsplat.pipeline.clean import clean
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.evaluate import evaluate
-from snowsplat.pipeline.output.scene_source import load_trained
+from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.pipeline.watch import NewestScene
+from snowsplat.scene.edit import seen_from
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import HERE, opposite
 
@@ -90,6 +91,14 @@ def test_a_scene_of_another_origin_meets_the_dataset(far: Path, out: Path, tmp_p
         assert cleaned.after > 0.5 * cleaned.before
         assert cleaned.psnr[0] == pytest.approx(before, abs=0.01)
         assert read_gaussians(tmp_path / target).origin == origin
+    saved = read_gaussians(out / "point_cloud/iteration_60/point_cloud.ply")
+    write_gaussians(scene, replace(saved, origin=HERE))  # as another program saves it
+    assert evaluate(load_trained(other)).psnr == pytest.approx(before, abs=0.01)
+    for stored in (saved, replace(saved, origin=HERE), seen_from(saved, (500_001.0, *UTM[1:]))):
+        write_gaussians(scene, stored)  # the cameras in the output folder see the same
+        assert load_viewable(other).gaussians.origin == origin
+        torch.testing.assert_close(load_viewable(other).gaussians.means, saved.means)
+    shutil.copy(tmp_path / "moved.ply", scene)
     convert(scene, tmp_path / "half.ply", Edits(decimate="50%"), dataset=far)
     shutil.copy(tmp_path / "half.ply", scene)
     assert evaluate(load_trained(other)).psnr > before - 1

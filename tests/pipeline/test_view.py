@@ -1,6 +1,7 @@
 """`viewed_scene`: which scenes are shown in levels of detail."""
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -12,7 +13,9 @@ from snowsplat.formats.lod import INDEX, read_index
 from snowsplat.pipeline import view
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.view import viewed_scene
+from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.initial_view import overview
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.served_file import FileOnDisk
@@ -72,6 +75,23 @@ def test_levels_are_not_turned(tmp_path):
         (found,) = re.findall(rb'"initial": {"position": (\[.*?\])', viewed.files[""].content)
     x, y, z = overview(floor).position
     assert json.loads(found) == pytest.approx([-x, -y, z], abs=0.05)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_page_scales_levels_of_an_unusual_unit(scene, tmp_path, scale):
+    """The viewer moves at a fixed speed, and limits distances. The files stay as they are."""
+    box = read_gaussians(scene)
+    change = Similarity(scale, torch.eye(3), torch.zeros(3))
+    write_gaussians(tmp_path / "levels" / INDEX, transform(box, change))
+    with viewed_scene(tmp_path / "levels") as viewed:
+        script = viewed.files["index.js"].content
+        (factor,) = re.findall(rb"0, 180\); entity.setLocalScale\((.*?),", script)
+        (found,) = re.findall(rb'"initial": ({.*?})', viewed.files[""].content)
+    start = json.loads(found)
+    assert math.dist(start["position"], start["target"]) == pytest.approx(3.0, rel=1e-3)
+    view = overview(box)
+    usual = scale * math.dist(view.position, view.target)
+    assert float(factor) * usual == pytest.approx(3.0, rel=1e-3)
 
 
 def test_a_folder_with_levels_is_served_as_it_is(scene, tmp_path):

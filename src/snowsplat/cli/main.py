@@ -19,6 +19,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from snowsplat._version import __version__
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
 from snowsplat.cli.subcommands import SUBCOMMANDS, description, load_subcommand
@@ -42,6 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     accept_all_characters()
     _report_log_and_warnings_as_lines()
+    if arguments == ["--version"]:
+        print("snowsplat", __version__)
+        return 0
     try:
         return int(parse(arguments or ["--help"]).run())
     except SettingError as error:

@@ -219,21 +219,15 @@ def write_ply(path: Path | str, gaussians: GaussianArrays, *, georeferenced: boo
     Raises:
         OSError: the folder is missing or not writable, or the disk is full.
     """
-    count, rest = len(gaussians.means), gaussians.sh_rest.shape[1]
-    if not (georeferenced and any(gaussians.origin)):
-        antialiased, origin = gaussians.antialiased, gaussians.origin
-        write_ply_parts(path, count, rest, [gaussians], antialiased=antialiased, origin=origin)
-        return
-    names = _names(rest)
-    kinds = [("double" if name in _MEANS else "float", name) for name in names]
-    row = np.dtype([("means", "<f8", 3), ("others", "<f4", len(names) - 3)])
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(header(count, kinds, scene_comments(gaussians.antialiased, HERE)))
-        for start in range(0, count, _WRITE_ROWS):
-            part = gaussians.select(slice(start, start + _WRITE_ROWS))
-            rows = np.empty(len(part.means), row)
-            rows["means"], rows["others"] = part.world_means(), _table(part, rest)[:, 3:]
-            file.write(rows.tobytes())
+    write_ply_parts(
+        path,
+        len(gaussians.means),
+        gaussians.sh_rest.shape[1],
+        [gaussians],
+        antialiased=gaussians.antialiased,
+        origin=gaussians.origin,
+        georeferenced=georeferenced,
+    )
 
 
 def write_ply_parts(
@@ -244,6 +238,7 @@ def write_ply_parts(
     *,
     antialiased: bool,
     origin: Origin = HERE,
+    georeferenced: bool = False,
 ) -> None:
     """`write_ply` for a scene that does not fit into the memory: its parts one after the other.
 
@@ -252,38 +247,34 @@ def write_ply_parts(
         rest: K, the number of SH coefficients beyond the constant one; parts may have fewer.
         antialiased: whether the scene is marked as `Gaussians.antialiased`.
         origin: that of all parts.
+        georeferenced: see `write_ply`.
 
     Raises:
         OSError: see `write_ply`.
     """
-    names = _names(rest)
+    names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
+    exact = georeferenced and any(origin)
+    kinds = [("double" if exact and name in _MEANS else "float", name) for name in names]
+    row = np.dtype([("means", "<f8" if exact else "<f4", 3), ("others", "<f4", len(names) - 3)])
     written = 0
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        properties = [("float", name) for name in names]
-        file.write(header(count, properties, scene_comments(antialiased, origin)))
+        file.write(header(count, kinds, scene_comments(antialiased, HERE if exact else origin)))
         for part in parts:
             for start in range(0, len(part.means), _WRITE_ROWS):
-                rows = part.select(slice(start, start + _WRITE_ROWS))
-                file.write(_table(rows, rest).tobytes())
+                chunk = part.select(slice(start, start + _WRITE_ROWS))
+                rows = np.empty(len(chunk.means), row)
+                rows["means"] = chunk.world_means() if exact else chunk.means
+                rows["others"] = _others(chunk, rest)
+                file.write(rows.tobytes())
             written += len(part.means)
         assert written == count
 
 
-def _names(rest: int) -> list[str]:
-    return [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
-
-
-def _table(gaussians: GaussianArrays, rest: int) -> np.ndarray:
-    """(N, columns) the rows of the file; SH coefficients that are missing are zeros."""
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = gaussians
+def _others(gaussians: GaussianArrays, rest: int) -> np.ndarray:
+    """(N, columns) the rows after x y z; SH coefficients that are missing are zeros."""
+    _, log_scales, quats, opacity_logits, sh_dc, sh_rest = gaussians
     n, k = sh_rest.shape[:2]
-    rows = np.zeros((n, 17 + 3 * rest), "<f4")
-    rows[:, 0:3] = means
-    rows[:, 6:9] = sh_dc[:, 0]
-    by_channel = rows[:, 9 : 9 + 3 * rest].reshape(n, 3, rest)
+    by_channel = np.zeros((n, 3, rest), np.float32)
     by_channel[..., :k] = sh_rest.transpose(0, 2, 1)
-    rows[:, 9 : 9 + 3 * rest] = by_channel.reshape(n, 3 * rest)
-    rows[:, -8] = opacity_logits
-    rows[:, -7:-4] = log_scales
-    rows[:, -4:] = quats
-    return rows
+    columns = (np.zeros((n, 3), np.float32), sh_dc[:, 0], by_channel.reshape(n, 3 * rest))
+    return np.concatenate([*columns, opacity_logits[:, None], log_scales, quats], 1)

@@ -167,7 +167,7 @@ FORMATS: list[Format] = [
         None,
         read_splat,
         write_splat,
-        "all SH, and precision: rotations, colours and opacity have 8 bits",
+        "all SH, colours beyond black and white; rotations, colours and opacity have 8 bits",
         False,
     ),
     Format(

@@ -57,6 +57,7 @@ _HALF_TURNS = np.array(
     [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]], dtype=np.float32
 )
 _COLOR_STEP = 0.15 * 255
+_COLOR_LIMIT = 127.5 / _COLOR_STEP
 _SCALE_RANGE = (-10.0, 255 / 16 - 10)  # logarithms
 # SH bytes are rounded to multiples of these (degree 1, higher degrees), so that they compress
 # better. Niantic's implementation uses 8 and 16, which lower the PSNR of a trained scene by more
@@ -184,6 +185,8 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     if len(means) and 2.0**-bits > 0.5 * math.exp(min(80.0, float(np.median(log_scales.max(1))))):
         cut.note("positions", np.ones(len(means), bool), f"in steps of {2.0**-bits:.2g}")
     packing.cut_scales(cut, log_scales, *_SCALE_RANGE, step=1 / 32)
+    beyond = (np.abs(sh_dc) > _COLOR_LIMIT + 0.5 / _COLOR_STEP).any((1, 2))
+    cut.note("colours", beyond, "from -0.44 to 1.44", rare=True)
     cut.note("SH", (np.abs(sh_rest) > 1 + _SH_STEPS[1] / 128).any((1, 2)), "at most 1", rare=True)
     cut.report(_advice(log_scales))
 

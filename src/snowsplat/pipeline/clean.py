@@ -20,7 +20,7 @@ from snowsplat.pipeline.output.scene_paths import folder_around
 from snowsplat.pipeline.output.scene_source import Color, load_viewable
 from snowsplat.pipeline.refine import photos_of
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.edit import seen_from
+from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
@@ -88,7 +88,7 @@ def clean(
     photos = _photos(source.file, None if dataset is None else Path(dataset))
     gaussians, cameras = source.gaussians, source.cameras
     if photos is not None:
-        gaussians = seen_from(gaussians, photos.origin)
+        gaussians = seen_from_dataset(gaussians, photos.origin)
         cameras = [view.camera for view in [*photos.train, *photos.test]]
     if not cameras:
         raise UserError(

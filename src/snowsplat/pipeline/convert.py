@@ -24,7 +24,7 @@ from snowsplat.pipeline.output.scene_files import (
     write_gaussians,
 )
 from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
-from snowsplat.pipeline.output.scene_source import background_of, cameras_of
+from snowsplat.pipeline.output.scene_source import background_of, cameras_of, seen_by_cameras
 from snowsplat.pipeline.refine import photos_of, refine
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
@@ -228,7 +228,9 @@ def _decimation(
         if len(scenes) != 1:  # the cameras of one of several scenes do not show the others
             return Decimation(observer=observer)
         folder = folder_around(scenes[0])
-        return Decimation(cameras_of(folder), background_of(folder), observer=observer)
+        return Decimation(
+            cameras_of(folder), background_of(folder), folder.origin(), observer=observer
+        )
     if edits.decimate is None:
         raise SettingError("refine", "is for decimated scenes; set `decimate` as well")
     if edits.crop:
@@ -242,4 +244,5 @@ def _decimation(
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
     """Write an HTML page, with the cameras and the background of its training if they are known."""
     folder, about = folder_around(source), Description(target.stem, made=made_on(source))
+    scene = seen_by_cameras(scene, folder)
     write_html(target, ready(scene, cameras_of(folder), background_of(folder)), about)

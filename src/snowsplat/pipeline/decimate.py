@@ -12,7 +12,7 @@ import torch
 from snowsplat.formats.origin_file import read_origin, write_origin
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.edit import seen_from
+from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.scene.simplify import simplify
@@ -66,7 +66,7 @@ class Decimation:
 
     def merged(self, scene: Gaussians, count: int) -> Gaussians:
         """``count`` Gaussians, see `simplify`; fewer if the scene has fewer."""
-        return simplify(seen_from(scene, self.origin or scene.origin), count, self.cameras)
+        return simplify(self._seen(scene), count, self.cameras)
 
     def fitted(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         """Merged Gaussians that look more like ``scene``, of which they were made."""
@@ -76,13 +76,16 @@ class Decimation:
             return self.refined(smaller)
         return self._distilled(smaller, scene) if self.cameras else smaller
 
+    def _seen(self, scene: Gaussians) -> Gaussians:
+        return scene if self.origin is None else seen_from_dataset(scene, self.origin)
+
     def _distilled(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))
 
         self.observer.steps_begin(0, _STEPS)
         try:
-            whole = scene.select(scene.usable_rows())
+            whole = self._seen(scene).select(scene.usable_rows())
             color = torch.tensor(self.background)
             return distill(smaller, whole, self.cameras, color, _STEPS, report)
         finally:

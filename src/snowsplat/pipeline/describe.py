@@ -42,8 +42,8 @@ def describe(path: Path | str) -> dict[str, Any]:
       what is impossible or doubtful about the cameras.
 
     Bounds and lengths are in world units, in the frame of the file, relative to the "origin" of a
-    scene that has one (`scene.origin`). torch is imported only for
-    datasets, photos and videos.
+    scene or dataset that has one (`scene.origin`). torch is imported only for datasets, photos and
+    videos.
 
     Raises:
         UserError: ``path`` is missing, damaged, or of an unknown kind.
@@ -233,6 +233,7 @@ def _dataset(path: Path) -> dict[str, Any]:
         "depth_maps": sum(view.depth is not None for view in views),
         "points": 0 if dataset.points is None else len(dataset.points),
         "extent": float(f"{dataset.extent:.5g}"),
+        **({"origin": list(dataset.origin)} if any(dataset.origin) else {}),
         "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],
         "impossible": [finding.text for finding in findings if finding.impossible],
         "doubtful": [finding.text for finding in findings if not finding.impossible],

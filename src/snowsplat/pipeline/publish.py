@@ -79,7 +79,7 @@ def publish(
         iteration: an iteration of an output folder; default: the last one.
         overwrite: whether to replace a web site in ``folder``.
         threads: number of CPU threads; None: all cores.
-        observer: gets the progress of levels of detail, the stage "levels".
+        observer: gets the progress of levels of detail, the stage "levels", and notes.
 
     Raises:
         UserError: the scene is missing, damaged or has no Gaussians; ``folder`` contains other
@@ -96,6 +96,9 @@ def publish(
 
     url = options.url and options.url.rstrip("/") + "/"
     about = Description(options.title or scene_name(scene), options.licence, made_on(source.file))
+    if any(source.gaussians.origin):
+        place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
+        observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
     what = source.gaussians, source.cameras, source.background, about, url
     if len(source.gaussians) <= _LARGE:

@@ -20,6 +20,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, index_in
+from snowsplat.pipeline.output.scene_source import seen_by_cameras
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.gaussians import Gaussians
@@ -249,6 +250,7 @@ def _load(scene: Path, iteration: int | None, name: str) -> _Source:
         _, gaussians = folder.read_scene(iteration)
         file = folder.videos / f"{name}.mp4"
     _, background = folder.settings()
+    gaussians = seen_by_cameras(gaussians, folder)
     return _Source(gaussians, read_cameras(folder.path / "cameras.json"), background, file)
 
 

@@ -15,7 +15,7 @@ from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
 from snowsplat.pipeline.output.scene_paths import existing_folder
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.scene.edit import seen_from
+from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.core import checkpoint
@@ -120,7 +120,7 @@ class NewestScene:
 
     def _gaussians(self, path: Path) -> Gaussians:
         if path.parent != self._folder.checkpoints:
-            return seen_from(read_gaussians(path), self._origin)
+            return seen_from_dataset(read_gaussians(path), self._origin)
         saved = checkpoint.load(path)
         part = "gaussians."
         own: dict[str, Any] = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from snowsplat.scene.geometry import invert_rigid, transform_points
+from snowsplat.scene.geometry import Similarity, invert_rigid, transform_points
 from snowsplat.scene.near_plane import NEAR
 from snowsplat.scene.origin import Origin
 
@@ -82,6 +82,11 @@ class Camera:
     def to(self, device: torch.device) -> Camera:
         """This camera with its pose on ``device``, as rendering on that device needs it."""
         return dataclasses.replace(self, cam_from_world=self.cam_from_world.to(device))
+
+    def transformed(self, change: Similarity) -> Camera:
+        """The camera that shows the same in the new world frame of ``change``."""
+        pose = change.apply_to_poses(self.cam_from_world)
+        return dataclasses.replace(self, cam_from_world=pose, near=change.scale * self.near)
 
     def seen_from(self, origin: Origin) -> Camera:
         """The same camera in a world frame whose 0 is at ``origin`` in this one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +14,8 @@ from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 from snowsplat.scene.origin import HERE, Origin, origin_of
+
+logger = logging.getLogger(__name__)
 
 # Directions on the sphere for `sh_rotation`. 16 determine degree 3; more are better conditioned.
 _DIRECTIONS = 64
@@ -65,6 +68,20 @@ def seen_from(gaussians: Gaussians, origin: Origin) -> Gaussians:
         gaussians.means.dtype
     )
     return replace(gaussians, means=means, origin=origin)
+
+
+def seen_from_dataset(gaussians: Gaussians, origin: Origin) -> Gaussians:
+    """`seen_from` the origin of the dataset with which the scene was trained.
+
+    Other programs do not write the origin of a file that they save. Positions without an origin
+    that are nearer to 0 than to that of the dataset are therefore relative to it already.
+    """
+    if gaussians.origin == HERE and any(origin) and len(gaussians):
+        middle = gaussians.means.detach().nanmedian(0).values.double().cpu()
+        if middle.norm() < (middle - torch.tensor(origin, dtype=torch.float64)).norm():
+            logger.info("the scene has no origin; its positions are relative to its dataset")
+            return replace(gaussians, origin=origin)
+    return seen_from(gaussians, origin)
 
 
 def sh_rotation(rotation: Tensor, degree: int) -> list[Tensor]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.scene.near_plane import near_plane
+from snowsplat.scene.near_plane import near_of_overview
 
 # Distance of the camera of `overview` from the middle, relative to the radius that it shows.
 _OVERVIEW_DISTANCE = 2.77
@@ -44,7 +44,7 @@ class InitialView:
             for point in (self.position, self.target, (0.0, -1.0, 0.0))
         )
         pose = look_at(position, target, up)
-        near = near_plane(float((target - position).norm()))
+        near = near_of_overview(float((target - position).norm()))
         return Camera(width, height, focal, focal, width / 2, height / 2, pose, near)
 
     def with_aspect(self, aspect: float) -> InitialView:

@@ -19,6 +19,17 @@ _USUAL_DISTANCE = 2.8
 # What is nearer than nearly everything is at least this many times as far as the near plane.
 _NEAREST = 3.0
 
+# For a scene whose cameras are not known, relative to the distance of its middle.
+_OF_DISTANCE = 0.05
+
+
+def near_of_overview(distance: float) -> float:
+    """The near plane of a camera that shows a scene from ``distance``, in world units.
+
+    Such a scene is rendered as it is, so no compatibility with a training asks for `NEAR`.
+    """
+    return _OF_DISTANCE * distance if 0 < distance < math.inf else NEAR
+
 
 def near_plane(distance: float, nearest: float | None = None) -> float:
     """The depth below which no Gaussian is drawn, in world units.

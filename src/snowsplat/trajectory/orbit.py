@@ -11,7 +11,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
-from snowsplat.scene.near_plane import near_plane
+from snowsplat.scene.near_plane import near_of_overview
 from snowsplat.trajectory.focus import (
     DEFAULT_UP,
     focus_of,
@@ -153,7 +153,7 @@ def orbit_path(
     elevation = math.radians(15)
     focal = 1.2 * min(width, height)
     pose = look_at(focus - torch.tensor([0.0, 0.0, radius]), focus, DEFAULT_UP)
-    near = near_plane(radius)
+    near = near_of_overview(radius)
     lens = Camera(width, height, focal, focal, width / 2, height / 2, pose, near)
 
     def circle(t: Tensor) -> Tensor:

@@ -4,16 +4,21 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from snowsplat.data import load_dataset
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.near_plane import NEAR
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.viewer.live.key_cameras import KeyCameras
 from snowsplat.viewer.live.session import MOVE_SECONDS
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
+from ...training.test_unit import scaled
 from ..clients import Visitor, camera, frame, upgrade
 
 pytestmark = pytest.mark.slow
@@ -115,3 +120,36 @@ def test_a_browser_that_receives_slowly_gets_the_newest_images(tmp_path):
             wait(lambda: seen.on_the_way == 0)
     finally:
         viewer.close()
+
+
+def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
+    """Its keys, near plane and limits of distances are absolute, so its unit is not the world's."""
+    usual = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
+    starts, images = [], []
+    for factor in (1.0, 2.0**-13, 2.0**13):
+        dataset = scaled(usual, factor)
+        viewer = NetworkViewer(dataset)
+        try:
+            start = viewer.server.initial_camera
+            starts.append(np.concatenate([start.position, start.look_at]))
+            with Visitor(viewer.url) as visitor:
+                visitor.send_camera()
+                wait(lambda on=viewer: [v for v in on.session._visitors.values() if v.pose])
+                (seen,) = viewer.session._visitors.values()
+                (browser,) = viewer._browsers.values()
+                keys = KeyCameras(browser.client, seen, viewer._world_from_page)
+                keys.store()
+                near = factor * usual.train[0].camera.near
+                assert keys.cameras[0].position.tolist() == [0.0, 0.0, -3.0 * (near / NEAR)]
+                assert keys.cameras[0].near == near
+                box = (-9.0, -9.0, -9.0), (0.0, 9.0, 9.0)
+                viewer.session.change(seen, display=replace(seen.display, crop=box))
+                request = viewer.session.next_request(0, False)
+                gaussians = Gaussians.from_points(dataset.points)
+                images.append(viewer._draw(request, gaussians).astype(int))
+        finally:
+            viewer.close()
+    for start, image in zip(starts[1:], images[1:], strict=True):
+        np.testing.assert_array_equal(start, starts[0])
+        assert images[0].std() > 5
+        assert np.abs(image - images[0]).max() <= 1

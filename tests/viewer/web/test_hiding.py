@@ -57,7 +57,10 @@ def test_floaters_are_hidden_at_first_without_cameras():
     largest, least = scene.hiding.size
     limit = largest * (least / largest) ** (scene.hiding.start / 100)
     assert 0.1 * scene.stops.radius <= limit < 0.5
-    assert scene.panel(Description("x"), "")["hiding"]["start"] == [0, scene.hiding.start]
+    assert scene.bootstrap(Description("x"), "")["panel"]["hiding"]["start"] == [
+        0,
+        scene.hiding.start,
+    ]
 
 
 def test_few_gaussians_are_hidden_at_first():

@@ -34,6 +34,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
+from snowsplat.formats.origin_file import origin_file, read_origin, write_origin
+from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import (
     atomic_path,
@@ -71,7 +73,15 @@ _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
 _RESULTS = ("point_cloud", "checkpoints", "refined", "train", "test", "videos", "films", "masks")
 _REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html")
-_FILES = ("cfg_args", "config.json", "cameras.json", "input.ply", *_REPORTS)
+_CAMERAS = "cameras.json"
+_FILES = (
+    "cfg_args",
+    "config.json",
+    _CAMERAS,
+    origin_file(Path(_CAMERAS)).name,
+    "input.ply",
+    *_REPORTS,
+)
 
 
 @dataclass(frozen=True)
@@ -185,6 +195,7 @@ class OutputFolder:
             points = dataset.points
             write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
         self.write_cameras([*dataset.train, *dataset.test])
+        write_origin(self.path / _CAMERAS, dataset.origin)
 
     def write_cameras(self, views: Sequence[View]) -> None:
         """Write `cameras.json`."""
@@ -196,7 +207,12 @@ class OutputFolder:
             for view in views
             for part in [view.image.view]
         )
-        write_cameras(self.path / "cameras.json", cameras)
+        write_cameras(self.path / _CAMERAS, cameras)
+
+    def origin(self) -> Origin | None:
+        """That of `cameras.json`; None if the cameras are in the world, or it is not known."""
+        origin = read_origin(self.path / _CAMERAS)
+        return origin if any(origin) else None
 
     def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:
         """Write `config.json` and `cfg_args`; remove unfinished files of a killed process."""

@@ -18,7 +18,7 @@ from snowsplat.pipeline.output.scene_paths import (
 from snowsplat.pipeline.run.refined_cameras import with_refined
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
-from snowsplat.scene.edit import seen_from
+from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 
@@ -65,7 +65,7 @@ def load_trained(
     folder = existing_folder(Path(output))
     data, background = load_dataset_of(folder, dataset, resolution)
     found, gaussians = folder.read_scene(iteration)
-    gaussians = seen_from(gaussians, data.origin).to((compute or Compute()).apply())
+    gaussians = seen_from_dataset(gaussians, data.origin).to((compute or Compute()).apply())
     return TrainedScene(folder, found, gaussians, data, background)
 
 
@@ -92,6 +92,12 @@ def cameras_of(folder: OutputFolder) -> list[Camera]:
     """
     file = folder.path / "cameras.json"
     return read_cameras(file)[1] if file.is_file() else []
+
+
+def seen_by_cameras(gaussians: Gaussians, folder: OutputFolder) -> Gaussians:
+    """The scene relative to the origin of the cameras of the training in ``folder``."""
+    origin = folder.origin()
+    return gaussians if origin is None else seen_from_dataset(gaussians, origin)
 
 
 def background_of(folder: OutputFolder) -> Color:
@@ -131,4 +137,5 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
             raise UserError("`iteration` selects a scene of an output folder; leave it out")
         file, gaussians = path, read_gaussians(path)
         folder = folder_around(path)
+    gaussians = seen_by_cameras(gaussians, folder)
     return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))

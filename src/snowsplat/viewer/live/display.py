@@ -11,7 +11,6 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, rotation_from_quat
-from snowsplat.scene.near_plane import NEAR
 
 Mode = Literal["color", "depth", "alpha", "normals", "points", "ellipsoids", "cost", "error"]
 
@@ -27,7 +26,8 @@ class DisplaySettings:
     mode: Mode = "color"
     sh_degree: int = 3  # degree of the spherical harmonics that are used for colours
     scale: float = 1.0  # factor on the size of every Gaussian
-    # Lower and upper corner (x, y, z, world) of a box; Gaussians outside are hidden.
+    # Lower and upper corner (x, y, z) of a box; Gaussians outside are hidden. That of a visitor is
+    # in the frame of the page, see `NetworkViewer`; `draw` needs one in the world.
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     # Fraction of the width, from the left, in which the photo covers the rendering.
     wipe: float = 0.0
@@ -35,23 +35,22 @@ class DisplaySettings:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """The camera pose of a browser."""
+    """The camera pose of a browser, in the frame of the page; see `NetworkViewer`."""
 
     # (4,) wxyz, float64, rotation of world_from_cam; x right, y down, z forward.
     quat: Tensor = field(repr=False)
-    position: Tensor  # (3,) float64, camera centre in the world frame
+    position: Tensor  # (3,) float64, camera centre
     fov: float  # vertical field of view in radians
     # width, height: size of the window in pixels.
     width: int
     height: int
-    near: float = NEAR  # the near plane, in world units
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of an image of this size."""
         focal = 0.5 * height / math.tan(0.5 * min(max(self.fov, _NARROWEST), _WIDEST))
         pose = torch.cat([rotation_from_quat(self.quat), self.position[:, None]], 1)
         cx, cy = 0.5 * width, 0.5 * height
-        return Camera(width, height, focal, focal, cx, cy, invert_rigid(pose), self.near)
+        return Camera(width, height, focal, focal, cx, cy, invert_rigid(pose))
 
     def is_near(self, other: Pose) -> bool:
         """Whether both are the same pose, except for rounding in the browser."""

@@ -10,6 +10,7 @@ import viser
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import entries_of
+from snowsplat.scene.geometry import Similarity
 from snowsplat.viewer.live.controls import in_server_thread, note
 from snowsplat.viewer.live.session import Visitor
 
@@ -20,11 +21,17 @@ _NONE = "Store two or more views to make a video."
 
 
 class KeyCameras:
-    """The views that a user has stored in one browser, and the buttons for them."""
+    """The views that a user has stored in one browser, and the buttons for them.
 
-    def __init__(self, client: viser.ClientHandle, visitor: Visitor) -> None:
+    Attributes:
+        cameras: the views, in the world.
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, visitor: Visitor, world_from_page: Similarity
+    ) -> None:
         self.cameras: list[Camera] = []
-        self._client, self._visitor = client, visitor
+        self._client, self._visitor, self._world_from_page = client, visitor, world_from_page
         self._sent = -math.inf
         gui = client.gui
         with gui.add_folder("Video", order=4, expand_by_default=False):
@@ -46,7 +53,8 @@ class KeyCameras:
         """Store the current view of the browser."""
         pose = self._visitor.pose
         if pose is not None and len(self.cameras) < _MAX_VIEWS:
-            self.cameras.append(pose.camera(pose.width, pose.height))
+            camera = pose.camera(pose.width, pose.height)
+            self.cameras.append(camera.transformed(self._world_from_page))
             self._show()
 
     def remove_last(self) -> None:

@@ -57,7 +57,8 @@ class Photos:
     ) -> None:
         """
         Args:
-            extent: extent of the scene, in world units.
+            train, test: with cameras in the frame of the page, see `NetworkViewer`.
+            extent: extent of the scene in that frame.
             centre: (3,) centre of the scene, around which a browser rotates.
             background: (3,) colour behind transparent photos, 0..1.
         """
@@ -150,7 +151,7 @@ class Photos:
         placed = PhotoRectangle.within(camera, width, height).camera(camera, width, height)
         pose = camera.world_from_cam.detach().to(torch.float64)
         fov = 2.0 * math.atan(0.5 * height / placed.fy)
-        return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height, camera.near)
+        return Pose(quat_from_rotation(pose[:, :3]), pose[:, 3], fov, width, height)
 
     def _look_at(self, camera: Camera) -> Tensor:
         """The point on the optical axis, in front of the camera, nearest to the scene centre."""

@@ -7,7 +7,7 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ import viser
 
 from snowsplat.data import Dataset
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.near_plane import NEAR
 from snowsplat.viewer.live.controls import Controls, ScenePanel
 from snowsplat.viewer.live.display import Pose
 from snowsplat.viewer.live.guard import (
@@ -70,6 +72,9 @@ class NetworkViewer:
     Attributes:
         others: the addresses of the page for other machines, if they differ from `url`.
 
+    In the page, the keys move the camera at a fixed speed, and distances have fixed limits. So its
+    frame is the world in another unit, a power of two, in which the near plane is the usual one.
+
     Images are rendered only in the thread that calls `serve` or `show_newest`. So the Gaussians do
     not change during rendering, and no copy of them is needed.
     """
@@ -98,17 +103,20 @@ class NetworkViewer:
         """
         self.session = Session()
         self.background = torch.tensor(background, dtype=torch.float32)
-        self._bounds = dataset.bounds
-        self._near = (dataset.train or dataset.test)[0].camera.near
+        views = [*dataset.train, *dataset.test]
+        self._world_from_page = replace(Similarity.identity(), scale=views[0].camera.near / NEAR)
+        change = self._world_from_page.inverse()
+        views = [replace(view, camera=view.camera.transformed(change)) for view in views]
+        self._bounds = change.apply(dataset.bounds)
         running = start_server(host, port, label, allow_host)
         self.server, self.url, self.others = running.server, running.url, running.others
         set_theme(self.server.gui, dark=True)
         self._photos = Photos(
             self.server,
             self.session,
-            dataset.train,
-            dataset.test,
-            dataset.extent,
+            views[: len(dataset.train)],
+            views[len(dataset.train) :],
+            change.scale * dataset.extent,
             self._bounds.mean(0),
             self.background,
         )
@@ -130,7 +138,7 @@ class NetworkViewer:
     async def _entered(self, client: viser.ClientHandle) -> None:
         visitor = self.session.enter(client.client_id)
         controls = Controls(client, self.session, visitor, self._photos, self._bounds)
-        KeyCameras(client, visitor)
+        KeyCameras(client, visitor, self._world_from_page)
         Shortcuts(client, controls, self._bounds)
         connection = current_connection.get()
         connection.on_arrival = functools.partial(self.session.arrived, visitor)
@@ -148,7 +156,7 @@ class NetworkViewer:
                 move(pose)
 
         async def moved(camera: viser.CameraHandle) -> None:
-            pose = _pose(camera, self._near)
+            pose = _pose(camera)
             if pose is not None:
                 move(pose)
 
@@ -205,12 +213,18 @@ class NetworkViewer:
         return True
 
     def _draw(self, request: RenderRequest, gaussians: Gaussians) -> np.ndarray:
+        width, height, display, photo = request.width, request.height, request.display, None
         if request.photo_view is None:
-            camera = request.pose.camera(request.width, request.height)
-            return draw(gaussians, camera, request.display, self.background)
-        photo = fitted_photo(request.photo_view, request.width, request.height)
-        camera = photo.placed.camera(request.photo_view.camera, request.width, request.height)
-        return draw(gaussians, camera, request.display, self.background, photo)
+            camera = request.pose.camera(width, height)
+        else:
+            photo = fitted_photo(request.photo_view, width, height)
+            camera = photo.placed.camera(request.photo_view.camera, width, height)
+        if display.crop is not None:
+            box = self._world_from_page.apply(torch.tensor(display.crop, dtype=torch.float64))
+            (x, y, z), (u, v, w) = box.tolist()
+            display = replace(display, crop=((x, y, z), (u, v, w)))
+        camera = camera.transformed(self._world_from_page)
+        return draw(gaussians, camera, display, self.background, photo)
 
     def wait(self) -> None:
         """Wait for a change, or a fraction of a second."""
@@ -233,7 +247,7 @@ class NetworkViewer:
                 self.wait()
 
 
-def _pose(camera: viser.CameraHandle, near: float) -> Pose | None:
+def _pose(camera: viser.CameraHandle) -> Pose | None:
     """The pose of a browser; None if it is not valid."""
     quat, position = torch.from_numpy(camera.wxyz.copy()), torch.from_numpy(camera.position.copy())
     turned = _SMALL < float(quat.norm()) < 1.0 / _SMALL
@@ -242,4 +256,4 @@ def _pose(camera: viser.CameraHandle, near: float) -> Pose | None:
         return None
     if not camera.fov > 0:
         return None
-    return Pose(quat, position, camera.fov, camera.image_width, camera.image_height, near)
+    return Pose(quat, position, camera.fov, camera.image_width, camera.image_height)

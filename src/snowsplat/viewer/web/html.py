@@ -61,12 +61,7 @@ def write_html(path: Path | str, scene: ReadyScene, about: Description | None = 
             "decimate them, or drop SH degrees"
         )
     pictures = f"data:image/webp;base64,{_base64(scene.stops.pictures)}"
-    bootstrap = {
-        "settings": scene.settings(),
-        "contentFilename": "scene.compressed.ply",
-        "antialiased": scene.gaussians.antialiased,
-        "panel": scene.panel(about, pictures),
-    }
+    bootstrap = scene.bootstrap(about, pictures) | {"contentFilename": "scene.compressed.ply"}
     write_text(path, whole_page(about.title, bootstrap, _SCENE.format(scene=_base64(content))))
 
 

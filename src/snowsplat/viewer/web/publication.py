@@ -68,13 +68,8 @@ def write_site(
     for name in ("index.css", "index.js"):
         write_text(folder / name, asset(name))
     write_text(folder / "viewer-licence.txt", asset("LICENSE"))
-    bootstrap = {
-        "settings": scene.settings(),
-        "contentUrl": f"./{content}",
-        "posterUrl": f"./{POSTER}",
-        "antialiased": scene.gaussians.antialiased,
-        "panel": scene.panel(about, f"./{PICTURES}"),
-    }
+    bootstrap = scene.bootstrap(about, f"./{PICTURES}")
+    bootstrap |= {"contentUrl": f"./{content}", "posterUrl": f"./{POSTER}"}
     tags = _tags(
         {
             "og:type": "website",

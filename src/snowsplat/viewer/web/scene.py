@@ -30,7 +30,7 @@ from snowsplat.viewer.web.hiding import Hiding, hiding_of
 from snowsplat.viewer.web.panel import Description, panel_settings
 from snowsplat.viewer.web.served_file import FileOnDisk, Served, ServedFile
 from snowsplat.viewer.web.stops import Stops, stops_of
-from snowsplat.viewer.web.viewer_page import asset, content_policy, page, settings
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page, script, settings
 
 _SCENE = "scene.compressed.ply"
 _TYPES = {".json": "application/json", ".webp": "image/webp"}
@@ -59,24 +59,23 @@ def site(
     Args:
         levels: returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
             loads instead of the complete scene.
-        count: the number of Gaussians, if ``gaussians`` is only a coarse level; then the frame
-            stays that of the levels.
+        count: the number of Gaussians, if ``gaussians`` is only a coarse level. Then the levels
+            stay as they are, and the page only scales them.
     """
-    scene = ready(gaussians, cameras, background, in_place=count is not None)
+    in_place = count is not None
+    scene = ready(gaussians, cameras, background, turn=not in_place)
     if levels is not None:
         scene = scene.complete()
     content = _content(scene.gaussians, levels)
-    bootstrap = {
-        "settings": scene.settings(),
-        "contentUrl": f"./{next(iter(content))}",
-        "antialiased": scene.gaussians.antialiased,
-        "panel": scene.panel(about, f"./{PICTURES}", count),
-    }
+    bootstrap = scene.bootstrap(about, f"./{PICTURES}", count)
+    bootstrap["contentUrl"] = f"./{next(iter(content))}"
     index = page(f"{about.title} - snowsplat", bootstrap)
     files: dict[str, Served] = {
         "": ServedFile(index.encode(), "text/html; charset=utf-8"),
         "index.css": ServedFile(asset("index.css").encode(), "text/css; charset=utf-8"),
-        "index.js": ServedFile(asset("index.js").encode(), "text/javascript; charset=utf-8"),
+        "index.js": ServedFile(
+            script(scene.scale if in_place else 1.0).encode(), "text/javascript; charset=utf-8"
+        ),
         **content,
     }
     if scene.stops.views:
@@ -112,25 +111,31 @@ class ReadyScene(NamedTuple):
     stops: Stops  # views of some of the photos, and the subject of the scene
     background: Sequence[float]  # red, green, blue in 0..1
     hiding: Hiding  # what the page can hide
+    scale: float  # of the frame, relative to that of the scene that was given
 
     def complete(self) -> ReadyScene:
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
         return self._replace(hiding=replace(self.hiding, start=0))
 
-    def settings(self) -> dict[str, Any]:
-        """The settings of the viewer."""
-        return settings(self.start, self.background, self.film)
+    def bootstrap(
+        self, about: Description, pictures: str, count: int | None = None
+    ) -> dict[str, Any]:
+        """What `page` needs, except for the address of the scene.
 
-    def panel(self, about: Description, pictures: str, count: int | None = None) -> dict[str, Any]:
-        """What the panel shows; ``pictures`` is the address of the pictures of the stops.
-
-        ``count``: of the Gaussians, if those here are only a coarse level.
+        Args:
+            pictures: the address of the pictures of the stops.
+            count: the number of Gaussians, if those here are only a coarse level.
         """
         subject = self.stops.middle.tolist(), self.stops.radius
         count = count or len(self.gaussians)
-        return panel_settings(
-            about, count, self.start, subject, self.stops.views, pictures, self.hiding
-        )
+        stops = self.stops.views
+        return {
+            "settings": settings(self.start, self.background, self.film),
+            "antialiased": self.gaussians.antialiased,
+            "panel": panel_settings(
+                about, count, self.start, subject, stops, pictures, self.hiding
+            ),
+        }
 
 
 def ready(
@@ -138,43 +143,39 @@ def ready(
     cameras: Sequence[Camera],
     background: Sequence[float] = (0.0, 0.0, 0.0),
     *,
-    in_place: bool = False,
+    turn: bool = True,
 ) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
     Without cameras, the surfaces may imply another up direction, and the distance is that of
-    the `overview`. If the scene must stay ``in_place`` (only without cameras), it is unchanged.
+    the `overview`. Without ``turn`` (only without cameras), the scene is only scaled.
     """
     if not cameras:
-        if not in_place:
-            up = up_of_surfaces(*_surfaces(gaussians))
-            view = overview(gaussians)
-            depth = math.dist(view.position, view.target)
-            level = _viewing_frame(_UP if up is None else up, depth, _TOO_FAR)
-            gaussians = gaussians if level is None else transform(gaussians, level)
+        up = up_of_surfaces(*_surfaces(gaussians)) if turn else None
+        view = overview(gaussians)
+        depth = math.dist(view.position, view.target)
+        change = _viewing_frame(_UP if up is None else up, depth, _TOO_FAR)
+        if change is not None:
+            gaussians = transform(gaussians, change)
+        scale = change.scale if change else 1.0
         stops = stops_of(gaussians, (), 1.0, background)
         hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=True)
-        return ReadyScene(gaussians, overview(gaussians), [], stops, background, hiding)
+        start = overview(gaussians)
+        return ReadyScene(gaussians, start, [], stops, background, hiding, scale)
     depth = _depth_ahead(gaussians, cameras[0])
     rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
     change = _viewing_frame(scene_up(rotations.numpy()), depth)
     if change is not None:
         gaussians = transform(gaussians, change)
         depth *= change.scale
-        cameras = [
-            replace(
-                camera,
-                cam_from_world=change.apply_to_poses(camera.cam_from_world),
-                near=change.scale * camera.near,
-            )
-            for camera in cameras
-        ]
+        cameras = [camera.transformed(change) for camera in cameras]
     stops = stops_of(gaussians, cameras, depth, background)
     hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=False)
     film = _film(cameras, depth)
-    return ReadyScene(gaussians, stops.views[0], film, stops, background, hiding)
+    scale = change.scale if change else 1.0
+    return ReadyScene(gaussians, stops.views[0], film, stops, background, hiding, scale)
 
 
 def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:

@@ -27,6 +27,8 @@ FILM_SECONDS = 20.0
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
 _CREATE = "createViewer({ container: document.body, settings, ...options });"
+# Where the viewer places the scene that it has loaded.
+_PLACED = "entity.setLocalEulerAngles(0, 0, 180);"
 # Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
 _HANDLER = re.compile(r' on[a-z]+=\\"([^"\\]*)\\"')
 _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOTALL)
@@ -44,6 +46,19 @@ def asset(name: str) -> str:
         raise UserError(
             f"{_FOLDER / name}: the viewer's page is missing; in a checkout, run make native"
         ) from None
+
+
+def script(scale: float = 1.0) -> str:
+    """index.js, which shows the files of the scene ``scale`` times as large as they say.
+
+    Raises:
+        UserError: see `asset`.
+    """
+    text = asset("index.js")
+    if scale == 1:
+        return text
+    larger = f"entity.setLocalScale({scale}, {scale}, {scale});"
+    return _replaced(text, _PLACED, f"{_PLACED} {larger}")
 
 
 def settings(
