@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import pycolmap
 
 from snowsplat.sfm.colmap.consistency import (
+    CONSISTENT,
     CheckedPair,
+    agreement_of_model,
     check_pairs,
     find_parts,
     unconfirmed_photos,
@@ -108,15 +110,18 @@ def _registered_again(
     model: pycolmap.Reconstruction, mapping: Mapping, parts: Sequence[set[int]], max_error: float
 ) -> list[pycolmap.Reconstruction]:
     """``model`` after the photos of all parts but the first were registered again, as the only
-    entry; none if not all of them could be, or if parts still contradict each other."""
+    entry; none if not all of them could be, if parts still contradict each other, or if the model
+    does not agree with its matches: false ones may have bent it."""
     rest = mapping.without(copy.deepcopy(model), set().union(*parts[1:]))
     if rest.num_reg_images() < MIN_PHOTOS:
         return []
     again = mapping.extend([rest], relaxed=False)[0]
     if again.num_reg_images() < model.num_reg_images():
         return []
-    left = find_parts(check_pairs(again, mapping.database, max_error))
-    return [again] if len(left) < 2 else []
+    if len(find_parts(check_pairs(again, mapping.database, max_error))) > 1:
+        return []
+    agreement = agreement_of_model(again, mapping.database, max_error)
+    return [again] if agreement >= CONSISTENT else []
 
 
 def _made_again(
