@@ -103,6 +103,26 @@ def test_photos_that_do_not_determine_the_focal_length_keep_that_of_exif(tmp_pat
     assert found.model.cameras[1].mean_focal_length() == 500.0
 
 
+def test_photos_that_do_not_determine_two_focal_lengths_get_one(tmp_path):
+    walk = walks.facing()
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens())
+    assert abs(model.cameras[1].focal_length_x / model.cameras[1].focal_length_y - 1) > 0.005
+    found = settled(model, walk.photos(500.0), Lens(), refine)
+    assert found.model.cameras[1].model_name == "RADIAL"
+    assert not found.held
+
+
+def test_pixels_that_are_not_square(tmp_path):
+    """Such as those of an anamorphic video: the photos decide."""
+    walk = walks.sideways()
+    for pixels in walk.pixels:
+        pixels[:, 0] *= 1.2
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens())
+    found = settled(model, walk.photos(500.0), Lens(), refine)
+    camera = found.model.cameras[1]
+    assert camera.focal_length_x / camera.focal_length_y == pytest.approx(1.2, abs=0.01)
+
+
 @pytest.mark.parametrize("exif", [250.0, 1000.0])
 def test_a_wrong_focal_length_in_exif_is_told(tmp_path, exif):
     walk = walks.sideways()

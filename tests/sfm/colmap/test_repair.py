@@ -38,6 +38,12 @@ def mapping(tmp_path, scene):
     return Mapping(database, tmp_path, 1.0, 1, silent)
 
 
+@pytest.fixture
+def made_anew(monkeypatch):
+    """A new model is made at once; the wrong photos are not first registered again."""
+    monkeypatch.setattr("snowsplat.sfm.colmap.repair._registered_again", lambda *_: [])
+
+
 def state_of(model):
     poses = {i: model.image(i).cam_from_world().matrix().tolist() for i in model.reg_image_ids()}
     points = {i: (p.xyz.tolist(), str(p.track)) for i, p in model.points3D.items()}
@@ -63,7 +69,10 @@ def test_a_correct_model_is_not_changed(mapping, scene):
     assert (repaired.contradicting, repaired.left_out, repaired.description) == (0, {}, "")
 
 
-def test_a_folded_part_is_registered_again(mapping, scene):
+@pytest.mark.parametrize("anew", [False, True], ids=["in the model", "in a new model"])
+def test_a_folded_part_is_registered_again(mapping, scene, monkeypatch, anew):
+    wrong = "_registered_again" if anew else "_made_again"
+    monkeypatch.setattr(f"snowsplat.sfm.colmap.repair.{wrong}", lambda *_: [])
     model = look_alikes.model(scene, folded=True)
     assert largest_centre_error(model, scene) > 5
     repaired = repair(model, mapping, 4.0)
@@ -127,7 +136,9 @@ def test_the_same_model_is_repaired_in_the_same_way(mapping, scene):
     assert state_of(first)[0] == state_of(second)[0]
 
 
-def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, scene, monkeypatch):
+def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(
+    mapping, scene, monkeypatch, made_anew
+):
     monkeypatch.setattr(Mapping, "run", lambda self, mapper: [])
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
@@ -142,7 +153,7 @@ def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(mapping, sce
     )
 
 
-def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp_path):
+def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp_path, made_anew):
     """A model of COLMAP does not contain photos that have no matches with others any more."""
 
     def drop(self, mapper):
@@ -157,7 +168,7 @@ def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp
     assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
 
 
-def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch):
+def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch, made_anew):
     made = []
 
     def fold_again(self, mapper):
@@ -172,7 +183,7 @@ def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypat
     assert len(repaired.left_out) == len(FAR)
 
 
-def test_a_photo_may_be_in_a_later_model_only(mapping, scene, monkeypatch, tmp_path):
+def test_a_photo_may_be_in_a_later_model_only(mapping, scene, monkeypatch, tmp_path, made_anew):
     first = mapping.without(look_alikes.model(scene, folded=True), [look_alikes.COUNT])
     first.write(tmp_path)
     first = pycolmap.Reconstruction(tmp_path)
@@ -211,7 +222,7 @@ def test_a_photo_that_no_other_photo_confirms_is_left_out(mapping, scene, monkey
     )
 
 
-def test_the_model_with_the_most_photos_is_used(mapping, scene, monkeypatch):
+def test_the_model_with_the_most_photos_is_used(mapping, scene, monkeypatch, made_anew):
     """A model made again may have fewer photos than the first one without its wrong photos."""
     few = look_alikes.COUNT - len(FAR) - 1
 

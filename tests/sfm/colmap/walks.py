@@ -82,6 +82,17 @@ def sideways(count: int = 12, points: int = 1500, lens: PhoneLens | FisheyeLens 
     return _walk(xyz, centres, turns, random, reach=100.0, lens=lens)
 
 
+def facing(count: int = 12) -> Walk:
+    """Steps to all sides before a wall, without turns: fx and fy are hardly determined."""
+    random = np.random.default_rng(2)
+    xyz = random.uniform([-5, -4, 6], [5, 4, 9], (300, 3))
+    centres = np.concatenate([random.uniform(-1.2, 1.2, (count, 2)), np.zeros((count, 1))], 1)
+    walk = _walk(xyz, centres, 0.01 * random.normal(size=(count, 3)), random, reach=100.0)
+    for pixels in walk.pixels:
+        pixels += random.normal(0, 0.6, pixels.shape)
+    return walk
+
+
 def zoomed(walk: Walk, zooms: np.ndarray) -> Walk:
     """``walk`` with photos of other focal lengths: ``zooms`` (N,) times `FOCAL`."""
     middle = np.array([WIDTH / 2, HEIGHT / 2])

@@ -7,7 +7,8 @@ with what is known about lenses (`lens_findings`), and with the focal length in 
 
 An estimate in doubt is compared with a model whose focal length is held (`settled`). If this model
 agrees equally well with the matches, then the photos do not determine the focal length, and the
-held one is better. Otherwise the photos contradict it, and the estimate is right.
+held one is better. Otherwise the photos contradict it, and the estimate is right. In the same way,
+a lens with one focal length is tried if the two of OPENCV differ: pixels are square.
 """
 
 from __future__ import annotations
@@ -57,6 +58,9 @@ _MAX_MOUSTACHE = 0.02
 _EQUAL_ERROR = 0.05
 # A possible lens is used instead of an impossible one up to this factor between the errors.
 _MAX_WORSE = 2.0
+# fx and fy are in doubt if they differ by more than this share. Sensors have square pixels within
+# 0.1%; where photos determine both, the estimates differ by less than that, too.
+_SQUARE = 0.005
 # The estimated focal length is in doubt if it differs from that in EXIF by more than this share.
 _NEAR_EXIF = 0.1
 
@@ -170,13 +174,13 @@ def with_all_parameters(
 
 
 def _converted(camera: pycolmap.Camera, model: str) -> pycolmap.Camera:
-    """A camera with a fisheye lens in another ``model``, which is the same or more detailed."""
+    """A camera in another ``model``; of the coefficients, those that both models have first."""
     size, focal = (camera.width, camera.height), camera.mean_focal_length()
     made = pycolmap.Camera.create_from_model_name(camera.camera_id, model, focal, *size)
     params = made.params.copy()
     params[list(made.principal_point_idxs())] = camera.principal_point_x, camera.principal_point_y
     for target, source in zip(made.extra_params_idxs(), camera.extra_params_idxs(), strict=False):
-        params[target] = camera.params[source]  # the first coefficient is that of θ³ in all models
+        params[target] = camera.params[source]  # the first coefficient is that of θ³, or of r²
     made.params = params
     return made
 
@@ -338,6 +342,8 @@ def settled(
     """
     known = exif_focals(photos)
     if not (lens.held or _doubts(model, known)):
+        model = _with_square_pixels(model, lens, refine)
+    if not (lens.held or _doubts(model, known)):
         return Settled(model, False, [])
 
     def refined(held: bool) -> pycolmap.Reconstruction:
@@ -349,7 +355,7 @@ def settled(
                 break
         return made
 
-    free, held = refined(False), refined(True)
+    free, held = _with_square_pixels(refined(False), lens, refine), refined(True)
     ratio = misfit(held) / misfit(free)
     if not _impossible(held) and ratio <= 1 + _EQUAL_ERROR:
         return Settled(held, True, [])
@@ -358,6 +364,29 @@ def settled(
     if not _impossible(held) and ratio <= _MAX_WORSE:
         return Settled(held, True, [])
     return Settled(None, False, _doubts(free, known))
+
+
+def _with_square_pixels(
+    model: pycolmap.Reconstruction, lens: Lens, refine: Refine
+) -> pycolmap.Reconstruction:
+    """``model`` with one focal length in cameras whose two differ, if it agrees equally well.
+
+    A camera model that the user has stated is kept.
+    """
+    unequal = {}
+    for number in _used(model):
+        camera = model.cameras[number]
+        ratio = camera.focal_length_x / camera.focal_length_y
+        if lens.model == "auto" and camera.model_name == "OPENCV" and abs(ratio - 1) > _SQUARE:
+            unequal[number] = _converted(camera, "RADIAL")
+    if not unequal:
+        return model
+    made = refine(copy.deepcopy(model), list(unequal.values()), False)
+    # The errors of the photos of other cameras hardly change, so they do not count.
+    photos = [model.image(i).camera_id for i in model.reg_image_ids()]
+    share = sum(number in unequal for number in photos) / len(photos)
+    worse = misfit(made) > (1 + _EQUAL_ERROR * share) * misfit(model)
+    return model if worse or _impossible(made) else made
 
 
 def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:

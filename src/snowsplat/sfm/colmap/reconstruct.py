@@ -41,7 +41,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap import camera_groups
-from snowsplat.sfm.colmap.consistency import agreement_of_model
+from snowsplat.sfm.colmap.consistency import CONSISTENT, agreement_of_model
 from snowsplat.sfm.colmap.database import (
     fingerprint_of,
     forget_verification,
@@ -78,9 +78,6 @@ from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
-# A model is bent if its agreement is less than this (`agreement_of`). That of right models is 0.99
-# or more, and 0.94 in a room whose carpet repeats; of three bent ones, it is 0.61 to 0.79.
-_CONSISTENT = 0.93
 # The expected time from the start of the job to the end of the next attempt, divided by the time
 # from the start of the job until now.
 _NEXT_ATTEMPT = 3.0
@@ -191,7 +188,7 @@ class PoseEstimation:
         remove_database(second)
         zooms = "" if self.photos is given else camera_groups.describe(best.models[0])
         doubts = list(best.doubts)
-        if best.agreement < _CONSISTENT:
+        if best.agreement < CONSISTENT:
             doubts.append(
                 f"the poses may be bent: where they fit least, {best.agreement:.0%} of the matches "
                 "between neighbouring photos agree with them"
@@ -438,7 +435,7 @@ class PoseEstimation:
 
     def _good(self, evidence: Evidence) -> bool:
         """Whether enough photos are registered, in a model that agrees with its matches."""
-        consistent = self._best().agreement >= _CONSISTENT
+        consistent = self._best().agreement >= CONSISTENT
         return self._enough(evidence) and (consistent or self._late())
 
     def _enough(self, evidence: Evidence) -> bool:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import pycolmap
 
 from snowsplat.sfm.colmap.consistency import (
+    CONSISTENT,
     CheckedPair,
+    agreement_of_model,
     check_pairs,
     find_parts,
     unconfirmed_photos,
 )
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
-from snowsplat.sfm.colmap.mapping import Mapping
+from snowsplat.sfm.colmap.mapping import MIN_PHOTOS, Mapping
 
-_ROUNDS = 3  # the model is made again at most this number of times
+_ROUNDS = 3  # a new model is made at most this number of times
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,18 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     """Find the photos of ``model`` that are in a wrong place, and register them again.
 
     `find_parts` divides the photos into parts that contradict each other. The poses of all parts
-    except the first are wrong, so matches between photos of different parts are false if they agree
-    with these poses (`_false_pairs`). A new model is made without the false matches: they have
-    also bent the first part of the model. This is repeated until no part contradicts the others, at
-    most `_ROUNDS` times. Of all models, the one with the most photos is used. Its photos that
-    contradict the others, or that no other photo confirms, are left out.
+    except the first are wrong. There are two causes, and both mends are tried, in this order:
+
+    - A photo was registered with too few points, for example at a turn of the camera. The photos
+      after it then have wrong poses, too. They are registered again from the first part, which may
+      be on the other side of the weak place (`_registered_again`).
+    - Places look alike. Matches between photos of different parts are false if they agree with
+      the wrong poses (`_false_pairs`). A new model is made without the false matches: they have
+      also bent the first part of the model. This is repeated until no part contradicts the others,
+      at most `_ROUNDS` times.
+
+    Of all models, the one with the most photos is used. Its photos that contradict the others, or
+    that no other photo confirms, are left out.
 
     A model without contradictions is returned unchanged. ``max_error`` as in `check_pairs`.
     """
@@ -65,8 +75,10 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         wrong |= _doubts(model, pairs, doubtful) | _reasons(model, pairs, parts)
         if len(parts) < 2:
             break
-        false_pairs |= _false_pairs(pairs, parts)
-        models = _made_again(mapping, false_pairs) if len(found) <= _ROUNDS else []
+        models = _registered_again(model, mapping, parts, max_error) if len(found) == 1 else []
+        if not models and len(found) <= _ROUNDS:
+            false_pairs |= _false_pairs(pairs, parts)
+            models = _made_again(mapping, false_pairs)
         if not models:
             break
         model = models[0]
@@ -92,6 +104,24 @@ def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> l
         if len(others) == 1:
             return others
     return parts
+
+
+def _registered_again(
+    model: pycolmap.Reconstruction, mapping: Mapping, parts: Sequence[set[int]], max_error: float
+) -> list[pycolmap.Reconstruction]:
+    """``model`` after the photos of all parts but the first were registered again, as the only
+    entry; none if not all of them could be, if parts still contradict each other, or if the model
+    does not agree with its matches: false ones may have bent it."""
+    rest = mapping.without(copy.deepcopy(model), set().union(*parts[1:]))
+    if rest.num_reg_images() < MIN_PHOTOS:
+        return []
+    again = mapping.extend([rest], relaxed=False)[0]
+    if again.num_reg_images() < model.num_reg_images():
+        return []
+    if len(find_parts(check_pairs(again, mapping.database, max_error))) > 1:
+        return []
+    agreement = agreement_of_model(again, mapping.database, max_error)
+    return [again] if agreement >= CONSISTENT else []
 
 
 def _made_again(
