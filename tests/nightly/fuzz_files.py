@@ -30,6 +30,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 _GRACE = 60.0  # seconds that a process may use in addition, to start and to end
+_MEMORY = Path("/dev/shm")  # files in memory: on a disk, most of the time is spent waiting for it
 
 
 def main() -> int:
@@ -81,6 +82,7 @@ def _one(name: str, flags: argparse.Namespace, guided: bool) -> tuple[int, float
     command += ["--seconds", str(flags.seconds), "--seed", str(flags.seed)]
     command += ["--findings", str(flags.findings.absolute())]
     command += [] if guided else ["--random"]
+    memory = {"TMPDIR": str(_MEMORY)} if _MEMORY.is_dir() else {}
     note = flags.findings.absolute() / f"{_file_name(name)}.json"
     note.unlink(missing_ok=True)
     start = time.monotonic()
@@ -88,7 +90,11 @@ def _one(name: str, flags: argparse.Namespace, guided: bool) -> tuple[int, float
     with open(log, "wb") as output:
         try:
             code = subprocess.run(
-                command, stdout=output, stderr=output, timeout=flags.seconds + _GRACE
+                command,
+                stdout=output,
+                stderr=output,
+                timeout=flags.seconds + _GRACE,
+                env={**memory, **os.environ},
             ).returncode
         except subprocess.TimeoutExpired:
             code = -1

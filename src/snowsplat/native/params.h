@@ -399,7 +399,7 @@ struct ResampleParams {
   int64_t source_width;  // of the photo in pixels, below 2^16
   int64_t source_height;
   const uint8_t* source;  // (channels, source_height, source_width)
-  int64_t wraps;       // beside the photo: 0: its border, 1: its other side; then 0 <= x <= width
+  int64_t wraps;       // beside the photo: 0: its border, 1: its other side; then 0 <= x <= 3 width
   int64_t columns;     // of the nodes
   const float* nodes;  // (rows, columns, 2): x, y in pixels of the photo; NaN as (-inf, -inf)
   const int32_t* column;  // (width,), at most columns - 2

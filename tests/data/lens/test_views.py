@@ -92,8 +92,13 @@ def test_several_views_cover_the_photo_and_each_pixel_has_its_ray(name):
         for rows, found in view.strips(view.width, view.height):
             shown = view.covered(found) & np.isfinite(found).all(-1)
             x, y = np.arange(view.width) + 0.5, np.arange(view.height)[rows] + 0.5
-            true = position_of(view, x, y)
-            assert np.abs(found - true)[shown].max(initial=0) < 0.02  # pixels of the photo
+            difference = found - position_of(view, x, y)
+            if view.wraps:  # several turns are the same
+                turns = np.round(difference[..., 0] / lens.width)
+                assert found[..., 0].min() >= 0
+                difference[..., 0] -= turns * lens.width
+                found[..., 0] %= lens.width
+            assert np.abs(difference)[shown].max(initial=0) < 0.02  # pixels of the photo
             inside = (found[shown] / 10).astype(int)
             reached[
                 inside[:, 1].clip(0, len(reached) - 1), inside[:, 0].clip(0, reached.shape[1] - 1)

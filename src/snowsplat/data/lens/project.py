@@ -45,11 +45,14 @@ def intrinsics(lens: LensModel) -> tuple[float, float, float, float, tuple[float
 
 
 def project(lens: LensModel, rays: np.ndarray) -> np.ndarray:
-    """The pixels (..., 2) float64 of directions (..., 3), of any length, in OpenCV axes.
+    """The pixels (..., 2) of directions (..., 3), of any length, in OpenCV axes.
 
-    NaN where the model has no pixel. Positions outside of the photo are returned as they are.
+    float32 for directions in float32, otherwise float64. NaN where the model has no pixel.
+    Positions outside of the photo are returned as they are.
     """
-    rays = np.asarray(rays, np.float64)
+    rays = np.asarray(rays)
+    if rays.dtype != np.float32:
+        rays = rays.astype(np.float64)
     x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
     fx, fy, cx, cy, k = intrinsics(lens)
     with np.errstate(all="ignore"):
@@ -59,8 +62,9 @@ def project(lens: LensModel, rays: np.ndarray) -> np.ndarray:
             u, v = _fisheye(lens.model, k, x, y, z)
         else:
             u, v = _perspective(lens.model, k, x, y, z)
-        pixels = np.stack([fx * u + cx, fy * v + cy], -1)
-    pixels[~np.isfinite(pixels).all(-1)] = np.nan
+        u, v = fx * u + cx, fy * v + cy
+    pixels = np.stack([u, v], -1)
+    pixels[~(np.isfinite(u) & np.isfinite(v))] = np.nan
     return pixels
 
 

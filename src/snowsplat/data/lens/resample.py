@@ -97,6 +97,7 @@ def nearest(values: np.ndarray, view: LensView, width: int, height: int) -> np.n
     for rows, position in view.strips(width, height):
         shown = view.covered(position) & np.isfinite(position).all(-1)
         column, row = np.floor(position[shown] * scale).astype(np.int64).T
-        column, row = column.clip(0, values.shape[1] - 1), row.clip(0, values.shape[0] - 1)
+        column = column % values.shape[1] if view.wraps else column.clip(0, values.shape[1] - 1)
+        row = row.clip(0, values.shape[0] - 1)
         made[rows][shown] = values[row, column]
     return made

@@ -36,7 +36,7 @@ _FOLD = 0.05
 _LARGEST = 2.0
 # Share of the field that views must cover.
 _COVERED = 0.995
-# Pixels: the error of positions from `strips`. The pole of a panorama is exactly at its border.
+# Pixels: the error of positions from `strips`.
 _POSITION_ERROR = 0.05
 # Nodes are kept for so many views: 0.1 to 5 MB each.
 _KEPT = 24
@@ -75,18 +75,30 @@ class LensView:
     def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
         """Rows of this view at the size ``width`` × ``height``, and the positions of their pixels
         in the photo, in pixels of the lens; NaN where there are none.
+
+        In a panorama, a column x and a column x + lens.width are the same.
         """
-        if not self.wraps:
+        if not self._shows_pole:
             yield slice(0, height), Positions.between(_nodes(self), width, height)
             return
-        # Longitude has a seam and two poles, where it cannot be interpolated.
+        # Longitude cannot be interpolated at a pole.
         for first in range(0, height, 64):
             rows = slice(first, min(first + 64, height))
             x = (np.arange(width, dtype=np.float32) + 0.5) * np.float32(self.width / width)
             y = (np.arange(*rows.indices(height), dtype=np.float32) + 0.5) * np.float32(
                 self.height / height
             )
-            yield rows, Positions.exact(project(self.lens, self.rays(x, y)).astype(np.float32))
+            yield rows, Positions.exact(project(self.lens, self.rays(x, y)))
+
+    @property
+    def _shows_pole(self) -> bool:
+        """Whether the view shows the zenith or the nadir of a panorama."""
+        if not self.wraps:
+            return False
+        fx, fy, cx, cy = self.params
+        x, y, z = np.eye(3)[1] if self.rotation is None else np.array(self.rotation)[:, 1]
+        across, down = max(cx, self.width - cx) / fx, max(cy, self.height - cy) / fy
+        return bool(abs(x) <= across * abs(z) and abs(y) <= down * abs(z))
 
     def strips(self, width: int, height: int) -> Iterator[tuple[slice, np.ndarray]]:
         """As `positions`, in arrays (H, W, 2) float32."""
@@ -108,7 +120,7 @@ class LensView:
 
     def covered(self, position: np.ndarray) -> np.ndarray:
         """(H, W) bool: whether positions from `strips` are in the photo and in its circle."""
-        if not self.partial:
+        if not self.partial or self.wraps:
             return np.ones(position.shape[:2], bool)
         x, y = position[..., 0], position[..., 1]
         least, right, bottom = -_POSITION_ERROR, self.lens.width, self.lens.height
@@ -321,7 +333,12 @@ def _positions(view: LensView, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(len(y), len(x), 2): positions in the photo of pixels of a view; NaN where there are none."""
     rays = view.rays(x, y)
     position = project(view.lens, rays)
-    if view.partial:
+    if view.wraps:
+        # Longitudes without a seam in the view, and not negative.
+        middle = view.rays(np.array(view.params[2:3]), np.array(view.params[3:]))
+        turn, axis = view.lens.width, project(view.lens, middle)[..., 0]
+        position[..., 0] = axis + (position[..., 0] - axis + 0.5 * turn) % turn + 0.5 * turn
+    elif view.partial:
         limit = _field(view.lens, view.circle).limit
         angle = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
         position[angle > limit] = np.nan

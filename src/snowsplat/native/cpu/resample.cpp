@@ -88,7 +88,8 @@ class Resampler {
   void locate(int64_t row, int y) {
     const Line &upper = line_of(p_.row[row]), &lower = line_of(p_.row[row] + 1);
     const float down = p_.down[row];
-    const float right = float(p_.source_width + 3), bottom = float(p_.source_height + 3);
+    const float right = float((p_.wraps ? 3 : 1) * p_.source_width + 3);
+    const float bottom = float(p_.source_height + 3);
     int32_t *to_x = &x_[y * p_.width], *to_y = &y_[y * p_.width];
     const float *x0 = upper.x.data(), *x1 = lower.x.data();
     const float *y0 = upper.y.data(), *y1 = lower.y.data();
@@ -98,7 +99,8 @@ class Resampler {
     }
   }
   // In phases, from 2 pixels before the centre of the first pixel; limited to 2 pixels beside the
-  // photo, where a spline has the same result as beyond. NaN becomes 0.
+  // photo, where a spline has the same result as beyond; if the photo wraps, to its third turn. NaN
+  // becomes 0.
   SNOW_INLINE static int32_t fixed_point(float position, float most) {
     float from = position + 1.5f;
     from = from > 0.f ? from : 0.f;
@@ -159,6 +161,7 @@ class Resampler {
   void fill(int64_t to, int64_t left, int64_t row, int count) {
     const int64_t width = p_.source_width, plane = width * p_.source_height;
     row = std::clamp<int64_t>(row, 0, p_.source_height - 1);
+    if (p_.wraps) left = (left % width + width) % width;
     const uint8_t* channel[kChannels];
     for (int c = 0; c < kChannels; c++)
       channel[c] = p_.source + std::min<int64_t>(c, p_.channels - 1) * plane + row * width;
@@ -170,7 +173,7 @@ class Resampler {
     const int end = int(std::clamp<int64_t>(width - left, begin, count));
     for (int i = begin; i < end; i++) packed_[i] = pixel(left + i);
     const auto outside = [&](int64_t x) {
-      return p_.wraps ? (x % width + width) % width : std::clamp<int64_t>(x, 0, width - 1);
+      return p_.wraps ? x % width : std::clamp<int64_t>(x, 0, width - 1);
     };
     for (int i = 0; i < begin; i++) packed_[i] = pixel(outside(left + i));
     for (int i = end; i < count; i++) packed_[i] = pixel(outside(left + i));
