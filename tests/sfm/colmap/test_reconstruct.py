@@ -52,9 +52,7 @@ def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
 
 
 def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
-    job = PoseEstimation(
-        Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent)
-    )
+    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
     fisheye = Lens(fisheyes=frozenset([1]))
     job.attempts = [
         SimpleNamespace(registered=9, agreement=0.95, error=0.24, lens=fisheye),
