@@ -119,6 +119,18 @@ def test_features_are_compared_within_their_kind():
     assert {(i + 50, i) for i in range(200)} <= expected
 
 
+def test_few_matches_are_those_among_all_features():
+    random = np.random.default_rng(5)
+    first, second = sift_like(random, 200), sift_like(random, 200)
+    noise = random.normal(size=(80, LENGTH)) * 12
+    second[:80] = normalised(np.abs(first[:80] + noise))
+    kinds = [by_brightness(descriptors) for descriptors in (first, second)]
+    bright = [{*rows.tolist()} for (rows, _), _ in kinds]
+    found = match_descriptors(first, second)
+    np.testing.assert_array_equal(found, _match_exactly(first, second))
+    assert any((int(i) in bright[0]) != (int(j) in bright[1]) for i, j in found)
+
+
 def matches_of_colmap(folder, first, second):
     database = pycolmap.Database.open(folder / "database.db")
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 640, 480)

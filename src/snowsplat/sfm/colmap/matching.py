@@ -25,6 +25,9 @@ _NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
 # 97% and 99% then have the same kind of feature in both photos. (The middle alone: 98%, 97%, 98%.)
 _WEIGHTS = (100, -40, 30)
 
+#: A pair has few matches if it has less than `FEW`. With less than `FEWEST`, it cannot be verified.
+FEW, FEWEST = 100, 10
+
 #: The features of a photo, by their kind: their indices (K,), and their descriptors (K, 128).
 Kinds = tuple[tuple[NDArray[np.intp], NDArray[np.uint8]], ...]
 
@@ -45,7 +48,8 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
     0.7 rad, and this angle is less than 0.8 times the angle to the second nearest descriptor, in
     both directions (Lowe 2004, section 7.1).
 
-    Only features of the same kind are compared; see `by_brightness`.
+    Only features of the same kind are compared (`by_brightness`). The kind of a few is mistaken. So
+    if few matches are found, none of which can be spared, all features are compared.
 
     Raises:
         ValueError: a wrong shape or dtype.
@@ -56,12 +60,24 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
 def match_kinds(first: Kinds, second: Kinds) -> NDArray[np.uint32]:
     """As `match_descriptors`, of the results of `by_brightness`."""
+    found = _match_each(first, second)
+    if FEWEST <= len(found) < FEW:
+        found = _match_each(_together(first), _together(second))
+    return found[np.argsort(found[:, 0])].astype(np.uint32)
+
+
+def _match_each(first: Kinds, second: Kinds) -> NDArray[np.intp]:
+    """(K, 2) the matches within each kind."""
     found = []
     for (rows, some), (columns, others) in zip(first, second, strict=True):
         pairs = _match_exactly(some, others)
         found.append(np.stack([rows[pairs[:, 0]], columns[pairs[:, 1]]], 1))
-    every = np.concatenate(found)
-    return every[np.argsort(every[:, 0])].astype(np.uint32)
+    return np.concatenate(found)
+
+
+def _together(kinds: Kinds) -> Kinds:
+    rows, descriptors = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
+    return ((rows, descriptors),)
 
 
 def by_brightness(descriptors: NDArray[np.uint8]) -> Kinds:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features import SEED, WorkerProgress
-from snowsplat.sfm.colmap.matching import LENGTH, Kinds, by_brightness, match_kinds
+from snowsplat.sfm.colmap.matching import FEW, LENGTH, Kinds, by_brightness, match_kinds
 from snowsplat.util import native_library
 
 # Number of pairs that are matched or verified before the results are written to the database. If
@@ -120,7 +120,7 @@ def verified(
     Most pairs are not flat, so for the homography, this takes many samples of RANSAC in vain. So a
     fundamental matrix is estimated first, which agrees with the matches of all kinds of pairs.
     Then COLMAP looks among the matches that agree with it, where a few samples are enough to find
-    each kind of model, or to reject it.
+    each kind of model, or to reject it. With few matches, COLMAP looks among all of them at once.
 
     Args:
         matches: (M, 2) indices of features.
@@ -133,7 +133,8 @@ def verified(
     ransac = options.ransac
     ransac.max_num_trials, ransac.max_error, ransac.random_seed = _MAX_TRIALS, max_error, SEED
     ransac.min_inlier_ratio = _inlier_ratio(len(matches))
-    if one.is_perspective_pinhole() and other.is_perspective_pinhole():
+    few = len(matches) < FEW  # they are not reduced twice
+    if not few and one.is_perspective_pinhole() and other.is_perspective_pinhole():
         calibrated = one.has_prior_focal_length and other.has_prior_focal_length
         pixels = points[matches[:, 0]], others[matches[:, 1]]
         lenses = (one, other) if calibrated else None
@@ -180,7 +181,7 @@ def _consensus(
             lambda: pycolmap.estimate_essential_matrix(first, second, *lenses, options)
         )
     best = np.zeros(len(first), bool)
-    for estimate in estimates if len(first) >= _MIN_INLIERS else ():
+    for estimate in estimates:
         found = estimate()
         if found is not None and found["num_inliers"] > best.sum():
             best = np.asarray(found["inlier_mask"], bool)
