@@ -47,7 +47,7 @@ def attempted(folder, walk, exif=None):
     folders = Folders(folder)
     folders.distorted.mkdir()
     walk.write(folders.database, exif, RADIAL)
-    progress = WorkerProgress(silent, lambda *table: None)
+    progress = WorkerProgress(silent)
     job = PoseEstimation(folders, photos, SfmOptions("SIMPLE_RADIAL"), 1, progress)
     matched = Matched(folders.database, EFFORTS["draft"], PairChoice(list(walk.matches), ""), 1.0)
     job._try("as configured", matched, "incremental", RADIAL)

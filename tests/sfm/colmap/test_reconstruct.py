@@ -23,7 +23,7 @@ from snowsplat.sfm.progress import silent
     ],
 )
 def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registered, enough):
-    progress = WorkerProgress(silent, lambda *table: None)
+    progress = WorkerProgress(silent)
     options = SfmOptions(seconds=seconds)
     job = PoseEstimation(Folders(tmp_path), [], options, 1, progress)
     job.started = time.monotonic() - elapsed
@@ -41,7 +41,7 @@ def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registe
     ],
 )
 def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
-    progress = WorkerProgress(silent, lambda *table: None)
+    progress = WorkerProgress(silent)
     job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, progress)
     job.attempts = [
         SimpleNamespace(registered=n, agreement=share, error=1.0, lens=Lens())
@@ -52,9 +52,7 @@ def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
 
 
 def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
-    job = PoseEstimation(
-        Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent, lambda *table: None)
-    )
+    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
     fisheye = Lens(fisheyes=frozenset([1]))
     job.attempts = [
         SimpleNamespace(registered=9, agreement=0.95, error=0.24, lens=fisheye),

@@ -242,7 +242,7 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     runs = iter([[folded], []])  # of the attempt, and of the repair
     monkeypatch.setattr(Mapping, "run", lambda self, mapper, relaxed=False: next(runs))
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
-    progress = WorkerProgress(silent, lambda *table: None)
+    progress = WorkerProgress(silent)
     photos = look_alikes.photos()
     job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, progress)
     choice = PairChoice(sorted(scene.matches), "neighbours")

@@ -8,7 +8,6 @@ import json
 import os
 import queue
 import signal
-import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -185,9 +184,7 @@ def _communicate(
         try:
             line = lines.get(timeout=_POLL_SECONDS)
         except queue.Empty:
-            if "watch" in answer:
-                _report_rows(report, *answer["watch"])
-            elif "progress" in answer:
+            if "progress" in answer:
                 report(*answer["progress"])
             continue
         # If the child has ended, the last line may be incomplete.
@@ -201,16 +198,6 @@ def _communicate(
     with contextlib.suppress(BrokenPipeError):
         child.stdin.close()
     return answer
-
-
-def _report_rows(report: Report, database: str, table: str, total: int, what: str) -> None:
-    address = f"{Path(database).as_uri()}?mode=ro"
-    with (
-        contextlib.suppress(sqlite3.Error),  # if the database is locked, rows are counted later
-        contextlib.closing(sqlite3.connect(address, uri=True)) as connection,
-    ):
-        (rows,) = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()
-        report(min(rows, total), total, what)
 
 
 def child_environment(threads: int) -> dict[str, str]:

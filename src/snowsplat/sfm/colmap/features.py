@@ -51,15 +51,11 @@ class Folders:
 class WorkerProgress:
     """The functions with which the worker sends its progress to the parent process.
 
-    ``report`` sends a number of finished items. ``watch`` sends the name of a table of the
-    database: the parent process then counts the rows that COLMAP writes into this table. The worker
-    must not count them itself: COLMAP contains its own copy of SQLite, and if two copies of SQLite
-    in one process have a database open, each removes the locks of the other. ``features`` is called
-    with the mean number of features of the photos.
+    ``report`` sends a number of finished items. ``features`` is called with the mean number of
+    features of the photos.
     """
 
     report: Report
-    watch: Callable[[str, str, int, str], None]  # database, table, final row count, item name
     features: Callable[[float], None] = lambda mean: None
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import functools
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.database import closing_database, count_rows, match_counts, set_names
+from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features import SEED, WorkerProgress
-from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors
-from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.colmap.matching import FEW, LENGTH, Kinds, by_brightness, match_kinds
 from snowsplat.util import native_library
 
 # Number of pairs that are matched or verified before the results are written to the database. If
@@ -28,17 +27,23 @@ _CACHED_PHOTOS = 100
 
 # A verified pair has at least this many inliers: matches that are consistent with a relative pose.
 _MIN_INLIERS = 15
-# The pairs of a group are verified in this number of passes over all photos. Pairs with few inliers
-# take several times as long as others. Each pass contains pairs of all kinds, so the time left can
-# be estimated from the number of verified pairs.
-_PASSES = 8
-# Pairs are verified in groups. Each group has one of these smallest inlier ratios. The last ratio
-# is the default of COLMAP; it is used for all pairs with many matches.
+# RANSAC looks for at least one of these shares of inliers, the smallest with `_MIN_INLIERS` of the
+# matches of a pair. The last one is the default of COLMAP; it is used for pairs with many matches.
 _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
 # The maximum number of samples of RANSAC (COLMAP: 10,000). It matters for pairs with many
 # matches of which most are false, such as photos of a carpet that repeats. For 600 pairs of four
 # real datasets, the result is the same as with 10,000.
 _MAX_TRIALS = 3000
+# If more than this share of the matches agrees with one model, no other one is tried.
+_MOST = 0.5
+# The kind of a pair is found among matches that agree with one model already: at least this share
+# of them agrees with the right kind of model, and this number of them is enough.
+_AGREEING, _ENOUGH, _FEWEST_TRIALS = 0.75, 200, 30
+
+_UNCALIBRATED = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+_Floats = NDArray[np.floating[Any]]
+#: The camera of a photo, and (N, 2) the positions of its features in pixels of the photo.
+Side = tuple[pycolmap.Camera, _Floats]
 
 
 def match_pairs(
@@ -49,10 +54,11 @@ def match_pairs(
     with closing_database(database) as opened:
 
         @functools.lru_cache(_CACHED_PHOTOS)
-        def descriptors(index: int) -> NDArray[np.uint8]:
+        def descriptors(index: int) -> Kinds:
             if not opened.exists_descriptors(index + 1):
-                return np.zeros((0, LENGTH), np.uint8)
-            return np.asarray(opened.read_descriptors(index + 1).data).reshape(-1, LENGTH)
+                return by_brightness(np.zeros((0, LENGTH), np.uint8))
+            found = np.asarray(opened.read_descriptors(index + 1).data).reshape(-1, LENGTH)
+            return by_brightness(found)
 
         remaining = [(i, j) for i, j in pairs if not opened.exists_matches(i + 1, j + 1)]
         for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
@@ -60,94 +66,125 @@ def match_pairs(
             progress.report(done, len(pairs), "matched pairs")
             transaction = pycolmap.DatabaseTransaction(opened)
             for i, j in remaining[start : start + _PAIRS_PER_BLOCK]:
-                matches = match_descriptors(descriptors(i), descriptors(j))
+                matches = match_kinds(descriptors(i), descriptors(j))
                 opened.write_matches(i + 1, j + 1, matches)
             del transaction  # the destructor ends the transaction
 
 
 def verify_pairs(
     database: Path,
-    photos: Sequence[Photo],
     pairs: list[tuple[int, int]],
     max_error: float,
     threads: int,
     progress: WorkerProgress,
 ) -> None:
-    """Let COLMAP verify the matches of those ``pairs`` that are not verified yet.
+    """Verify the matches of those ``pairs`` that are not verified yet; see `verified`.
 
-    ``max_error`` is the largest distance of a verified match from its epipolar line, in pixels of
-    the photos in ``input/``. The lenses are those in the database.
+    The lenses are those in the database.
     """
-    # COLMAP reads the pairs from a file in which spaces separate the names, and the name of a photo
-    # may contain spaces. Therefore the images temporarily have numbers as names.
-    set_names(database, [str(i) for i in range(len(photos))])
-    table = "two_view_geometries"
-    try:
-        with _progress_of_rows(database, table, len(pairs), "verified pairs", progress):
-            for ratio, group in _by_inlier_ratio(pairs, match_counts(database)).items():
-                _verify(database, group, ratio, max_error, threads)
-    finally:
-        set_names(database, [photo.name for photo in photos])
+    with closing_database(database) as opened, ThreadPoolExecutor(threads) as pool:
+        cameras = {
+            image.image_id: opened.read_camera(image.camera_id)
+            for image in opened.read_all_images()
+        }
+
+        @functools.lru_cache(_CACHED_PHOTOS)
+        def positions(image: int) -> _Floats:
+            return np.asarray(opened.read_keypoints(image)[:, :2], np.float64)
+
+        def side(image: int) -> Side:
+            return cameras[image], positions(image)
+
+        ids = [(i + 1, j + 1) for i, j in pairs]
+        remaining = [pair for pair in ids if not opened.exists_two_view_geometry(*pair)]
+        for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
+            progress.report(len(ids) - len(remaining) + start, len(ids), "verified pairs")
+            block = remaining[start : start + _PAIRS_PER_BLOCK]
+            jobs = [
+                pool.submit(verified, side(i), side(j), opened.read_matches(i, j), max_error)
+                for i, j in block
+            ]
+            transaction = pycolmap.DatabaseTransaction(opened)
+            for pair, job in zip(block, jobs, strict=True):
+                opened.write_two_view_geometry(*pair, job.result())
+            del transaction  # the destructor ends the transaction
+        progress.report(len(ids), len(ids), "verified pairs")
 
 
-def _by_inlier_ratio(
-    pairs: list[tuple[int, int]], counts: dict[tuple[int, int], int]
-) -> dict[float, list[tuple[int, int]]]:
-    """The ``pairs``, grouped by the smallest inlier ratio that RANSAC has to find.
+def verified(
+    first: Side, second: Side, matches: NDArray[np.uint32], max_error: float
+) -> pycolmap.TwoViewGeometry:
+    """The matches of a pair of photos that agree with a relative pose, and the kind of the pair.
 
-    ``counts`` is the number of matches of each pair. The number of samples in RANSAC depends on the
-    smallest inlier ratio that it has to find. A pair with few matches and `_MIN_INLIERS` inliers
-    has a high inlier ratio, so a few samples suffice to find the inliers or to reject the pair.
+    COLMAP looks for an essential matrix, a fundamental matrix and a homography among all matches.
+    Most pairs are not flat, so for the homography, this takes many samples of RANSAC in vain. So a
+    fundamental matrix is estimated first, which agrees with the matches of all kinds of pairs.
+    Then COLMAP looks among the matches that agree with it, where a few samples are enough to find
+    each kind of model, or to reject it. With few matches, COLMAP looks among all of them at once.
+
+    Args:
+        matches: (M, 2) indices of features.
+        max_error: the largest distance of a verified match from its epipolar line, in pixels of
+            the photos in ``input/``.
     """
-    groups: dict[float, list[tuple[int, int]]] = {}
-    for pair in pairs:
-        least = _MIN_INLIERS / max(1, counts.get(pair, 0))
-        ratio = next((ratio for ratio in _INLIER_RATIOS if ratio <= least), _INLIER_RATIOS[-1])
-        groups.setdefault(ratio, []).append(pair)
-    return groups
+    (one, points), (other, others) = first, second
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = _MIN_INLIERS
+    ransac = options.ransac
+    ransac.max_num_trials, ransac.max_error, ransac.random_seed = _MAX_TRIALS, max_error, SEED
+    ransac.min_inlier_ratio = _inlier_ratio(len(matches))
+    few = len(matches) < FEW  # they are not reduced twice
+    if not few and one.is_perspective_pinhole() and other.is_perspective_pinhole():
+        calibrated = one.has_prior_focal_length and other.has_prior_focal_length
+        pixels = points[matches[:, 0]], others[matches[:, 1]]
+        lenses = (one, other) if calibrated else None
+        matches = matches[_consensus(*pixels, lenses, ransac)]
+        ransac.min_inlier_ratio, ransac.min_num_trials = _AGREEING, _FEWEST_TRIALS
+        if len(matches) > _ENOUGH and not calibrated:
+            some = matches[np.linspace(0, len(matches) - 1, _ENOUGH).astype(int)]
+            found = pycolmap.estimate_two_view_geometry(one, points, other, others, some, options)
+            if found.config == _UNCALIBRATED.value:
+                found.inlier_matches = matches
+                return found
+    if len(matches) < _MIN_INLIERS:
+        return pycolmap.TwoViewGeometry()
+    return pycolmap.estimate_two_view_geometry(one, points, other, others, matches, options)
 
 
-def _verify(
-    database: Path,
-    pairs: list[tuple[int, int]],
-    inlier_ratio: float,
-    max_error: float,
-    threads: int,
-) -> None:
-    """Let COLMAP verify the matches of ``pairs``, which are in the database."""
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
-    matching.use_gpu = False
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = _MIN_INLIERS
-    verification.ransac.min_inlier_ratio = inlier_ratio
-    verification.ransac.max_num_trials = _MAX_TRIALS
-    verification.ransac.max_error = max_error
-    verification.ransac.random_seed = SEED
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.block_size = _PAIRS_PER_BLOCK
-    pairing.match_list_path = database.with_suffix(".pairs")
-    ordered = [pair for first in range(_PASSES) for pair in pairs[first::_PASSES]]
-    Path(pairing.match_list_path).write_text("".join(f"{i} {j}\n" for i, j in ordered))
-    try:
-        pycolmap.match_image_pairs(
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
+def _inlier_ratio(matches: int) -> float:
+    """The smallest share of inliers that RANSAC has to find among this number of matches.
+
+    The number of samples in RANSAC depends on it. A pair with few matches and `_MIN_INLIERS`
+    inliers has a high share, so a few samples suffice to find the inliers or to reject the pair.
+    """
+    least = _MIN_INLIERS / max(1, matches)
+    return next((ratio for ratio in _INLIER_RATIOS if ratio <= least), _INLIER_RATIOS[-1])
+
+
+def _consensus(
+    first: _Floats,
+    second: _Floats,
+    lenses: tuple[pycolmap.Camera, pycolmap.Camera] | None,
+    options: pycolmap.RANSACOptions,
+) -> NDArray[np.bool_]:
+    """(M,) the largest set of matches that agrees with one model; ``first``, ``second`` (M, 2).
+
+    A homography, and an essential matrix if the ``lenses`` are known, are tried if only a small
+    share agrees with a fundamental matrix: they need fewer matches in a sample.
+    """
+    estimates: list[Callable[[], dict[str, Any] | None]] = [
+        lambda: pycolmap.estimate_fundamental_matrix(first, second, options),
+        lambda: pycolmap.estimate_homography_matrix(first, second, options),
+    ]
+    if lenses is not None:
+        estimates.append(
+            lambda: pycolmap.estimate_essential_matrix(first, second, *lenses, options)
         )
-    finally:
-        os.remove(pairing.match_list_path)
-
-
-@contextmanager
-def _progress_of_rows(
-    database: Path, table: str, total: int, what: str, progress: WorkerProgress
-) -> Iterator[None]:
-    """Report the number of rows of a table while COLMAP writes them, inside the with block."""
-    # The rows can be counted here only before COLMAP opens the database; see `WorkerProgress`.
-    progress.report(min(count_rows(database, table), total), total, what)
-    progress.watch(str(database), table, total, what)
-    yield
-    progress.report(total, total, what)
+    best = np.zeros(len(first), bool)
+    for estimate in estimates:
+        found = estimate()
+        if found is not None and found["num_inliers"] > best.sum():
+            best = np.asarray(found["inlier_mask"], bool)
+        if best.mean() > _MOST:
+            break
+    return best

@@ -330,7 +330,7 @@ class PoseEstimation:
         """
         set_cameras(matched.database, self.photos, lens)
         error, pairs = _MAX_ERROR * matched.scale, matched.choice.pairs
-        verify_pairs(matched.database, self.photos, pairs, error, self.threads, self.progress)
+        verify_pairs(matched.database, pairs, error, self.threads, self.progress)
 
     def _similarity(self, database: Path) -> Callable[[], NDArray[np.floating]]:
         indices = range(len(self.photos))

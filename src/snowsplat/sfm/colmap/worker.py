@@ -3,11 +3,10 @@
     python -m snowsplat.sfm.colmap.worker
 
 The parent sends the job as one line of JSON to stdin. The child answers with lines of JSON on
-stdout: its progress, with its processor time and the number of features; the database tables whose
-rows the parent may count (`WorkerProgress`); and at the end the result or a `UserError`. Stdin
-stays open as long as the parent runs; when it closes, the child ends immediately. The child ignores
-Ctrl-C, which the parent handles. The output of COLMAP goes to stderr, which the parent redirects to
-a log file.
+stdout: its progress, with its processor time and the number of features; and at the end the result
+or a `UserError`. Stdin stays open as long as the parent runs; when it closes, the child ends
+immediately. The child ignores Ctrl-C, which the parent handles. The output of COLMAP goes to
+stderr, which the parent redirects to a log file.
 """
 
 from __future__ import annotations
@@ -58,7 +57,6 @@ def main() -> None:
     try:
         progress = WorkerProgress(
             report=report,
-            watch=lambda *table: send(watch=table),
             features=lambda mean: figures.update(features=mean),
         )
         send(result=asdict(_run(job, progress)))
