@@ -42,7 +42,7 @@ _WRITTEN_MEGAPIXEL = 0.1  # of a resized photo: resizing and saving
 _FRAME_MEGAPIXEL = 0.02  # of each frame of a video, also of those that are not used
 _SIFT_MEGAPIXEL = 0.33
 _SIFT_THOUSAND = 0.06  # for each thousand features
-_MATCHED_PAIR = 0.0006  # a pair of photos with 1000 features each
+_MATCHED_PAIR = 0.001  # a pair of photos with 1000 features each
 _VERIFIED_PAIR = 0.006  # a pair of photos with 1000 features each
 # The costs of a photo in the step "poses".
 _REGISTERED = 0.27  # with bundle adjustment (`photos_with_adjustment`)

@@ -7,13 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.matching import (
-    LENGTH,
-    _match_exactly,
-    by_brightness,
-    match_descriptors,
-    two_nearest,
-)
+from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors, two_nearest
 from snowsplat.util import native_library
 
 
@@ -89,46 +83,19 @@ def test_the_number_of_threads_does_not_change_the_result():
     np.testing.assert_array_equal(*results)
 
 
-def test_matches_of_a_kind_are_those_of_colmap(tmp_path):
+def test_matches_are_those_of_colmap(tmp_path):
     """Half of the descriptors are in both photos, with noise of every size."""
     random = np.random.default_rng(2)
     first, second = sift_like(random, 700), sift_like(random, 600)
     noise = random.normal(size=(300, LENGTH)) * np.linspace(0, 40, 300)[:, None]
     second[:300] = normalised(np.abs(first[200:500] + noise))
     second[300] = second[10]  # not distinctive
-    found = _match_exactly(first, second)
+    found = match_descriptors(first, second)
     np.testing.assert_array_equal(found, matches_of_colmap(tmp_path, first, second))
+    assert found.dtype == np.uint32
     assert 100 < len(found) < 299
     assert (found[:, 0] - found[:, 1] == 200).mean() > 0.99
     assert 210 not in found[:, 0]
-
-
-def test_features_are_compared_within_their_kind():
-    random = np.random.default_rng(3)
-    first, second = sift_like(random, 300), sift_like(random, 250)
-    second[:200] = first[50:250]
-    found = match_descriptors(first, second)
-    assert found.dtype == np.uint32
-    assert (np.diff(found[:, 0].astype(int)) > 0).all()
-    kinds = [by_brightness(descriptors) for descriptors in (first, second)]
-    expected = set()
-    for (rows, some), (columns, others) in zip(*kinds, strict=True):
-        assert len(rows) > 50
-        expected |= {(rows[i], columns[j]) for i, j in _match_exactly(some, others)}
-    assert set(map(tuple, found)) == expected
-    assert {(i + 50, i) for i in range(200)} <= expected
-
-
-def test_few_matches_are_those_among_all_features():
-    random = np.random.default_rng(5)
-    first, second = sift_like(random, 200), sift_like(random, 200)
-    noise = random.normal(size=(80, LENGTH)) * 12
-    second[:80] = normalised(np.abs(first[:80] + noise))
-    kinds = [by_brightness(descriptors) for descriptors in (first, second)]
-    bright = [{*rows.tolist()} for (rows, _), _ in kinds]
-    found = match_descriptors(first, second)
-    np.testing.assert_array_equal(found, _match_exactly(first, second))
-    assert any((int(i) in bright[0]) != (int(j) in bright[1]) for i, j in found)
 
 
 def matches_of_colmap(folder, first, second):

@@ -6,7 +6,7 @@ from PIL import Image
 from tests.sfm.colmap.scenes import texture
 
 from snowsplat.sfm.colmap import sift
-from snowsplat.sfm.colmap.matching import _match_exactly, by_brightness, match_descriptors
+from snowsplat.sfm.colmap.matching import match_descriptors
 from snowsplat.sfm.colmap.sift import detect_sift, photos_at_once
 
 ALL = 100_000
@@ -40,31 +40,6 @@ def test_positions_and_matrices_turn_with_the_photo(tmp_path, picture):
     axes = a[:, 2:].reshape(-1, 2, 2)
     expected = np.stack([axes[:, 1], -axes[:, 0]], 1).reshape(-1, 4)
     assert np.median(np.abs(b[:, 2:] - expected)) < 0.05 * np.median(np.abs(expected))
-
-
-def test_features_have_the_same_kind_in_both_photos(tmp_path, picture):
-    dark = Image.eval(picture, lambda value: 255 - value)
-    original, inverted = (
-        detect_sift(saved(image, tmp_path / f"{i}.png"), None, 1000, ALL)
-        for i, image in enumerate((picture.rotate(20, Image.Resampling.BICUBIC), dark))
-    )
-    upright = detect_sift(saved(picture, tmp_path / "a.png"), None, 1000, ALL)
-    pairs = _match_exactly(upright.descriptors, original.descriptors)
-    bright = [bright_ones(features) for features in (upright, original, inverted)]
-    assert len(pairs) > 200
-    assert (bright[0][pairs[:, 0]] == bright[1][pairs[:, 1]]).mean() > 0.97
-    # What is bright in a photo is dark in its negative.
-    positions = [features.keypoints[:, None, :2] for features in (upright, inverted)]
-    same = np.abs(positions[0] - positions[1].swapaxes(0, 1)).max(2) < 0.01
-    rows, columns = np.nonzero(same)
-    assert len(rows) > 1000
-    assert (bright[0][rows] != bright[2][columns]).mean() > 0.97
-
-
-def bright_ones(features):
-    chosen = np.zeros(len(features.descriptors), bool)
-    chosen[by_brightness(features.descriptors)[0][0]] = True
-    return chosen
 
 
 def test_positions_and_scales_are_in_pixels_of_the_photo(tmp_path, picture):

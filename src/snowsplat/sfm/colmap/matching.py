@@ -20,16 +20,6 @@ LENGTH = 128
 _MAX_ANGLE = np.float32(0.7)  # radians between the two descriptors of a match
 _MAX_RATIO = np.float32(0.8)  # angle to the nearest descriptor / angle to the second nearest
 _NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
-# `by_brightness`: the weights of the 4 cells in the middle of a descriptor, of the 8 at its sides
-# and of the 4 at its corners. Of the verified matches of a room, of a street and of a carpet, 99%,
-# 97% and 99% then have the same kind of feature in both photos. (The middle alone: 98%, 97%, 98%.)
-_WEIGHTS = (100, -40, 30)
-
-#: A pair has few matches if it has less than `FEW`. With less than `FEWEST`, it cannot be verified.
-FEW, FEWEST = 100, 10
-
-#: The features of a photo, by their kind: their indices (K,), and their descriptors (K, 128).
-Kinds = tuple[tuple[NDArray[np.intp], NDArray[np.uint8]], ...]
 
 
 class Nearest(NamedTuple):
@@ -48,74 +38,17 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
     0.7 rad, and this angle is less than 0.8 times the angle to the second nearest descriptor, in
     both directions (Lowe 2004, section 7.1).
 
-    Only features of the same kind are compared (`by_brightness`). The kind of a few is mistaken. So
-    if few matches are found, none of which can be spared, all features are compared.
-
     Raises:
         ValueError: a wrong shape or dtype.
         UserError: the native library is missing or outdated.
     """
-    return match_kinds(by_brightness(first), by_brightness(second))
-
-
-def match_kinds(first: Kinds, second: Kinds) -> NDArray[np.uint32]:
-    """As `match_descriptors`, of the results of `by_brightness`."""
-    found = _match_each(first, second)
-    if FEWEST <= len(found) < FEW:
-        found = _match_each(_together(first), _together(second))
-    return found[np.argsort(found[:, 0])].astype(np.uint32)
-
-
-def _match_each(first: Kinds, second: Kinds) -> NDArray[np.intp]:
-    """(K, 2) the matches within each kind."""
-    found = []
-    for (rows, some), (columns, others) in zip(first, second, strict=True):
-        pairs = _match_exactly(some, others)
-        found.append(np.stack([rows[pairs[:, 0]], columns[pairs[:, 1]]], 1))
-    return np.concatenate(found)
-
-
-def _together(kinds: Kinds) -> Kinds:
-    rows, descriptors = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
-    return ((rows, descriptors),)
-
-
-def by_brightness(descriptors: NDArray[np.uint8]) -> Kinds:
-    """The ``descriptors`` (N, 128) of features that are brighter than their surroundings, and the
-    others; with their indices.
-
-    A feature has the same kind in all photos, so matching within the kinds takes half the time
-    (Bay, Ess, Tuytelaars and Van Gool, "Speeded-up robust features", 2008, section 4.3). A
-    descriptor has 4 rows of 4 cells, and for each cell 8 directions of gradients, every 45°. In the
-    middle of a bright feature, the gradients point inwards.
-    """
-    power = descriptors.astype(np.float64) ** 2  # the histograms, of which they are the roots
-    bright = power @ _INWARDS > 0  # sums of integers: exact
-    kinds = np.flatnonzero(bright), np.flatnonzero(~bright)
-    return tuple((rows, descriptors[rows]) for rows in kinds)
-
-
-def _inwards() -> NDArray[np.float64]:
-    """(128,) how much a gradient in each cell and direction tells that a feature is bright."""
-    y, x, turn = np.meshgrid(np.arange(4) - 1.5, np.arange(4) - 1.5, np.arange(8), indexing="ij")
-    outside = (np.abs(x) > 1).astype(int) + (np.abs(y) > 1)
-    angle = turn * (np.pi / 4)
-    inwards = (y * np.sin(angle) - x * np.cos(angle)) / np.hypot(x, y)
-    return np.asarray(np.rint(np.choose(outside, _WEIGHTS) * inwards)).reshape(LENGTH)
-
-
-_INWARDS = _inwards()
-
-
-def _match_exactly(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """(K, 2) as `match_descriptors`, among all descriptors."""
     rows, columns = two_nearest(first, second)
     forth, back = _accepted(rows), _accepted(columns)
     if len(forth) == 0 or len(back) == 0:
-        return np.zeros((0, 2), np.intp)
+        return np.zeros((0, 2), np.uint32)
     (found,) = np.nonzero(forth >= 0)
     found = found[back[forth[found]] == found]
-    return np.stack([found, forth[found]], 1)
+    return np.stack([found, forth[found]], 1).astype(np.uint32)
 
 
 def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Nearest, Nearest]:

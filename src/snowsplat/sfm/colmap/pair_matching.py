@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features import SEED, WorkerProgress
-from snowsplat.sfm.colmap.matching import FEW, LENGTH, Kinds, by_brightness, match_kinds
+from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors
 from snowsplat.util import native_library
 
 # Number of pairs that are matched or verified before the results are written to the database. If
@@ -34,6 +34,8 @@ _INLIER_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.32, 0.25)
 # matches of which most are false, such as photos of a carpet that repeats. For 600 pairs of four
 # real datasets, the result is the same as with 10,000.
 _MAX_TRIALS = 3000
+# Pairs with fewer matches are verified in one step: none of their matches can be spared.
+_FEW = 100
 # If more than this share of the matches agrees with one model, no other one is tried.
 _MOST = 0.5
 # The kind of a pair is found among matches that agree with one model already: at least this share
@@ -54,11 +56,10 @@ def match_pairs(
     with closing_database(database) as opened:
 
         @functools.lru_cache(_CACHED_PHOTOS)
-        def descriptors(index: int) -> Kinds:
+        def descriptors(index: int) -> NDArray[np.uint8]:
             if not opened.exists_descriptors(index + 1):
-                return by_brightness(np.zeros((0, LENGTH), np.uint8))
-            found = np.asarray(opened.read_descriptors(index + 1).data).reshape(-1, LENGTH)
-            return by_brightness(found)
+                return np.zeros((0, LENGTH), np.uint8)
+            return np.asarray(opened.read_descriptors(index + 1).data).reshape(-1, LENGTH)
 
         remaining = [(i, j) for i, j in pairs if not opened.exists_matches(i + 1, j + 1)]
         for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
@@ -66,7 +67,7 @@ def match_pairs(
             progress.report(done, len(pairs), "matched pairs")
             transaction = pycolmap.DatabaseTransaction(opened)
             for i, j in remaining[start : start + _PAIRS_PER_BLOCK]:
-                matches = match_kinds(descriptors(i), descriptors(j))
+                matches = match_descriptors(descriptors(i), descriptors(j))
                 opened.write_matches(i + 1, j + 1, matches)
             del transaction  # the destructor ends the transaction
 
@@ -133,7 +134,7 @@ def verified(
     ransac = options.ransac
     ransac.max_num_trials, ransac.max_error, ransac.random_seed = _MAX_TRIALS, max_error, SEED
     ransac.min_inlier_ratio = _inlier_ratio(len(matches))
-    few = len(matches) < FEW  # they are not reduced twice
+    few = len(matches) < _FEW  # they are not reduced twice
     if not few and one.is_perspective_pinhole() and other.is_perspective_pinhole():
         calibrated = one.has_prior_focal_length and other.has_prior_focal_length
         pixels = points[matches[:, 0]], others[matches[:, 1]]
