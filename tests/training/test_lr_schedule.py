@@ -46,6 +46,17 @@ def test_annealing_begins_at_its_moment_and_ends_at_its_factor():
     )
 
 
+@pytest.mark.parametrize(
+    ("views", "factor"), [(0, 1.0), (10, 1.0), (25, 1.0), (50, 2.0), (100, 4.0), (1000, 6.0)]
+)
+def test_with_few_passes_view_dependent_colours_change_as_much_in_total(views, factor):
+    """Of 1000 steps, 25 photos have 40 passes each."""
+    rates, schedule = LearningRates(sh_rest_passes=40.0), Schedule(1000)
+    usual, found = LearningRates().at(9, schedule, 1.0), rates.at(9, schedule, 1.0, views)
+    assert found.pop("sh_rest") == pytest.approx(factor * usual.pop("sh_rest"))
+    assert found == usual
+
+
 def test_scaled_leaves_the_final_rate_unchanged():
     rates = LearningRates().scaled(3.0)
     assert rates.means == pytest.approx(4.8e-4)

@@ -42,6 +42,7 @@ class Adam:
         *,
         schedule: Schedule,
         extent: float,
+        views: int = 0,
         visible_only: bool = False,
         shards: Shards = ALONE,
     ) -> None:
@@ -49,12 +50,14 @@ class Adam:
         Args:
             extent: extent of the scene, in world units; the learning rate of the means is
                 multiplied by it.
+            views: number of training views; see `LearningRates.at`.
             visible_only: whether a step leaves Gaussians unchanged that its view does not see.
             shards: the processes; ``gaussians`` are those of this process.
         """
         self.rates = rates
         self.schedule = schedule
         self.extent = extent
+        self.views = views
         self.visible_only = visible_only
         self.shards = shards
         self.rows: dict[str, Tensor] = {}
@@ -64,7 +67,7 @@ class Adam:
 
     def rates_at(self, step: int) -> dict[str, float]:
         """The learning rate of each parameter at ``step``, which counts from 1."""
-        return self.rates.at(step, self.schedule, self.extent)
+        return self.rates.at(step, self.schedule, self.extent, self.views)
 
     def step(self, gaussians: Gaussians, gradients: Sequence[ViewGradient], step: int) -> None:
         """Update ``gaussians`` in place by the sum of the gradients; ``step`` counts from 1.

@@ -194,6 +194,7 @@ class Run:
             config.learning_rates,
             schedule=self.schedule,
             extent=self.dataset.extent,
+            views=len(self.dataset.train),
             visible_only=config.visible_only and not regularizing(parts),
             shards=self.shards,
         )

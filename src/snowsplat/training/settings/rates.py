@@ -11,6 +11,9 @@ from snowsplat.training.settings.declare import Settings, When, setting
 if TYPE_CHECKING:
     from snowsplat.training.core.step_schedule import Schedule
 
+#: The largest factor of the rate of the view-dependent colours with few passes.
+_MOST = 6.0
+
 
 @dataclass(frozen=True)
 class LearningRates(Settings):
@@ -60,6 +63,14 @@ class LearningRates(Settings):
     sh_rest: float = setting(
         2.5e-3 / 20, "Learning rate of the view-dependent colours.", least=0.0, metavar="F"
     )
+    sh_rest_passes: float = setting(
+        0.0,
+        "With fewer passes over the photos than this, the rate of the view-dependent colours is "
+        "higher by the same ratio, at most six times, so that a colour can change as much in "
+        "total; 0: never.",
+        least=0.0,
+        metavar="F",
+    )
     anneal: float = setting(
         1.0,
         "Factor of all these rates but that of the positions at the last step. With a factor below "
@@ -78,13 +89,18 @@ class LearningRates(Settings):
         rates = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
         return replace(self, **{name: factor * getattr(self, name) for name in rates})
 
-    def at(self, step: int, schedule: Schedule, extent: float) -> dict[str, float]:
+    def at(self, step: int, schedule: Schedule, extent: float, views: int = 0) -> dict[str, float]:
         """The learning rate of each parameter at ``step``; that of the means is in world units.
 
         means(t) = extent · means^(1 − t) · means_final^t, t = step / means_steps, at most 1.
         The other rates are multiplied by anneal^u, where u increases from 0 at ``anneal_from`` to 1
         at the last step.
+
+        Args:
+            views: the number of training views, for ``sh_rest_passes``.
         """
+        # Adam changes a coefficient by about its rate in each step that shows it.
+        few = self.sh_rest_passes * views / schedule.iterations
         t = schedule.share(step, self.means_steps)
         means = math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
         u = (schedule.share(step) - self.anneal_from) / (1.0 - self.anneal_from)
@@ -95,7 +111,7 @@ class LearningRates(Settings):
             "quats": factor * self.quats,
             "opacity_logits": factor * self.opacity_logits,
             "sh_dc": factor * self.sh_dc,
-            "sh_rest": factor * self.sh_rest,
+            "sh_rest": factor * min(max(1.0, few), _MOST) * self.sh_rest,
         }
 
 

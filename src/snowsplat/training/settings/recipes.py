@@ -24,11 +24,12 @@ def default() -> TrainConfig:
     It is `classic` with these changes, which docs/performance.md measures: the training starts with
     points on the surfaces, which are found by plane sweep, and in the sky; in the last part of the
     training, all learning rates decrease; opacities and scales decay, so that Gaussians which no
-    photo needs become transparent; Gaussians with an opacity below 0.1 are removed, and their
-    places are used again; no Gaussian is much nearer to a camera than the points that it sees;
-    densification lasts longer, uses absolute gradients, and always reaches the maximum number; more
-    Gaussians and fewer steps take the same time; objects that move between the photos are masked;
-    and the scene is antialiased.
+    photo needs become transparent; with few passes over the photos, view-dependent colours change
+    faster; Gaussians with an opacity below 0.1 are removed, and their places are used again; no
+    Gaussian is much nearer to a camera than the points that it sees; densification lasts longer,
+    uses absolute gradients, and always reaches the maximum number; more Gaussians and fewer steps
+    take the same time; objects that move between the photos are masked; and the scene is
+    antialiased.
     """
     config = classic()
     return replace(
@@ -39,7 +40,9 @@ def default() -> TrainConfig:
         initial_opacity=0.3,
         initial_scale=0.6,
         sky=True,
-        learning_rates=replace(config.learning_rates, anneal=0.1, anneal_from=0.7),
+        learning_rates=replace(
+            config.learning_rates, sh_rest_passes=40.0, anneal=0.1, anneal_from=0.7
+        ),
         decay=DecayRates(opacity=0.04, scale=0.02, until=0.7),
         relative_scale=0.3,
         near_limit=0.6,
