@@ -78,6 +78,17 @@ def test_projections_are_those_of_colmap(model):
         )
 
 
+@pytest.mark.parametrize("width", [64, 128, 300, 2000])
+def test_positions_of_panoramas_of_any_size_are_exact(width):
+    """Also those of a view that one cell of nodes would fill, and whose errors cancel out there."""
+    for view in lens_views(LensModel("EQUIRECTANGULAR", width, width // 2, (width, width / 2.0))):
+        found = np.concatenate([rows for _, rows in view.strips(view.width, view.height)])
+        x, y = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
+        difference = found - project(view.lens, view.rays(x, y))
+        difference[..., 0] -= width * np.round(difference[..., 0] / width)
+        assert np.abs(difference).max() < 0.05
+
+
 @pytest.mark.parametrize("name", WIDE)
 def test_several_views_cover_the_photo_and_each_pixel_has_its_ray(name):
     lens, circle = WIDE[name]

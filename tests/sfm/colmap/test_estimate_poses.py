@@ -279,7 +279,7 @@ def test_log_and_repeated_runs(tmp_path, pictures, capfd):
     estimate_poses(tmp_path, photos, DRAFT, silent)
     # COLMAP prints to its log only.
     assert capfd.readouterr() == ("", "")
-    assert "Feature matching" in (tmp_path / "distorted" / "colmap.log").read_text()
+    assert "Loading rigs" in (tmp_path / "distorted" / "colmap.log").read_text()
     left = {path.name for path in (tmp_path / "distorted").iterdir()}
     assert left == {"colmap.log", "database.db", "sparse"}
     # Features and matches are reused.

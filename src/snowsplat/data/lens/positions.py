@@ -9,6 +9,7 @@ import numpy as np
 
 _LARGEST_ERROR = 0.01  # pixels, of the interpolation between nodes
 _CELLS = (64, 32, 16, 8, 4, 2)  # pixels: approximate cell sizes, tried in this order
+_FEWEST = 4  # cells in each direction: the errors of a few cells may vanish by symmetry
 _STRIP_PIXELS = 1 << 18  # processed at a time: limits the memory and fits the caches
 
 
@@ -76,12 +77,12 @@ def node_grid(
             photo; NaN where there are none.
     """
     for cell in _CELLS:
-        x, y = (np.linspace(0, size, -(-size // cell) + 1) for size in (width, height))
+        x, y = (np.linspace(0, n, max(_FEWEST, -(-n // cell)) + 1) for n in (width, height))
         nodes = positions(x, y)
-        middles = positions((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
-        means = (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4
-        error = np.abs(means - middles)
-        if not (error > _LARGEST_ERROR).any():
+        # Between two nodes, in both directions: within a cell, the two errors may cancel out.
+        across = positions((x[1:] + x[:-1]) / 2, y) - (nodes[:, 1:] + nodes[:, :-1]) / 2
+        down = positions(x, (y[1:] + y[:-1]) / 2) - (nodes[1:] + nodes[:-1]) / 2
+        if not any((np.abs(error) > _LARGEST_ERROR / 2).any() for error in (across, down)):
             break
     return nodes.astype(np.float32)
 

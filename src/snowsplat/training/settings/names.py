@@ -31,7 +31,8 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
         settings: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``);
             fields of `LearningRates` with the prefix ``lr_`` (``lr_means=1e-4``), and of
             `DecayRates` with the prefix ``decay_``. None leaves a setting unchanged.
-            ``max_gaussians`` also disables ``gaussians_per_pixel``.
+            ``max_gaussians`` also disables ``gaussians_per_pixel``, and ``lr_sh_rest`` disables
+            ``lr_sh_rest_passes``.
 
     Raises:
         SettingError: the configuration has no such setting, or a value is invalid.
@@ -42,6 +43,8 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
         config = replace(config, **whole)
     if "max_gaussians" in given:
         given.setdefault("gaussians_per_pixel", 0.0)
+    if "lr_sh_rest" in given:
+        given.setdefault("lr_sh_rest_passes", 0.0)
     known = setting_names(config)
     direct: dict[str, Any] = {}
     of_parts: dict[str, dict[str, Any]] = {}
