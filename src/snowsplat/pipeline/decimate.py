@@ -66,7 +66,7 @@ class Decimation:
 
     def merged(self, scene: Gaussians, count: int) -> Gaussians:
         """``count`` Gaussians, see `simplify`; fewer if the scene has fewer."""
-        return simplify(self._seen(scene), count, self.cameras)
+        return simplify(seen_from_dataset(scene, self.origin), count, self.cameras)
 
     def fitted(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         """Merged Gaussians that look more like ``scene``, of which they were made."""
@@ -76,16 +76,13 @@ class Decimation:
             return self.refined(smaller)
         return self._distilled(smaller, scene) if self.cameras else smaller
 
-    def _seen(self, scene: Gaussians) -> Gaussians:
-        return scene if self.origin is None else seen_from_dataset(scene, self.origin)
-
     def _distilled(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))
 
         self.observer.steps_begin(0, _STEPS)
         try:
-            whole = self._seen(scene).select(scene.usable_rows())
+            whole = seen_from_dataset(scene, self.origin).select(scene.usable_rows())
             color = torch.tensor(self.background)
             return distill(smaller, whole, self.cameras, color, _STEPS, report)
         finally:

@@ -70,12 +70,15 @@ def seen_from(gaussians: Gaussians, origin: Origin) -> Gaussians:
     return replace(gaussians, means=means, origin=origin)
 
 
-def seen_from_dataset(gaussians: Gaussians, origin: Origin) -> Gaussians:
-    """`seen_from` the origin of the dataset with which the scene was trained.
+def seen_from_dataset(gaussians: Gaussians, origin: Origin | None) -> Gaussians:
+    """`seen_from` the origin of the dataset with which the scene was trained; unchanged if it is
+    None, not known.
 
     Other programs do not write the origin of a file that they save. Positions without an origin
     that are nearer to 0 than to that of the dataset are therefore relative to it already.
     """
+    if origin is None:
+        return gaussians
     if gaussians.origin == HERE and any(origin) and len(gaussians):
         middle = gaussians.means.detach().nanmedian(0).values.double().cpu()
         if middle.norm() < (middle - torch.tensor(origin, dtype=torch.float64)).norm():

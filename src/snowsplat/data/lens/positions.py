@@ -69,7 +69,8 @@ class Positions:
 def node_grid(
     width: int, height: int, positions: Callable[[np.ndarray, np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """`Positions.nodes`, with the largest cells for which the error is below 0.01 pixels.
+    """`Positions.nodes`, with the largest cells for which the error is below 0.01 pixels, or else
+    with the smallest ones.
 
     Args:
         width, height: of the image in pixels.

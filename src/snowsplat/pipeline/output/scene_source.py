@@ -96,8 +96,7 @@ def cameras_of(folder: OutputFolder) -> list[Camera]:
 
 def seen_by_cameras(gaussians: Gaussians, folder: OutputFolder) -> Gaussians:
     """The scene relative to the origin of the cameras of the training in ``folder``."""
-    origin = folder.origin()
-    return gaussians if origin is None else seen_from_dataset(gaussians, origin)
+    return seen_from_dataset(gaussians, folder.origin())
 
 
 def background_of(folder: OutputFolder) -> Color:

@@ -134,8 +134,8 @@ def verified(
     ransac = options.ransac
     ransac.max_num_trials, ransac.max_error, ransac.random_seed = _MAX_TRIALS, max_error, SEED
     ransac.min_inlier_ratio = _inlier_ratio(len(matches))
-    few = len(matches) < _FEW  # they are not reduced twice
-    if not few and one.is_perspective_pinhole() and other.is_perspective_pinhole():
+    pinholes = one.is_perspective_pinhole() and other.is_perspective_pinhole()
+    if len(matches) >= _FEW and pinholes:
         calibrated = one.has_prior_focal_length and other.has_prior_focal_length
         pixels = points[matches[:, 0]], others[matches[:, 1]]
         lenses = (one, other) if calibrated else None

@@ -108,7 +108,9 @@ class NearLimit(Part):
 
     def _unconfirmed(self, means: Tensor) -> Tensor:
         """(M,) bool: which means (M, 3) are near a camera, and in at most one photo."""
-        distances = torch.cdist(means, self._spheres[:, :3])
+        # Not as |a|² + |b|² − 2 a·b, whose digits would not suffice far from the origin.
+        exact = "donot_use_mm_for_euclid_dist"
+        distances = torch.cdist(means, self._spheres[:, :3], compute_mode=exact)
         near = (distances < self._spheres[:, 3]).any(1)
         rows = near.nonzero()[:, 0]
         near[rows[self._photos.count(means[rows]) > _UNCONFIRMED]] = False

@@ -61,7 +61,11 @@ class LearningRates(Settings):
     )
     sh_dc: float = setting(2.5e-3, "Learning rate of the base colours.", least=0.0, metavar="F")
     sh_rest: float = setting(
-        2.5e-3 / 20, "Learning rate of the view-dependent colours.", least=0.0, metavar="F"
+        2.5e-3 / 20,
+        "Learning rate of the view-dependent colours; if it is set, `lr_sh_rest_passes` is 0 "
+        "unless it is set, too.",
+        least=0.0,
+        metavar="F",
     )
     sh_rest_passes: float = setting(
         0.0,
