@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import resource
 import subprocess
 import sys
@@ -24,6 +23,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from plot import line_chart
+
+from snowsplat.util.machine import processor_name
 
 MINUTES = (0.25, 0.5, 1.0, 3.0, 6.5, 15.0)
 
@@ -34,7 +35,8 @@ class Result:
 
     Attributes:
         load: number of other active processes when the run began (load average of a minute).
-        cpu_seconds: processor time of the whole command, with the evaluation.
+        cpu_seconds: processor time of the training, with its evaluation at the size of the
+            training.
         size: of the held-out photos, on which PSNR and SSIM are judged.
     """
 
@@ -86,16 +88,7 @@ def table(results: list[Result]) -> str:
             f"| {r.dataset} | {r.minutes:g} | {r.psnr:.2f} | {r.ssim:.4f} | {r.size} | {r.steps} "
             f"| {r.cpu_seconds:.0f} s | {r.load:.1f} |"
         )
-    return "\n".join([*lines, "", f"{_processor()}, {os.cpu_count()} cores", ""])
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return "\n".join([*lines, "", f"{processor_name()}, {os.cpu_count()} cores", ""])
 
 
 def main() -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from workloads import SIZES
 
 from snowsplat.ops import native
 from snowsplat.util.errors import UserError
+from snowsplat.util.machine import processor_name
 
 Measured = dict[str, Any]
 BLEND = ("blend forward", "blend backward")
@@ -292,16 +292,10 @@ def _quartiles(values: list[float]) -> tuple[float, float, float]:
 
 
 def _machine(ghz: float) -> str:
-    model = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            named = [line.split(":")[1].strip() for line in file if line.startswith("model name")]
-        model = named[0] if named else model
-    except OSError:
-        pass
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     line = (
-        f"{model}, {cores} cores, {', '.join(native.available_isas())}; floor: {OPERATIONS} vector "
+        f"{processor_name()}, {cores} cores, {', '.join(native.available_isas())}; "
+        f"floor: {OPERATIONS} vector "
         f"operations per step, {OPERATIONS_PER_CLOCK:g} per clock, {ghz:.2f} GHz"
     )
     if hasattr(os, "getloadavg") and os.getloadavg()[0] > 0.5:
