@@ -23,6 +23,7 @@ from typing import Any
 from gpu_jobs import finding
 
 ROOT = Path(__file__).resolve().parents[1]
+RATE = Path(__file__).with_name("gpu_rate.cu")
 #: Datasets with transparent images.
 BACKGROUNDS = {"lego400": "white"}
 
@@ -114,16 +115,14 @@ def _copy_bandwidth() -> float:
 def _multiply_add_rate() -> float:
     """Multiply-adds per second, by gpu_rate.cu."""
     import torch
-    from gpu_step import gpu_times
+    from gpu_step import RateParams, gpu_times
 
     from snowsplat.ops.cuda import driver, nvrtc
     from snowsplat.ops.cuda.kernels import Kernel
 
     name, threads, a_loop = "multiply_adds", 256, 8 * 32
     card = torch.cuda.get_device_properties(0)
-    code, _ = nvrtc.Nvrtc(nvrtc.find()).compile(
-        Path(__file__).with_name("gpu_rate.cu"), f"sm_{card.major}{card.minor}"
-    )
+    code, _ = nvrtc.Nvrtc(nvrtc.find()).compile(RATE, f"sm_{card.major}{card.minor}")
     gpu = driver._gpu(0)
     with gpu.current():
         library = gpu._check(gpu.cuda.cuLibraryLoadData(code, None, None, 0, None, None, 0))
@@ -133,10 +132,10 @@ def _multiply_add_rate() -> float:
     blocks, loops = 64 * card.multi_processor_count, 400
     numbers = torch.tensor([0.999, 0.001], device="cuda")
     out = torch.empty(blocks * threads, device="cuda")
-    kernel = Kernel("gpu_rate", threads=threads, items=1)
+    kernel = Kernel("gpu_rate", RateParams, threads=threads, items=1)
 
     def work() -> None:
-        driver.run(kernel, name, blocks, (loops, numbers, out))
+        driver.run(kernel, name, blocks, RateParams(n=loops, numbers=numbers, out=out))
 
     for _ in range(3):
         work()

@@ -4,11 +4,18 @@
 
 constexpr int kChains = 8, kUnrolled = 32;  // also in gpu_parts.py
 
-SNOW_KERNEL(multiply_adds, 256, (int64_t loops, const float* numbers, float* out)) {
-  const float x = numbers[0], y = numbers[1];
+struct RateParams {
+  int64_t n;             // loops
+  const float* numbers;  // (2,)
+  float* out;            // out, one per thread
+  SNOW_FIELDS(n, numbers, out)
+};
+
+SNOW_KERNEL(multiply_adds, 256, RateParams) {
+  const float x = p.numbers[0], y = p.numbers[1];
   float chain[kChains];
   for (int k = 0; k < kChains; k++) chain[k] = float(k) + float(threadIdx.x);
-  for (int i = 0; i < int(loops); i++) {
+  for (int i = 0; i < int(p.n); i++) {
 #pragma unroll
     for (int j = 0; j < kUnrolled; j++) {
 #pragma unroll
@@ -17,5 +24,5 @@ SNOW_KERNEL(multiply_adds, 256, (int64_t loops, const float* numbers, float* out
   }
   float sum = 0;
   for (int k = 0; k < kChains; k++) sum += chain[k];
-  out[snow::thread_index()] = sum;
+  p.out[snow::thread_index()] = sum;
 }

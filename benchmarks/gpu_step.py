@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +187,15 @@ def medians(repeats: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[st
 
 
 # ----------------------------------------------------------------------------------------- on a GPU
+
+
+@dataclass(slots=True, kw_only=True)
+class RateParams(Params):
+    """The parameters of gpu_rate.cu."""
+
+    n: int
+    numbers: Tensor
+    out: Tensor
 
 
 def event() -> torch.cuda.Event:

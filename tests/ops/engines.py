@@ -26,17 +26,30 @@ def launcher(engine: str) -> Callable[[str, Params], int]:
 
 
 def execute_on_gpu(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
-    """Copies the tensors to the GPU, runs the kernel, and copies all of them back."""
-    copies: list[tuple[torch.Tensor, torch.Tensor]] = []
+    """Copies the memory of the tensors to the GPU, runs the kernel, and copies it back.
+
+    Tensors that share memory here share it there. torch does not notice that the memory changed, as
+    it does not notice that for the kernels of the CPU.
+    """
+    copies: dict[int, _Copy] = {}
     driver.run(kernel, name, blocks, _copied(params, copies))
-    for tensor, copy in copies:
-        tensor.copy_(copy)
+    for copy in copies.values():
+        copy.here.copy_(copy.there)
 
 
-def _copied(value: Any, copies: list[tuple[torch.Tensor, torch.Tensor]]) -> Any:
+class _Copy:
+    def __init__(self, here: torch.UntypedStorage) -> None:
+        self.here, self.there = here, here.cuda()
+
+
+def _copied(value: Any, copies: dict[int, _Copy]) -> Any:
     if isinstance(value, torch.Tensor):
-        copies.append((value, value.cuda()))
-        return copies[-1][1]
+        here = value.untyped_storage()
+        if here.data_ptr() not in copies:
+            copies[here.data_ptr()] = _Copy(here)
+        there = torch.empty(0, dtype=value.dtype, device="cuda")
+        memory = copies[here.data_ptr()].there
+        return there.set_(memory, value.storage_offset(), value.shape, value.stride())
     if isinstance(value, Params):
         names = [field.name for field in fields(value)]  # type: ignore[arg-type]
         return replace(value, **{name: _copied(getattr(value, name), copies) for name in names})

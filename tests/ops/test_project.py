@@ -318,6 +318,8 @@ def test_native_agrees_with_the_reference_for_long_thin_splats(
     native: Variant, shape: str, length: float, antialiased: bool
 ) -> None:
     """det Σ' as a difference cancels: with a σ of 1000 pixels, the error was 19% in float32."""
+    if native.dtype == torch.float32:  # the error of a conic is proportional to the length
+        native = replace(native, forward=3e-7 * length)
     scene = random_scene(3, 64, 64, 48)
     if antialiased:
         scene = scene.antialiased()
