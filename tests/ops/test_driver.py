@@ -175,8 +175,8 @@ def gpus(built, monkeypatch) -> FakeDriver:
     monkeypatch.setattr(driver, "_gpus", {})
     monkeypatch.setattr(driver, "why_unusable", lambda index: None)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda i: ((8, 6), (9, 0))[i])
-    streams = [SimpleNamespace(cuda_stream=70 + index) for index in range(2)]
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: streams[index])
+    stream_of = (70, 71).__getitem__
+    monkeypatch.setattr(torch._C, "_cuda_getCurrentRawStream", stream_of, raising=False)
     return fake
 
 
@@ -401,7 +401,7 @@ from snowsplat.ops.params import BackgroundBackwardParams
 stub = ctypes.CDLL("libcuda.so.1")
 driver.why_unusable = lambda index: None
 torch.cuda.get_device_capability = lambda index: (9, 0)
-torch.cuda.current_stream = lambda index: SimpleNamespace(cuda_stream=0x77)
+torch._C._cuda_getCurrentRawStream = lambda index: 0x77
 cubins.candidates = lambda file, capability, major: [b"code", file, capability, major][:1]
 
 class OnGpu(torch.Tensor):

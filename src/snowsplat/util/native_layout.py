@@ -80,20 +80,28 @@ class Layout:
         text = "".join(f"{name}={value};" for name, value in _CONSTANTS.items())
         self.hash = _fnv1a(text + _describe(params))
 
-    def pack_into(self, buffer: Any, params: Params) -> None:
+    def pack_into(self, buffer: Any, params: Params) -> Any:
         """Writes the struct to the beginning of `buffer`, which has at least `size` bytes.
+
+        Returns the first tensor, or None.
 
         Raises:
             TypeError: the value of a field has the wrong type.
         """
         values = list(self.values(params))
+        first = None
         try:
             for i in self.pointers:
                 tensor = values[i]
-                values[i] = 0 if tensor is None else tensor.data_ptr()
+                if tensor is None:
+                    values[i] = 0
+                else:
+                    first = tensor if first is None else first
+                    values[i] = tensor.data_ptr()
             self._format.pack_into(buffer, 0, *values)
         except (AttributeError, struct.error):
             raise self._wrong_kind(params) from None
+        return first
 
     def _wrong_kind(self, params: Params) -> TypeError:
         kinds: dict[str, tuple[type, ...]] = {"i": (int,), "d": (float, int)}

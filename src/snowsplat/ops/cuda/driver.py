@@ -50,15 +50,12 @@ def run(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
     Raises:
         UserError: the GPU cannot be used, the kernels are outdated, or the driver reports an error.
     """
-    layout = layout_of(kernel.params)
-    values = layout.values(params)
-    tensor = next(values[i] for i in layout.pointers if values[i] is not None)
-    index = tensor.device.index
+    buffer = _buffer
+    index = layout_of(kernel.params).pack_into(buffer.struct, params).device.index
     gpu = _gpus.get(index) or _gpu(index)
     function = gpu.functions.get(name) or gpu.load(kernel, name)
-    buffer = _buffer
-    layout.pack_into(buffer.struct, params)
-    stream = torch.cuda.current_stream(index).cuda_stream
+    # torch.cuda.current_stream takes longer than the launch.
+    stream = torch._C._cuda_getCurrentRawStream(index)
     cuda = gpu.cuda
     launch = (function, blocks, 1, 1, kernel.threads, 1, 1, 0, stream, buffer.address, 0)
     # The threads that torch creates for backward passes initially have no context.

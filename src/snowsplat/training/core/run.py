@@ -23,6 +23,7 @@ from snowsplat.training.core.regularizers import regularizing
 from snowsplat.training.core.run_state import RESERVED, load_state, state_tensors
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.view_graphs import ViewGraphs, recordable, recorder
 from snowsplat.training.core.view_queue import ViewQueue
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards, sharded_render
@@ -97,6 +98,7 @@ class Run:
         background: the colour behind the scene.
         queue: chooses the views of the next steps.
         runner: runs a step, and repeats it if the memory of the rasterizer was too small.
+        graphs: queues the gradient of a view on a GPU; None if it is computed without graphs.
         generators: one random generator for each of `GENERATORS`.
         render: renders the Gaussians of all processes; every process must call it.
         shards: the processes.
@@ -206,6 +208,10 @@ class Run:
             self.shards,
             with_depth=any(part.with_depth for part in parts),
         )
+        self.graphs: ViewGraphs | None = None
+        one_view = self.device.type == "cuda" and self.shards.size == 1 and config.batch == 1
+        if one_view and recordable(parts) and not self.has_own_loss:
+            self.graphs = ViewGraphs(recorder(self.device), self.note)
         self.count()
         for part in parts:
             part.begin(self)

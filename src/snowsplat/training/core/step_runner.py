@@ -26,6 +26,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import zip_longest
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -53,6 +54,15 @@ GROW_ABOVE = 0.9
 #: A new capacity is this multiple of the required instances. This is enough for one densification:
 #: it increases the number of Gaussians by at most about a quarter.
 GROWTH = 1.3
+
+
+class Summary(NamedTuple):
+    """The result of a step: ``table`` has a row (views + 2 + 6,) of float64 for each process: the
+    losses, the required and the available instances, and the counts of non-finite rows.
+    ``valid`` is (1,) bool."""
+
+    table: Tensor
+    valid: Tensor
 
 
 class StepRunner:
@@ -138,24 +148,34 @@ class StepRunner:
             self._losses.append(loss.detach())
             self._required = torch.maximum(self._required, self.capacity.required)
         if last:
-            self._start_readback()
+            self.send(self.summary(self._losses, self._required))
+            self._losses, self._required = [], torch.zeros_like(self._required)
         if loss is not None:
             loss.backward()
 
-    def _start_readback(self) -> None:
+    def summary(self, losses: Sequence[Tensor], required: Tensor) -> Summary:
+        """What the CPU reads back in a step, and whether the step is valid.
+
+        Args:
+            losses: (), of the views of this process.
+            required: (1,) int64, the largest number of instances of a view.
+        """
         device = self._nonfinite_rows.device
-        unused = torch.zeros(self._own_views - len(self._losses), device=device)
-        numbers = [loss.reshape(1) for loss in self._losses]
-        instances = torch.full((1,), float(self.capacity.instances), device=device)
-        numbers += [unused, self._required, instances, self._nonfinite_rows]
+        unused = torch.zeros(self._own_views - len(losses), device=device)
+        numbers = [loss.reshape(1) for loss in losses]
+        instances = torch.full((1,), self.capacity.instances, dtype=torch.float64, device=device)
+        numbers += [unused, required, instances, self._nonfinite_rows]
         table = self._shards.table(torch.cat([number.double() for number in numbers]))
-        self._readback.start(table)
-        losses, required, instances, rows = table.split(
+        found, required, instances, rows = table.split(
             [self._own_views, 1, 1, len(PARAMETERS)], dim=1
         )
-        valid = losses.isfinite().all() & (required <= instances).all() & ~rows.any()
-        self._valid = valid.reshape(1)
-        self._losses, self._required = [], torch.zeros_like(self._required)
+        valid = found.isfinite().all() & (required <= instances).all() & ~rows.any()
+        return Summary(table, valid.reshape(1))
+
+    def send(self, summary: Summary) -> None:
+        """Start the read-back of the summary of the present step."""
+        self._readback.start(summary.table)
+        self._valid = summary.valid
 
     def gradient(self, splats: Splats2D, camera: Camera, sh_degree: int) -> ViewGradient:
         """The gradient of a view, after the last backward pass of the step."""

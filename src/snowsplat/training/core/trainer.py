@@ -8,12 +8,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from snowsplat.data.decode import LoadedImage
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.batch import BatchView, batch_gradients
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.regularizers import add_regularizers
 from snowsplat.training.core.run import Run
+from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.util.process import interrupts_between_steps, single_threaded
 
 
@@ -85,19 +87,30 @@ class Trainer(Run):
 
     def _optimize(self, step: int, batch: Sequence[BatchView]) -> None:
         """Rasterize, compare with the photos, and update the Gaussians."""
-        gradients = batch_gradients(
-            self.gaussians,
-            batch,
-            self.runner,
-            self.shards,
-            self.config.sh_degree_at(step),
-            self._background,
-            self._loss,
-        )
+        gradients = self._gradients(step, batch)
         for part in reversed(self.parts):
             part.gradients(self, step, batch, gradients)
         add_regularizers(self)
         self.optimizer.step(self.gaussians, gradients, step)
+
+    def _gradients(self, step: int, batch: Sequence[BatchView]) -> list[ViewGradient]:
+        sh_degree = self.config.sh_degree_at(step)
+        if self.graphs is not None:
+            (view,) = batch
+            recorded = self.graphs.gradient(
+                self.gaussians, view, self._target(view), sh_degree, self.runner, self.loss
+            )
+            if recorded is not None:
+                return [recorded]
+        return batch_gradients(
+            self.gaussians,
+            batch,
+            self.runner,
+            self.shards,
+            sh_degree,
+            self._background,
+            self._loss,
+        )
 
     def _background(self, view: BatchView) -> Tensor:
         color = view.background
@@ -105,11 +118,15 @@ class Trainer(Run):
             color = part.background(self, view, color)
         return color
 
-    def _loss(self, view: BatchView, rendered: RenderOutput) -> Tensor:
-        photo, image = view.photo, rendered.image
+    def _target(self, view: BatchView) -> LoadedImage:
+        photo = view.photo
         assert photo is not None
         for part in self.parts:
             photo = part.target(self, view, photo)
+        return photo
+
+    def _loss(self, view: BatchView, rendered: RenderOutput) -> Tensor:
+        photo, image = self._target(view), rendered.image
         for part in self.parts:
             image = part.image(self, view, image, photo)
         loss = self.loss(image, photo, view.background)
