@@ -109,6 +109,15 @@ class Step:
         batch = [BatchView(0, self.view, self.camera, self.photo, self.background)]
         self.trainer._optimize(STEP, batch)
 
+    @contextmanager
+    def without_graphs(self) -> Iterator[None]:
+        """Inside the with block, the kernels of a step are queued one by one."""
+        graphs, self.trainer.graphs = self.trainer.graphs, None
+        try:
+            yield
+        finally:
+            self.trainer.graphs = graphs
+
     def run(self) -> float:
         """A complete step, repeated until the capacity suffices; returns its loss."""
         gaussians = self.trainer.gaussians
@@ -269,7 +278,15 @@ def step_times(step: Step, repeats: int) -> dict[str, float]:
 
 
 def stage_times(step: Step, execute: Execute, repeats: int) -> dict[str, dict[str, float]]:
-    """Milliseconds of each kernel of a step: medians of {native function: {kernel: …}}."""
+    """Milliseconds of each kernel of a step: medians of {native function: {kernel: …}}.
+
+    CUDA graphs are not used, because no event can be recorded between their kernels.
+    """
+    with step.without_graphs():
+        return _stage_times(step, execute, repeats)
+
+
+def _stage_times(step: Step, execute: Execute, repeats: int) -> dict[str, dict[str, float]]:
     found = []
     busy = BusyGpu()
     for _ in range(repeats + 6):

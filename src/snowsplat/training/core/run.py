@@ -23,7 +23,7 @@ from snowsplat.training.core.regularizers import regularizing
 from snowsplat.training.core.run_state import RESERVED, load_state, state_tensors
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_graphs import ViewGraphs, recordable, recorder
+from snowsplat.training.core.view_graphs import GraphRecorder, ViewGraphs, recordable
 from snowsplat.training.core.view_queue import ViewQueue
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards, sharded_render
@@ -211,7 +211,7 @@ class Run:
         self.graphs: ViewGraphs | None = None
         one_view = self.device.type == "cuda" and self.shards.size == 1 and config.batch == 1
         if one_view and recordable(parts) and not self.has_own_loss:
-            self.graphs = ViewGraphs(recorder(self.device), self.note)
+            self.graphs = ViewGraphs(GraphRecorder(self.device), self.note)
         self.count()
         for part in parts:
             part.begin(self)

@@ -116,7 +116,7 @@ class ViewGraphs:
     def __init__(self, record: Record, note: Callable[[str], None]) -> None:
         """
         Args:
-            record: see `recorder`.
+            record: a `GraphRecorder`.
             note: takes a line for the user.
         """
         self.record: Record | None = record
@@ -187,24 +187,30 @@ def _key(
     )
 
 
-def recorder(device: torch.device) -> Record:
-    """Records CUDA graphs on a GPU."""
-    # All graphs share memory, because they never run at the same time. Recording needs a stream
-    # that is not the default one, and the backward pass runs on the stream of the forward pass.
-    pool, stream = torch.cuda.graph_pool_handle(), torch.cuda.Stream(device)
+class GraphRecorder:
+    """Records CUDA graphs on a GPU: a `Record`.
 
-    def record(work: Callable[[], None]) -> Callable[[], None]:
-        graph = torch.cuda.CUDAGraph()
-        present = torch.cuda.current_stream(device)
-        stream.wait_stream(present)
-        with torch.cuda.stream(stream):
-            # Other threads decode photos and may allocate memory meanwhile.
-            graph.capture_begin(pool, capture_error_mode="thread_local")
+    All graphs share memory, because they never run at the same time.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._pool = torch.cuda.graph_pool_handle()
+        # Not the default stream, where nothing can be recorded. The backward pass runs on the
+        # stream of the forward pass, so both are recorded on the same one.
+        self._stream = torch.cuda.Stream(device)
+        # torch does not accept the pool again after its last graph was deleted; so one is kept.
+        self._kept = self(lambda: torch.zeros(1, device=device))
+
+    def __call__(self, work: Callable[[], object]) -> Callable[[], None]:
+        graph, present = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self._device)
+        self._stream.wait_stream(present)
+        with torch.cuda.stream(self._stream):
+            # Meanwhile other threads decode photos, and may allocate memory.
+            graph.capture_begin(self._pool, capture_error_mode="thread_local")
             try:
                 work()
             finally:
                 graph.capture_end()
-        present.wait_stream(stream)
+        present.wait_stream(self._stream)
         return graph.replay
-
-    return record
