@@ -30,7 +30,7 @@ from gpu_table import Findings, page
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = Path(__file__).with_name("gpu_parts.py")
-GROUPS = ("device", "tests", "sanitizer", "stages", "train", "peer")
+GROUPS = ("device", "tests", "sanitizer", "stages", "peer", "train", "cpu")
 SIZES = ("200k", "1m", "3m")
 DATASETS = ("fox", "lego400")
 
@@ -71,7 +71,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
     most = str(max(1, cores - 6))
     found = {group: [] for group in (*GROUPS, "untimed")}
     found["device"] = [job("device", ["device"], 45, alone=True)]
-    if "train" in flags.only:
+    if "cpu" in flags.only:
         part = ["train", *datasets, "--device", "cpu", "--seeds", *map(str, flags.seeds)]
         found["untimed"].append(job("train on the CPU", part, 200, SNOWSPLAT_THREADS=most))
     if "peer" in flags.only:
@@ -85,7 +85,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         part = ["tests", name, "--done", str(scratch / f"{path.stem}.done")]
         found["tests"].append(job(name, part, 120, **two_threads))
     found["sanitizer"] = [
-        job(tool, ["sanitize", tool], 170, **two_threads)
+        job(tool, ["sanitize", tool], min(170.0, 30 * flags.minutes), **two_threads)
         for tool in ("memcheck", "racecheck", "synccheck")
     ]
     for size in ("1m", "200k", "3m"):
@@ -105,7 +105,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
     wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
     # The sanitizers start first, because they take longest. The tests follow; there are many.
     parallel = [*found["untimed"], *wanted["sanitizer"], *wanted["tests"]]
-    timed = [*wanted["train"], *wanted["stages"], *wanted["peer"]]
+    timed = [*wanted["stages"], *wanted["peer"], *wanted["train"]]
     return [*wanted["device"], *parallel, *timed, *late]
 
 

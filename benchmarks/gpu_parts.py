@@ -433,9 +433,13 @@ def stages(size: str, folder: Path, repeats: int) -> None:
             for _ in range(3):
                 step.run()
             torch.cuda.reset_peak_memory_stats()
+            found = {"size": size, "in_order": in_order, "repeats": repeats}
             times = step_times(step, repeats)
             peak = torch.cuda.max_memory_allocated()
-            finding("step", size=size, in_order=in_order, repeats=repeats, peak=peak, **times)
+            with step.without_graphs():
+                step.run()
+                plain = step_times(step, repeats)
+            finding("step", **found, peak=peak, **times, plain=plain)
             kernels = stage_times(step, driver.run, repeats)
             finding("stages", size=size, in_order=in_order, kernels=kernels)
 

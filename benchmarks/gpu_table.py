@@ -255,9 +255,10 @@ def _column(found: Finding, step: Finding | None, floors: dict[str, float]) -> d
     times = {name: sum(kernels.values()) for name, kernels in found["kernels"].items()}
     cells = {name: _cells(time, floors.get(name)) for name, time in times.items()}
     if step is not None:
-        cells[REST] = _cells(max(0.0, step["gpu"] - sum(times.values())), None)
+        total = step["plain"]["gpu"]
+        cells[REST] = _cells(max(0.0, total - sum(times.values())), None)
         known = sum(floors.values()) if floors else None
-        cells[TOTAL] = _cells(step["gpu"], known)
+        cells[TOTAL] = _cells(total, known)
     return cells
 
 
@@ -277,6 +278,7 @@ def _steps(findings: Findings, name: str) -> str:
         memory, frame = findings.one("memory", size=size), findings.one("frame", size=size)
         limit = "GPU" if step["gpu"] >= step["host"] else "CPU"
         cells = [size, *(f"{step[key]:.3f}" for key in ("gpu", "host", "wall")), limit]
+        cells += [f"{step['plain'][key]:.3f}" for key in ("host", "wall")]
         cells.append(f"{1e3 / step['wall']:.0f}")
         cells.append(f"{ordered['gpu'] / step['gpu']:.2f}" if ordered else "—")
         if memory and frame:
@@ -291,7 +293,8 @@ def _steps(findings: Findings, name: str) -> str:
         rows.append(cells)
     if not rows:
         return ""
-    head = "size,GPU ms,queueing ms,step ms,limit,steps/s,in order ×,peak MB,allocated MB"
+    head = "size,GPU ms,queueing ms,step ms,limit,queueing without graphs,step without graphs"
+    head += ",steps/s,in order ×,peak MB,allocated MB"
     lines = [f"## {name}: a training step", "", *_table([*head.split(","), "bytes/Gaussian"], rows)]
     each = _memory_each(findings)
     if each is not None:

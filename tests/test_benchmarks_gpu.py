@@ -116,7 +116,7 @@ def test_the_jobs_of_a_run(gpu_modules, tmp_path):
     import gpu_parts
 
     flags = argparse.Namespace(
-        datasets=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0"
+        datasets=tmp_path, only=list(gpu.GROUPS), seeds=[0, 1], peer=None, arch="9.0", minutes=8.8
     )
     planned = gpu.jobs(flags, tmp_path)
     names = [job.name for job in planned]
