@@ -25,14 +25,17 @@ import tempfile
 import time
 from pathlib import Path
 
-from gpu_jobs import MARK, Finding, Job, Runner
-from gpu_table import Findings, page
-
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "src"))  # snowsplat need not be installed
+
+from gpu_jobs import MARK, Finding, Job, Runner  # noqa: E402
+from gpu_table import Findings, page  # noqa: E402
+
 PARTS = Path(__file__).with_name("gpu_parts.py")
 GROUPS = ("device", "tests", "sanitizer", "stages", "peer", "train", "cpu")
 SIZES = ("200k", "1m", "3m")
 DATASETS = ("fox", "lego400")
+TRAINING_TESTS = ("trainer_gpu", "view_graphs")
 
 
 def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
@@ -78,9 +81,8 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         found["untimed"].append(job("build the peer", ["peer-build"], 240))
     if {"stages", "peer"} & set(flags.only):
         found["untimed"].append(job("make scenes", ["scenes", *SIZES, *folder], 120))
-    for path in sorted(
-        [*ROOT.glob("tests/ops/test_*.py"), ROOT / "tests" / "training" / "test_trainer_gpu.py"]
-    ):
+    training = [ROOT / "tests" / "training" / f"test_{name}.py" for name in TRAINING_TESTS]
+    for path in sorted([*ROOT.glob("tests/ops/test_*.py"), *training]):
         name = str(path.relative_to(ROOT))
         part = ["tests", name, "--done", str(scratch / f"{path.stem}.done")]
         found["tests"].append(job(name, part, 120, **two_threads))

@@ -123,6 +123,18 @@ def test_parts_between_the_projection_and_the_loss_are_not_recorded() -> None:
     assert not recordable([Darker()])
 
 
+def test_a_trainer_with_its_own_loss_is_not_recorded(dataset: Dataset) -> None:
+    class Doubled(Trainer):
+        def _loss(self, view: BatchView, rendered: RenderOutput) -> Tensor:
+            return 2.0 * super()._loss(view, rendered)
+
+    record = Counted()
+    trainer = Doubled(dataset, BUSY)
+    trainer.graphs = ViewGraphs(record, note=pytest.fail)
+    losses(trainer, 9)
+    assert record.recorded == 0
+
+
 @pytest.mark.gpu
 @needs_gpu
 @every_density_control

@@ -95,7 +95,10 @@ class Trainer(Run):
 
     def _gradients(self, step: int, batch: Sequence[BatchView]) -> list[ViewGradient]:
         sh_degree = self.config.sh_degree_at(step)
-        if self.graphs is not None:
+        # Recordings contain neither `_background` nor `_loss`, which a subclass may replace.
+        kind = type(self)
+        replaced = kind._background is not Trainer._background or kind._loss is not Trainer._loss
+        if self.graphs is not None and not replaced:
             (view,) = batch
             recorded = self.graphs.gradient(
                 self.gaussians, view, self._target(view), sh_degree, self.runner, self.loss

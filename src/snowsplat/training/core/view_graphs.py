@@ -199,10 +199,15 @@ class GraphRecorder:
         # Not the default stream, where nothing can be recorded. The backward pass runs on the
         # stream of the forward pass, so both are recorded on the same one.
         self._stream = torch.cuda.Stream(device)
-        # torch does not accept the pool again after its last graph was deleted; so one is kept.
-        self._kept = self(lambda: torch.zeros(1, device=device))
+        self._kept: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, work: Callable[[], object]) -> Callable[[], None]:
+        if self._kept is None:
+            # torch does not accept the pool again after its last graph was deleted.
+            self._kept = self._recorded(lambda: torch.zeros(1, device=self._device))
+        return self._recorded(work).replay
+
+    def _recorded(self, work: Callable[[], object]) -> torch.cuda.CUDAGraph:
         graph, present = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self._device)
         self._stream.wait_stream(present)
         with torch.cuda.stream(self._stream):
@@ -213,4 +218,4 @@ class GraphRecorder:
             finally:
                 graph.capture_end()
         present.wait_stream(self._stream)
-        return graph.replay
+        return graph
