@@ -435,7 +435,7 @@ def test_available_memory_is_limited_by_the_control_group(monkeypatch, files, ex
             return files[self.path]
 
     system = {"SC_PHYS_PAGES": 3, "SC_PAGE_SIZE": 4096}
-    monkeypatch.setattr("snowsplat.data.image_loader.Path", FakePath)
+    monkeypatch.setattr("snowsplat.util.machine.Path", FakePath)
     monkeypatch.setattr(os, "sysconf_names", dict.fromkeys(system, 0), raising=False)
     monkeypatch.setattr(os, "sysconf", system.__getitem__, raising=False)
     assert available_memory() == expected

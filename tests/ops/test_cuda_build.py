@@ -30,7 +30,7 @@ ARCHITECTURES = re.search(
 
 # Bytes of local memory (spilled registers, arrays with dynamic indices) that a thread may have: a
 # few registers. Kernels for float64 are for tests, and may have more.
-LOCAL_BYTES = 16
+LOCAL_BYTES = 24
 
 pytestmark = pytest.mark.build
 

@@ -1,6 +1,7 @@
 """Selection of the device, and the messages if a GPU cannot be used."""
 
 import importlib
+import json
 import sys
 import warnings
 from types import SimpleNamespace
@@ -9,10 +10,10 @@ import pytest
 import torch
 
 from snowsplat import ops
-from snowsplat.ops.cuda import availability
+from snowsplat.ops.cuda import availability, inventory
 from snowsplat.util.errors import UserError
 
-TOO_OLD = "A card (compute capability 6.1) is too old; use one of 7.5 (2018) or newer"
+TOO_OLD = "A card (compute capability 6.1) is too old; use one of 7.0 (2017) or newer"
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +21,7 @@ def machine(monkeypatch) -> SimpleNamespace:
     """A machine with a usable GPU; tests then change it."""
     monkeypatch.delenv("SNOWSPLAT_DEVICE", raising=False)
     fake = SimpleNamespace(
-        usable=True, capabilities=[(8, 6), (9, 0)], architectures=["sm_75", "sm_80", "sm_90"]
+        usable=True, capabilities=[(8, 6), (9, 0)], architectures=["sm_70", "sm_80", "sm_90"]
     )
     fake.driver = SimpleNamespace(error=0, cuda=(12, 4))
     cuda = torch.cuda
@@ -137,7 +138,7 @@ def test_the_message_of_torch_is_reported(machine, monkeypatch):
     unused("PyTorch cannot use it: torch.cuda.is_available() is false")
 
 
-@pytest.mark.parametrize("capability", [(6, 1), (7, 0), (7, 2)])
+@pytest.mark.parametrize("capability", [(5, 2), (6, 1), (6, 2)])
 def test_too_old_a_gpu(capability, machine):
     machine.capabilities[0] = capability
     unused(TOO_OLD.replace("6.1", f"{capability[0]}.{capability[1]}"))
@@ -148,6 +149,8 @@ def test_too_old_a_gpu(capability, machine):
     ("capability", "architectures", "runs"),
     [
         ((12, 0), ["sm_80", "sm_90"], False),
+        ((7, 0), ["sm_70", "sm_90"], True),
+        ((7, 0), ["sm_75", "sm_90"], False),
         ((12, 0), ["sm_80", "sm_90", "compute_90"], True),
         ((8, 9), ["sm_80"], True),
         ((8, 0), ["sm_86", "compute_90"], False),
@@ -212,3 +215,31 @@ def test_the_driver_is_queried_directly(monkeypatch):
 
     monkeypatch.setattr(availability.ctypes, "CDLL", absent)
     assert query() is None
+
+
+def test_the_inventory_of_a_machine(machine, monkeypatch):
+    memory = SimpleNamespace(total_memory=16 << 30)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: memory, raising=False)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: (15 << 30, 16 << 30))
+    machine.capabilities = [(7, 0), (6, 1)]
+    found = inventory.inventory()
+    assert json.loads(json.dumps(found)) == found
+    first, second = found["devices"]
+    assert first == {
+        "name": "A card",
+        "compute_capability": "7.0",
+        "memory_bytes": 16 << 30,
+        "free_bytes": 15 << 30,
+        "why_unused": None,
+    }
+    assert second["why_unused"] == TOO_OLD
+    assert (found["has_gpu"], found["why_unused"], found["driver_cuda"]) == (True, None, "12.4")
+    machine.usable, machine.driver = False, None
+    found = inventory.inventory()
+    assert (found["devices"], found["has_gpu"], found["driver_cuda"]) == ([], False, None)
+    assert "no NVIDIA driver" in found["why_unused"]
+
+
+def test_the_name_of_a_device():
+    assert ops.device_name(torch.device("cuda", 1)) == "A card (cuda:1)"
+    assert f"{ops.get_num_threads()} threads" in ops.device_name(torch.device("cpu"))

@@ -51,7 +51,7 @@ class ManyParams(Params):
 
 
 KERNEL = Kernel("statistic", SomeParams, threads=128, items=64)
-BUILT = (75, 80, 86, 89, 90, 100, 120)  # as in CMakeLists.txt
+BUILT = (70, 75, 80, 86, 89, 90, 100, 120)  # as in CMakeLists.txt
 
 
 class OnGpu(torch.Tensor):
@@ -182,7 +182,7 @@ def gpus(built, monkeypatch) -> FakeDriver:
 
 class FakeCompiler:
     version = (12, 9)
-    architectures = (50, 75, 80, 86, 87, 89, 90, 100, 103, 120)
+    architectures = (50, 70, 72, 75, 80, 86, 87, 89, 90, 100, 103, 120)
 
     def __init__(self):
         self.compiled = []
@@ -489,6 +489,8 @@ def test_the_real_bindings_with_a_stub_driver(new_process):
 @pytest.mark.parametrize(
     ("capability", "cubin"),
     [
+        ((7, 0), 70),
+        ((7, 2), 70),
         ((7, 5), 75),
         ((8, 0), 80),
         ((8, 6), 86),
@@ -522,18 +524,24 @@ def test_without_built_kernels_all_are_compiled(tmp_path, monkeypatch, compiler)
     assert list(cubins.candidates("rasterize", (8, 6), 12)) == [b"rasterize for sm_86, 1"]
 
 
-@pytest.mark.parametrize(("major", "package"), [(12, "nvrtc-cu12"), (13, "nvrtc")])
-def test_without_nvrtc_the_error_names_the_package(major, package, built, monkeypatch):
+@pytest.mark.parametrize(
+    ("capability", "major", "newest", "package"),
+    [((13, 0), 12, 12, "nvrtc-cu12"), ((13, 0), 13, 13, "nvrtc"), ((7, 0), 13, 12, "nvrtc-cu12")],
+)
+def test_without_nvrtc_the_error_names_the_package(
+    capability, major, newest, package, built, monkeypatch
+):
     def nothing(majors):
-        assert list(majors) == list(range(major, 11, -1))
+        assert list(majors) == list(range(newest, 11, -1))
         raise nvrtc.NotFound
 
     monkeypatch.setattr(nvrtc, "find", nothing)
     assert next(cubins.candidates("rasterize", (8, 6), major)) == b"rasterize 86"
     with pytest.raises(
-        UserError, match=rf"capability 13.0, and .*: pip install nvidia-cuda-{package}$"
+        UserError,
+        match=rf"capability {capability[0]}.0, and .*: pip install nvidia-cuda-{package}$",
     ):
-        list(cubins.candidates("rasterize", (13, 0), major))
+        list(cubins.candidates("rasterize", capability, major))
 
 
 # ---- the cache

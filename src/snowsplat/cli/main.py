@@ -22,7 +22,7 @@ import tyro
 from snowsplat._version import __version__
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
-from snowsplat.cli.subcommands import SUBCOMMANDS, description, load_subcommand
+from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
@@ -43,11 +43,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     accept_all_characters()
     _report_log_and_warnings_as_lines()
-    if arguments == ["--version"]:
+    if arguments in (["--version"], ["version"]):
         print("snowsplat", __version__)
         return 0
+    if arguments[:1] == ["help"]:  # `help train` is `train --help`
+        arguments = [*arguments[1:2], "--help"]
+    if arguments in ([], ["-h"], ["--help"]):
+        print(overview())
+        return 0
     try:
-        return int(parse(arguments or ["--help"]).run())
+        return int(parse(arguments).run())
     except SettingError as error:
         return _fail(with_flags(f"`{error.setting}`: {error.problem}"), 2)
     except UserError as error:
@@ -87,7 +92,6 @@ def parse(arguments: Sequence[str]) -> Any:
             return tyro.cli(
                 union,
                 prog="snowsplat",
-                description=description(),
                 args=[name, *rest],
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
@@ -106,16 +110,14 @@ def _choices(called: str) -> list[Any]:
     Importing and analysing all of them takes longer than everything else that a help text needs.
     Only completion scripts and suggestions for a misplaced flag need the flags of all subcommands.
     """
-    load_all = called.startswith("-") and called not in ("-h", "--help")
     choices = []
-    for name, subcommand in SUBCOMMANDS.items():
-        load = load_all or name == called
-        if load:
+    for name in SUBCOMMANDS:
+        if name == called or called.startswith("-"):
             kind = load_subcommand(name)
             join_lines_of_field_docstrings(kind)
         else:
             kind = make_dataclass(name.capitalize(), [])
-        text = inspect.cleandoc(kind.__doc__ or "") if name == called else subcommand.summary
+        text = inspect.cleandoc(kind.__doc__ or "")
         choices.append(Annotated[kind, tyro.conf.subcommand(name, description=text)])
     return choices
 

@@ -19,6 +19,7 @@ import torch
 
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import ImageSource, LoadedImage, box_downscale, load_views
+from snowsplat.util.machine import available_memory_bytes
 
 #: Default number of threads that decode ahead.
 DECODERS = min(4, os.cpu_count() or 1)
@@ -255,23 +256,4 @@ def available_memory(device: torch.device | None = None) -> int:
     """
     if device is not None and device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    available = 4 << 30  # if the system does not report it
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        available = next(int(s.split()[1]) for s in lines if s.startswith("MemAvailable:")) << 10
-    except (OSError, StopIteration, ValueError, IndexError):
-        if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-            available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        (
-            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
-            "/sys/fs/cgroup/memory/memory.usage_in_bytes",
-        ),
-    ):
-        try:
-            left = int(Path(limit).read_text()) - int(Path(used).read_text())
-        except (OSError, ValueError):  # no control group, or no limit ("max")
-            continue
-        available = min(available, max(left, 0))
-    return available
+    return available_memory_bytes()

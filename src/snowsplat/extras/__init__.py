@@ -9,7 +9,6 @@ from snowsplat.cli.subcommands import Subcommand, register
 register(
     "lift",
     Subcommand(
-        "Make a scene from one photo and its depth map.",
         "PHOTO --depth MAP -o OUT",
         "one photo and its depth -> a scene",
         "snowsplat.extras.lift.command",
@@ -18,7 +17,6 @@ register(
 register(
     "image",
     Subcommand(
-        "Approximate a photo by 2D Gaussians, or render such an approximation.",
         "PHOTO -o OUT",
         "a photo as 1000 Gaussians",
         "snowsplat.extras.image.command",
@@ -27,7 +25,6 @@ register(
 register(
     "globe",
     Subcommand(
-        "Put a scene into a snow globe: a web page, and a video.",
         "SCENE",
         "a snow globe, as a web page",
         "snowsplat.extras.globe.command",

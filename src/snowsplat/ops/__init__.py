@@ -9,7 +9,7 @@ from snowsplat.ops.activated import project_activated, with_centres
 from snowsplat.ops.adam import AdamRates, Moments, adam_step
 from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
-from snowsplat.ops.devices import default_device, resolve_device
+from snowsplat.ops.devices import default_device, device_name, resolve_device
 from snowsplat.ops.gaussian_parameters import GaussianParameters
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
@@ -35,6 +35,7 @@ __all__ = [
     "camera_gradient",
     "count_blended",
     "default_device",
+    "device_name",
     "get_num_threads",
     "neighbours",
     "photometric_loss",

@@ -8,7 +8,9 @@ from collections.abc import Callable
 import torch
 
 from snowsplat.ops.cuda import availability
+from snowsplat.ops.native import get_num_threads, isa
 from snowsplat.util.errors import UserError
+from snowsplat.util.machine import processor_name
 
 
 def default_device(note: Callable[[str], None] | None = None) -> torch.device:
@@ -58,6 +60,13 @@ def resolve_device(
     if why is not None:
         raise UserError(f"{source}: {why}; {remedy}")
     return torch.device("cuda", index)
+
+
+def device_name(device: torch.device) -> str:
+    """A device in words: "NVIDIA H200 (cuda:0)", or the processor, its threads and instructions."""
+    if device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)} ({device})"
+    return f"{processor_name()}, {get_num_threads()} threads, {isa()}"
 
 
 def _current_index() -> int:

@@ -12,6 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from snowsplat.data import Dataset
+from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
@@ -361,6 +362,7 @@ class _Job:
         time_ratio: float,
         memory: MemoryUse,
     ) -> TrainResult:
+        self.observer.note(f"training on {device_name(self.device)}")
         self.observer.note(str(memory))
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(

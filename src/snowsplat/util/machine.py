@@ -28,6 +28,30 @@ def memory_bytes() -> int:
         return 0
 
 
+def available_memory_bytes() -> int:
+    """Memory that this process can still allocate, in bytes: the free memory of the machine without
+    swap space, limited by the control group (container) of the process."""
+    available = 4 << 30  # if the system does not report it
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        available = next(int(s.split()[1]) for s in lines if s.startswith("MemAvailable:")) << 10
+    except (OSError, StopIteration, ValueError, IndexError):
+        available = memory_bytes() // 2 or available
+    for limit, used in (
+        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
+        (
+            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+            "/sys/fs/cgroup/memory/memory.usage_in_bytes",
+        ),
+    ):
+        try:
+            left = int(Path(limit).read_text()) - int(Path(used).read_text())
+        except (OSError, ValueError):  # no control group, or no limit ("max")
+            continue
+        available = min(available, max(left, 0))
+    return available
+
+
 def system_name() -> str:
     """System, architecture and Python version, for example "Linux x86_64, Python 3.12"."""
     major, minor, *_ = platform.python_version_tuple()

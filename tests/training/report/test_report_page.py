@@ -83,7 +83,7 @@ def test_the_page_contains_the_results(trained, tmp_path):
         "48 × 36",
         "a & b",
         "0.1 GB peak",
-        "instruction set",
+        "trained on",
         f"snowsplat view '{NAME}'",
     ):
         assert expected in content

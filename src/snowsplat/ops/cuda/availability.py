@@ -11,7 +11,7 @@ import warnings
 
 import torch
 
-OLDEST = (7, 5)  # oldest architecture of the kernels: see CMakeLists.txt
+OLDEST = (7, 0)  # oldest architecture of the kernels: see CMakeLists.txt
 
 # Errors of cuInit: there is no GPU; the library is a stub, which is only for linking.
 _NO_DEVICE, _STUB_LIBRARY = 100, 34
@@ -38,7 +38,7 @@ def why_unusable(index: int = 0) -> str | None:
     name, capability = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
     shown = f"{name} (compute capability {capability[0]}.{capability[1]})"
     if capability < OLDEST:
-        return f"{shown} is too old; use one of {OLDEST[0]}.{OLDEST[1]} (2018) or newer"
+        return f"{shown} is too old; use one of {OLDEST[0]}.{OLDEST[1]} (2017) or newer"
     if not _torch_runs_on(capability):
         return (
             f"this PyTorch, for CUDA {torch.version.cuda}, has no kernels for {shown}; "
@@ -55,6 +55,12 @@ def has_gpu() -> bool:
     """Whether the machine has an NVIDIA GPU and a driver, even if they cannot be used."""
     found = _driver()
     return found is not None and found.error != _NO_DEVICE
+
+
+def driver_cuda() -> str | None:
+    """The CUDA version of the driver, such as "12.8"; None without a driver."""
+    found = _driver()
+    return None if found is None else "{}.{}".format(*found.cuda)
 
 
 class _Driver:

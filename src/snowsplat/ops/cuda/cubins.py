@@ -41,18 +41,25 @@ def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[b
     yield _compiled_here(file, capability, cuda_major)
 
 
+def built_for() -> list[str]:
+    """The compute capabilities for which the package contains kernels: "7.5", …"""
+    numbers = sorted(int(folder.name[3:]) for folder in _BUILT.glob("sm_*"))
+    return [f"{number // 10}.{number % 10}" for number in numbers]
+
+
 @functools.cache
-def _nvrtc(cuda_major: int) -> nvrtc.Nvrtc:
-    # The newest first, because it supports the most GPUs.
-    return nvrtc.Nvrtc(nvrtc.find(range(min(cuda_major, 13), 11, -1)))
+def _nvrtc(newest: int) -> nvrtc.Nvrtc:
+    return nvrtc.Nvrtc(nvrtc.find(range(newest, 11, -1)))
 
 
 def _compiled_here(file: str, capability: Capability, cuda_major: int) -> bytes:
     shown = f"{capability[0]}.{capability[1]}"
+    # The newest NVRTC supports the most GPUs; from 13 on, it does not support those before 7.5.
+    newest = min(cuda_major, 13 if capability >= (7, 5) else 12)
     try:
-        compiler = _nvrtc(cuda_major)
+        compiler = _nvrtc(newest)
     except nvrtc.NotFound:
-        package = "nvidia-cuda-nvrtc" + ("-cu12" if cuda_major < 13 else "")
+        package = "nvidia-cuda-nvrtc" + ("-cu12" if newest < 13 else "")
         raise UserError(
             f"no kernels are built for a GPU of compute capability {shown}, and NVRTC, which could "
             f"compile them, is missing: pip install {package}"

@@ -17,7 +17,6 @@ from snowsplat.data import Dataset
 from snowsplat.evaluation import verdict
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
-from snowsplat.ops import native
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
 from snowsplat.training.report import masks, pictures
@@ -25,7 +24,7 @@ from snowsplat.util import charts
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
 from snowsplat.util.html import bar, cards, page, table, text
-from snowsplat.util.machine import memory_bytes, processor_name, system_name
+from snowsplat.util.machine import memory_bytes, system_name
 from snowsplat.util.process import single_threaded
 
 #: Number of training views that are evaluated if no views were held out.
@@ -265,10 +264,8 @@ def _settings(trained: Trained) -> str:
 
 
 def _machine(trained: Trained) -> str:
-    threads = ops.get_num_threads()
     rows = [
-        ["processor", text(processor_name())],
-        ["threads", f"{threads}, instruction set {native.isa()}"],
+        ["trained on", text(ops.device_name(trained.gaussians.means.device))],
         ["system", text(system_name())],
     ]
     memory = [f"{trained.peak_bytes / 1e9:.1f} GB peak"] if trained.peak_bytes else []
