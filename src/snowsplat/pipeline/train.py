@@ -362,8 +362,7 @@ class _Job:
         time_ratio: float,
         memory: MemoryUse,
     ) -> TrainResult:
-        self.observer.note(f"training on {device_name(self.device)}")
-        self.observer.note(str(memory))
+        self.observer.note(f"training on {device_name(self.device)}; {memory}")
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(
             self.out,
