@@ -21,6 +21,7 @@ extensions = [
     "docstrings",
     "drawings",
     "local_mathjax",
+    "reference_flags_table",
     "repository_links",
     "settings_table",
     "subcommand_help",

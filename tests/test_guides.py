@@ -146,13 +146,6 @@ def test_named_flags_exist(capsys):
 
 # Flags of the other programs.
 OTHERS = {
-    "docs/guides/reference-implementation.md": {
-        "--antialiasing",
-        "--checkpoint_iterations",
-        "--data_device",
-        "--random_background",
-        "--start_checkpoint",
-    },
     "docs/guides/gsplat.md": {
         "--ckpt",
         "--data_factor",

@@ -122,7 +122,9 @@ def test_a_folder_of_the_reference_implementation(run, trained, dataset, tmp_pat
         f"Namespace(sh_degree=3, source_path='{dataset}', model_path='x', images='images', "
         "resolution=-1, white_background=False, data_device='cuda', eval=True)"
     )
-    assert run("evaluate", theirs).code == 0
+    result = run("evaluate", "-m", trained, theirs, "--iteration", -1)
+    assert result.code == 0
+    assert [f"{out}/metrics.json" in result.out for out in (trained, theirs)] == [True, True]
     ours = json.loads((trained / "metrics.json").read_text())
     assert json.loads((theirs / "metrics.json").read_text()) == ours
     (theirs / "cfg_args").write_text("__import__('os').system('echo executed')")

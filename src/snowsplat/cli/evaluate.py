@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -42,8 +42,19 @@ class Evaluate(SceneFlags):
     """File with the weights for LPIPS (of AlexNet or VGG16, and of the linear layers), in the
     safetensors format."""
 
+    model_paths: Annotated[tuple[Path, ...], flag("OUT [OUT ...]")] = ()
+    """Several output folders, one after the other."""
+
     def run(self) -> int:
         """Returns the exit code, 0."""
+        if self.model_paths:
+            for path in self.model_paths:
+                replace(self, model_path=path, model_paths=())._evaluate()
+        else:
+            self._evaluate()
+        return 0
+
+    def _evaluate(self) -> None:
         from snowsplat.evaluation.lpips import Lpips
         from snowsplat.pipeline.evaluate import evaluate, views_of
 
@@ -71,4 +82,3 @@ class Evaluate(SceneFlags):
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
         print(f"iteration {scene.iteration}, {which}: {where}")
-        return 0

@@ -22,6 +22,7 @@ import tyro
 from snowsplat._version import __version__
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
+from snowsplat.cli.reference_flags import translated
 from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
@@ -79,12 +80,15 @@ def parse(arguments: Sequence[str]) -> Any:
     Exits the process, as argparse does, after printing a help text.
 
     Raises:
-        UserError: an unknown subcommand, or invalid flags.
+        UserError: an unknown subcommand, or invalid or refused flags.
     """
     name, *rest = arguments
     name = _FORMER_NAMES.get(name, name)
     if name not in SUBCOMMANDS and not name.startswith("-"):
         raise UserError(_unknown_subcommand(name))
+    rest, notes = translated(name, rest)
+    for note in notes:
+        _print_error(note)
     union: Any = Union[tuple(_choices(name))]  # noqa: UP007 (made at run time)
     printed = io.StringIO()
     try:

@@ -284,7 +284,7 @@ class OutputFolder:
         return path
 
     def read_scene(self, iteration: int | None) -> tuple[int, Gaussians]:
-        """An iteration and its scene; None: the last one.
+        """An iteration and its scene; None or -1: the last one.
 
         Raises:
             UserError: no such folder or scene, or a damaged one.
@@ -298,7 +298,7 @@ class OutputFolder:
         scenes = self.scenes()
         if not scenes:
             raise UserError(f"{self.path}: contains no scene (no point_cloud/iteration_N in it)")
-        chosen = scenes[-1] if iteration is None else iteration
+        chosen = scenes[-1] if iteration in (None, -1) else iteration
         if chosen not in scenes:
             there = ", ".join(map(str, scenes))
             raise UserError(
