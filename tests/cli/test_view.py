@@ -32,12 +32,19 @@ def scene(out: Path) -> Path:
     return out / "point_cloud/iteration_60/point_cloud.ply"
 
 
+def address(line: str) -> str:
+    """The URL in the line about it."""
+    told, _, url = line.strip().partition(": ")
+    assert told == "open this in a browser, Ctrl-C ends it"
+    assert url.startswith("http://127.0.0.1:")
+    return url
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_serves_until_a_signal(start, out, number):
     process = start("view", out, "--no-browser")
     assert str(scene(out)) in process.stdout.readline()
-    url = process.stdout.readline().strip()
-    assert url.startswith("http://127.0.0.1:")
+    url = address(process.stdout.readline())
     with urllib.request.urlopen(url, timeout=10) as page:
         assert b"<title>out - snowsplat</title>" in page.read()
     with urllib.request.urlopen(f"{url}scene.compressed.ply", timeout=10) as content:
@@ -52,7 +59,7 @@ def test_a_real_browser_at_the_printed_address(start, out):
     process = start("view", out, "--no-browser")
     process.stdout.readline()
     with Browser(320, 240) as browser:
-        page = browser.open(process.stdout.readline().strip() + "?webgl&noui")
+        page = browser.open(address(process.stdout.readline()) + "?webgl&noui")
         page.wait_for("!!window.app", 60)
         assert page.screenshot().std() > 10
         assert not page.errors
@@ -86,14 +93,14 @@ def served(run, monkeypatch):
 
 def test_opens_a_browser_if_there_is_a_display(served, out):
     result, opened, _ = served(out, environment=["DISPLAY"])
-    assert opened == [result.out.splitlines()[1]]
+    assert opened == [address(result.out.splitlines()[1])]
     assert served(out, "--no-browser", environment=["DISPLAY"])[1] == []
     assert served(out)[1] == []
 
 
 def test_over_ssh_it_prints_the_port_forwarding_command(served, out):
     result, opened, _ = served(out, environment=["SSH_CONNECTION"])
-    port = result.out.splitlines()[1].split(":")[2].split("/")[0]
+    port = address(result.out.splitlines()[1]).split(":")[2].split("/")[0]
     assert f"ssh -L {port}:127.0.0.1:{port} " in result.out
     assert not opened
     assert "ssh" not in served(out)[0].out
@@ -101,8 +108,7 @@ def test_over_ssh_it_prints_the_port_forwarding_command(served, out):
 
 def test_with_a_public_host_it_prints_the_address_for_other_computers(served, out):
     here, others = served(out, "--host", "0.0.0.0", "--no-browser")[0].out.splitlines()[1:]
-    assert here.startswith("http://127.0.0.1:")
-    assert others.endswith(here.replace("127.0.0.1", socket.gethostname()))
+    assert others.endswith(address(here).replace("127.0.0.1", socket.gethostname()))
 
 
 def test_which_scene_and_which_cameras(served, out, tmp_path):
@@ -131,6 +137,31 @@ def test_scenes_of_other_formats(served, out, tmp_path):
         result, _, (_, shown, _, _) = served(tmp_path / name)
         assert f"{tmp_path / name}: {len(gaussians):,} Gaussians" in result.out
         assert len(shown) == len(gaussians)
+
+
+@pytest.mark.parametrize("levels", [False, True])
+def test_a_published_site_is_served_as_it_is(start, out, tmp_path, monkeypatch, levels):
+    from snowsplat.pipeline import publish
+
+    monkeypatch.setattr(publish, "_LARGE", 10 if levels else 10**9)
+    site = tmp_path / "site"
+    publish.publish(out, site, publish.PublishOptions(title="My garden"))
+    process = start("view", site, "--no-browser")
+    assert process.stdout.readline() == f"{site / 'index.html'}: a web site\n"
+    url = address(process.stdout.readline())
+    for file in (
+        "index.html",
+        "index.js",
+        "poster.jpg",
+        "lod-meta.json" if levels else "scene.sog",
+    ):
+        with urllib.request.urlopen(url + file, timeout=10) as response:
+            assert response.read() == (site / file).read_bytes()
+    with urllib.request.urlopen(url, timeout=10) as page:
+        assert b"<title>My garden" in page.read()
+        assert page.headers["Content-Type"] == "text/html; charset=utf-8"
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 0
 
 
 def test_errors(refused, out, tmp_path):

@@ -59,7 +59,9 @@ def test_other_text_is_rejected(text: str) -> None:
 def test_sizes_are_formatted() -> None:
     assert format_bytes(1_300_000_000) == "1.3 GB"
     assert format_bytes(240_000_000) == "240 MB"
-    assert format_bytes(0) == "1 MB"
+    assert format_bytes(3_440_000) == "3.4 MB"
+    assert format_bytes(31_990) == "32 kB"
+    assert format_bytes(0) == "0 bytes"
 
 
 def test_without_a_budget_nothing_is_reduced() -> None:

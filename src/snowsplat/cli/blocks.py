@@ -10,6 +10,7 @@ import tyro
 
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
 
@@ -143,7 +144,7 @@ class Blocks:
             )
         if distance := plan.settings.get("sky_distance"):
             print(f"distance of the sky in all of them: {distance:g}")
-        print(f"train them with: snowsplat blocks train {self.output}")
+        print(next_step("train them with", "blocks", "train", self.output))
         return 0
 
     def _train(self, folder: Path) -> int:
@@ -164,6 +165,7 @@ class Blocks:
             except TrainingStopped as stopped:
                 print(f"{stopped}; continue with the same command")
                 return 130
+        print(next_step("when all blocks are trained", "blocks", "merge", folder))
         return 0
 
     def _merge(self, folder: Path) -> int:
@@ -173,4 +175,5 @@ class Blocks:
         kept, trained = sum(merged.gaussians), sum(merged.trained)
         print(f"{merged.scene}: {kept:,} Gaussians of {len(merged.gaussians)} blocks")
         print(f"{trained - kept:,} Gaussians outside of the cells of their blocks are left out")
+        print(see_and_share(folder))
         return 0

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import see_and_share
 from snowsplat.util.errors import UserError
 
 
@@ -60,4 +61,5 @@ class Clean:
             f"{self.target}: {done.before - done.after:,} of {done.before:,} Gaussians removed; "
             f"PSNR of {done.compared} {before:.2f} dB before, {after:.2f} dB after"
         )
+        print(see_and_share(self.target))
         return 0

@@ -9,7 +9,9 @@ from typing import Annotated, Literal
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
 Vector = tuple[float, float, float]
@@ -103,6 +105,8 @@ class Convert:
                 overwrite=self.overwrite,
                 observer=observer,
             )
-        written = f"{format.size(target):,} bytes of {format.name}"
+        written = f"{format_bytes(format.size(target))} of {format.name}"
         print(f"{target}: {written}; lost in this format: {format.loses}")
+        page = format.name == "HTML"
+        print(f"to see it: open {target} in a browser" if page else see_and_share(target))
         return 0

@@ -59,8 +59,7 @@ class Demo:
             return 1
         scene = result.made.folder.path.parent
         if not self.open:
-            look = shlex.join(["snowsplat", "view", str(scene)])
-            print(f"\nTo see the scene: {look}; with your own photos: snowsplat make PHOTOS")
+            print("\nwith your own photos: snowsplat make PHOTOS")
             return 0
         return View(scene).run()
 

@@ -43,5 +43,9 @@ class Doctor:
             print(json.dumps(facts, indent=2))
         else:
             names = ", ".join(finding.name for finding in problems)
-            print(f"\nsee above: {names}" if problems else "\nnothing is missing")
+            print(
+                f"\nsee above: {names}"
+                if problems
+                else "\nnothing is missing; to try it: snowsplat demo"
+            )
         return int(any(finding.essential for finding in problems))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from snowsplat.cli.flags import flag
+from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.scene_flags import SceneFlags
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ class Evaluate(SceneFlags):
                 replace(self, model_path=path, model_paths=())._evaluate()
         else:
             self._evaluate()
+            out = self.output_path()
+            print(next_step("to see the renders", "render", out, "--split", self.split))
         return 0
 
     def _evaluate(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -10,6 +11,8 @@ from typing import Annotated, Any, Optional
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import next_step, see_and_share
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import printable
 
@@ -53,11 +56,28 @@ class Info:
             print(json.dumps(facts, indent=2))
         else:
             _print(facts)
+            print("\n".join(_next(facts["kind"], self.path)))
         return 0
+
+
+def _next(kind: str, path: Path) -> list[str]:
+    """What to do with what was described."""
+    if kind in ("scene", "output folder"):
+        return [see_and_share(path)]
+    if kind in ("photos", "video"):
+        return [next_step("to make a scene", "make", path)]
+    if kind == "dataset":
+        return [next_step("to make a scene", "train", path, "-o", "OUT", "--eval")]
+    return []
 
 
 def _print(facts: dict[str, Any], indent: str = "") -> None:
     """Print one line per fact; a dict that contains dicts or lists is indented below its name."""
+    facts = {
+        # "bytes_in_memory" -> "size in memory"
+        re.sub("^bytes", "size", name): format_bytes(value) if name.startswith("bytes") else value
+        for name, value in facts.items()
+    }
     width = max(len(name) for name in facts)
     for name, value in facts.items():
         label = f"{indent}{name.replace('_', ' '):{width}}"

@@ -22,8 +22,9 @@ import tyro
 from snowsplat._version import __version__
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
+from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.reference_flags import translated
-from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand, overview
+from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import printable
@@ -128,9 +129,13 @@ def _choices(called: str) -> list[Any]:
 
 def _unknown_subcommand(name: str) -> str:
     similar = difflib.get_close_matches(name, [*SUBCOMMANDS, *_FORMER_NAMES], 1)
-    if similar:
+    hint = advice(name)
+    if hint is None and os.path.exists(name):
+        make, info = next_step("to make a scene", "make", name), next_step("or", "info", name)
+        hint = f"{make}; {info}"
+    elif hint is None and similar:
         hint = f"did you mean {_FORMER_NAMES.get(similar[0], similar[0])}?"
-    else:
+    elif hint is None:
         hint = f"choose from {', '.join(SUBCOMMANDS)}"
     return f"{name}: unknown subcommand; {hint} (snowsplat --help describes all of them)"
 

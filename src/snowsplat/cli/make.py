@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from snowsplat.cli.flags import flag, switch, with_flags
+from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ def print_summary(made: MakeResult) -> None:
         figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
     poses = made.dataset_report or f"those of {made.dataset} are used"
     print(
-        f"\nThe scene, for any viewer:  {made.scene}\n"
+        f"\nThe scene, for any viewer:  {made.scene} ({format_bytes(made.scene.stat().st_size)})\n"
         f"{'Report on camera poses:' if made.dataset_report else 'Camera poses:':27} {poses}\n"
         f"Report on the training:     {made.folder.report}\n"
         f"Rendered test views:        {made.renders}\n"
@@ -161,4 +162,4 @@ def print_summary(made: MakeResult) -> None:
     )
     if made.verdict is not None:
         print("\n" + "\n".join(made.verdict.lines("The scene")))
-    sys.stdout.flush()
+    print("\n" + see_and_share(made.folder.path.parent), flush=True)

@@ -10,6 +10,7 @@ from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
 from snowsplat.pipeline.observer import Observer
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.viewer.hosts import LOCAL_HOST
 
@@ -73,7 +74,8 @@ class TerminalObserver(Observer):
         steps = result.step - result.first_step
         count = f"{steps} more steps" if result.first_step else f"{steps} steps"
         print(
-            f"{result.scene}: {result.gaussians:,} Gaussians, {count} in "
+            f"{result.scene}: {result.gaussians:,} Gaussians, "
+            f"{format_bytes(result.scene.stat().st_size)}, {count} in "
             f"{duration(result.seconds)}, {result.memory}"
         )
         for line in result.reductions:

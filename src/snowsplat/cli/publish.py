@@ -9,7 +9,9 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
 
@@ -27,8 +29,8 @@ class Publish:
       which browsers load what they show.
       Any web host can serve the folder; nothing has to run there. The page loads
       nothing from other sites. Browsers do not open it from disk: to look at it,
-      run python -m http.server -d site. Over https, browsers with a headset also
-      offer VR and AR.
+      run snowsplat view site. Over https, browsers with a headset also offer VR
+      and AR.
     """
 
     scene: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
@@ -66,5 +68,7 @@ class Publish:
                 threads=self.threads,
                 observer=observer,
             )
-        print(f"{result.folder}: {result.gaussians:,} Gaussians, {result.bytes / 1e6:.1f} MB")
+        print(f"{result.folder}: {result.gaussians:,} Gaussians, {format_bytes(result.bytes)}")
+        look = next_step("to look at it", "view", result.folder)
+        print(f"{look}; to share it: copy the folder to a web host, and send the address")
         return 0

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.scene_flags import SceneFlags
 from snowsplat.util.errors import UserError
@@ -110,6 +111,7 @@ class Render(SceneFlags):
             )
         for folder, count in rendered.items():
             print(f"{folder}: {count} images")
+        print(next_step("for a video", "render", self.output_path(), "--path", "ellipse"))
         return 0
 
     def _antialias(self) -> bool | None:
@@ -146,3 +148,4 @@ class Render(SceneFlags):
                 compute=self.compute(),
                 observer=observer,
             )
+        print(see_and_share(scene))

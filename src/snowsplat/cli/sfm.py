@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
 
@@ -98,7 +99,7 @@ class Sfm:
         verdict = Verdict.from_json(outcomes["report"].result["verdict"])
         for line in [] if verdict is None else verdict.lines("the photos"):
             print(line)
-        print(f"train it with: snowsplat train {folder} -o OUT --eval")
+        print(next_step("train it with", "train", folder, "-o", "OUT", "--eval"))
         return 0
 
     def _inputs_and_folder(self) -> tuple[tuple[Path, ...], Path]:

@@ -52,6 +52,31 @@ def load_subcommand(name: str) -> Any:
     return getattr(import_module(SUBCOMMANDS[name].module), name.capitalize())
 
 
+# What to use for words that people try.
+_WORDS = {
+    "use convert (a file in another format) or publish (a web site)": "export save download",
+    "use publish (a web site), or convert SCENE FILE.html": "share upload web site html embed",
+    "there are no meshes; convert writes Gaussians in other formats": "mesh obj",
+    "use convert": "edit crop merge compress decimate transform resize rotate scale",
+    "use view": "show open play viewer serve gui display",
+    "use make": "reconstruct splat build create scan run process new start",
+    "use sfm": "colmap poses cameras match dataset",
+    "use train": "fit optimize optimise resume continue",
+    "use evaluate": "metrics test eval psnr score compare",
+    "use render": "video movie film images",
+    "use clean": "prune filter floaters",
+    "use info": "inspect describe stats",
+    "use doctor": "check diagnose gpu devices system env",
+    "use watch": "attach monitor",
+}
+
+
+def advice(word: str) -> str | None:
+    """What to use for a word that is no subcommand, such as "export"; None if it is not known."""
+    word = word.lower()
+    return next((hint for hint, words in _WORDS.items() if word in words.split()), None)
+
+
 def overview() -> str:
     """All subcommands, a line each. It fits into a terminal of 80 columns and 24 lines."""
     lines = [

@@ -7,6 +7,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
 from snowsplat.cli.flags import with_flags
+from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageFlags
 from snowsplat.cli.train_flags import TrainFlags
@@ -81,10 +82,12 @@ class Train(TrainFlags):
                 print(with_flags(str(stopped)))
                 if stopped.scene is None:
                     raise
-                print(f"resume with: snowsplat train -o {self.output} --resume")
+                print(next_step("resume with", "train", "-o", self.output, "--resume"))
                 return 130
             if result.verdict is not None:
                 print("\n".join(result.verdict.lines("the scene")), flush=True)
+            if not self.quiet:
+                print(see_and_share(self.output), flush=True)
             if page is not None:
                 with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
                     print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)

@@ -30,6 +30,7 @@ class View:
     Examples:
       snowsplat view out/garden
       snowsplat view garden.spz
+      snowsplat view site                      the folder of snowsplat publish
       snowsplat view out/garden --no-browser --port 8080
 
     Notes:
@@ -43,8 +44,8 @@ class View:
     """
 
     path: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
-    """A scene file of any format, the output folder of train or make, or a folder with levels of
-    detail."""
+    """A scene file of any format, the output folder of train or make, a folder with levels of
+    detail, or a site of publish."""
     iteration: Annotated[int | None, flag("N", default="the last step")] = None
     """If OUT contains several scenes, the step after which the scene was saved."""
     host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
@@ -71,8 +72,9 @@ class View:
                 scene.files, scene.headers, self.host, self.port, self.allow_host
             ) as server,
         ):
-            print(f"{scene.file}: {scene.gaussians:,} Gaussians")
-            print(server.url, flush=True)
+            site = scene.gaussians is None
+            print(f"{scene.file}: {'a web site' if site else f'{scene.gaussians:,} Gaussians'}")
+            print(f"open this in a browser, Ctrl-C ends it: {server.url}", flush=True)
             for url in server.others:
                 print(f"from other computers: {url}", flush=True)
             if not server.others and over_ssh():

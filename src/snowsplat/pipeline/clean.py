@@ -24,6 +24,7 @@ from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import make_parent
 from snowsplat.util.process import single_threaded
 
 #: At most this number of photos is compared, evenly chosen.
@@ -69,7 +70,8 @@ def clean(
 
     Args:
         scene: the output folder of a training run, or a scene file.
-        target: the file to write; its suffix selects the format.
+        target: the file to write, in a folder that is created if it does not exist; its suffix
+            selects the format.
         dataset: the photos of the scene; default: the photos of the training, if they still exist.
         overwrite: replace ``target``.
         compute: the device; default: a GPU if there is one.
@@ -101,6 +103,7 @@ def clean(
         before = judge.psnr(gaussians)
         cleaned = without_floaters(gaussians, cameras, judge.psnr, judge.enough(before))
         after = judge.psnr(cleaned)
+    make_parent(target)
     write_gaussians(target, cleaned.to(torch.device("cpu")))
     return Cleaned(len(gaussians), len(cleaned), judge.compared, (before, after))
 

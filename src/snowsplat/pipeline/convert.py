@@ -30,6 +30,7 @@ from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.files import make_parent
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.scene import ready
@@ -127,7 +128,8 @@ def convert(
 
     Args:
         sources: scene files of any format, or output folders, whose last scene is used.
-        target: the file to write; its suffix selects the format. FOLDER/lod-meta.json stands for
+        target: the file to write, in a folder that is created if it does not exist; its suffix
+            selects the format. FOLDER/lod-meta.json stands for
             levels of detail in this folder.
         edits: changes to the merged scene; default: none.
         dataset: with ``decimate``: train the result for a moment on the photos of this dataset.
@@ -188,6 +190,7 @@ def convert(
         write = partial(write_levels, observer=observer)
 
     written: list[Gaussians] = []
+    make_parent(target)
 
     def write_placed(path: Path, gaussians: Gaussians) -> None:
         # The scene is moved last: cameras and photos show it in its place.

@@ -18,6 +18,7 @@ from snowsplat.scene.origin import HERE, Origin
 from snowsplat.scene.simplify import simplify
 from snowsplat.training.core.distillation import distill
 from snowsplat.training.core.progress import Progress
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import SettingError
 from snowsplat.util.files import atomic_path
 
@@ -119,7 +120,7 @@ def write_within(
                         break
                     count = int(count * min(0.98, size / actual))
             if not count:
-                raise SettingError("decimate", f"no scene fits into {size:,} bytes; use more")
+                raise SettingError("decimate", f"no scene fits into {format_bytes(size)}; use more")
             path.replace(temporary)
             write_origin(target, read_origin(path))
         finally:

@@ -16,7 +16,7 @@ from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.viewer.web.panel import Description, made_on
-from snowsplat.viewer.web.publication import write_site
+from snowsplat.viewer.web.publication import SCENE, is_site, write_site
 
 #: Larger scenes are written in levels of detail. Phones show at most that many Gaussians at a time.
 _LARGE = 2_000_000
@@ -112,15 +112,15 @@ def publish(
 def _write_levels(observer: Observer, folder: Path, gaussians: Gaussians) -> str:
     """Write the levels of detail of a site, and remove the SOG file of an earlier one."""
     write_levels(folder / INDEX, gaussians, observer)
-    (folder / "scene.sog").unlink(missing_ok=True)
+    (folder / SCENE).unlink(missing_ok=True)
     return INDEX
 
 
 def _check_free(folder: Path, overwrite: bool) -> None:
     if not folder.is_dir():
         raise UserError(f"{folder}: is a file; use a folder for the output")
-    names = {entry.name for entry in folder.iterdir()}
-    if names and not ("index.html" in names and names & {"scene.sog", INDEX}):
+    names = [entry.name for entry in folder.iterdir()]
+    if names and not is_site(folder):
         raise UserError(f"{folder}: contains other files; use a new or an empty folder")
     if names and not overwrite:
         raise UserError(f"{folder}: already contains a web site; use `overwrite` to replace it")

@@ -1,4 +1,4 @@
-"""`view`: the files of a page that shows a scene, in levels of detail if it is large."""
+"""`view`: the files of a page that shows a scene, in levels of detail if it is large; or a site."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.panel import Description, made_on
+from snowsplat.viewer.web.publication import PAGE, is_site, site_files
 from snowsplat.viewer.web.scene import site
 from snowsplat.viewer.web.served_file import Served
 
@@ -27,8 +28,8 @@ _LARGE = 4_000_000
 class ViewedScene:
     """The page of a scene."""
 
-    file: Path  # the scene file
-    gaussians: int  # their number
+    file: Path  # the scene file, or the page of a published site
+    gaussians: int | None  # their number; None for a published site, which is served as it is
     files: dict[str, Served]  # the files of the page, by name
     headers: dict[str, str]  # HTTP headers of the page
 
@@ -37,7 +38,7 @@ class ViewedScene:
 def viewed_scene(
     path: Path | str, iteration: int | None = None, observer: Observer = SILENT
 ) -> Iterator[ViewedScene]:
-    """A context with the page of a scene; see `load_viewable`.
+    """A context with the page of a scene; see `load_viewable`. ``path`` may be a published site.
 
     Of levels of detail, only the coarsest is read, so their page is ready at once. For other
     scenes of more than 4 million Gaussians, levels of detail are written to a temporary folder,
@@ -48,10 +49,13 @@ def viewed_scene(
     """
     path = Path(path)
     title = path.resolve().name
-    index = _levels_in(path)
+    published, index = is_site(path), _levels_in(path)
+    if iteration is not None and (published or index is not None):
+        raise UserError("`iteration` selects a scene of an output folder; leave it out")
+    if published:
+        yield ViewedScene(path / PAGE, None, *site_files(path))
+        return
     if index is not None:
-        if iteration is not None:
-            raise UserError("`iteration` selects a scene of an output folder; leave it out")
         counts = read_index(index).counts()
         coarse = read_lod(index, len(counts) - 1).to_gaussians()
         _check(index, coarse)

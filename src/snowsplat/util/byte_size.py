@@ -25,5 +25,8 @@ def parse_bytes(text: str) -> int:
 
 
 def format_bytes(count: int) -> str:
-    """Text such as "1.3 GB" or "240 MB"."""
-    return f"{count / 1e9:.1f} GB" if count >= 0.95e9 else f"{max(1, round(count / 1e6))} MB"
+    """Text such as "1.3 GB", "240 MB", "3.4 MB" or "31 kB"."""
+    for unit, name in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= 0.95 * unit:
+            return f"{count / unit:.{int(count < 10 * unit or name == 'GB')}f} {name}"
+    return f"{count} bytes"

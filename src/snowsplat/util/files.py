@@ -9,6 +9,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
+from snowsplat.util.errors import UserError
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -54,8 +56,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
                 os.close(handle)
     except OSError as error:
         named = [str(name) for name in (error.filename, error.filename2) if name is not None]
-        beside = str(path.with_name(f".{path.name}."))
-        ours = not named or any(name.startswith(beside) for name in named)
+        ours = not named or any(Path(name).name.startswith(f".{path.name}.") for name in named)
         better = OSError(error.errno, error.strerror, str(path))
         if ours and type(error) is type(better) and error.errno is not None:
             raise better from error
@@ -98,6 +99,14 @@ def _lock(temporary: Path) -> int:
         os.close(handle)
         raise
     return handle
+
+
+def make_parent(path: Path) -> None:
+    """Create the folder of a file. Raises UserError if there is a file in its place."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UserError(f"{path}: a part of its folder is a file; use another folder") from None
 
 
 def is_temporary(path: Path, names: Collection[str]) -> bool:

@@ -10,6 +10,7 @@ import tyro
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
 
@@ -70,6 +71,7 @@ class Globe:
                 threads=self.threads,
                 observer=observer,
             )
-        size = result.page.stat().st_size / 1e6
-        print(f"{result.page}: {result.gaussians:,} Gaussians, {size:.1f} MB")
+        size = format_bytes(result.page.stat().st_size)
+        print(f"{result.page}: {result.gaussians:,} Gaussians, {size}")
+        print(f"to see it: open {result.page} in a browser; to share it: send this file")
         return 0

@@ -23,7 +23,7 @@ from snowsplat.extras.globe import globe_video as video
 from snowsplat.extras.globe.layout import Arrangement
 from snowsplat.ops import reference
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.util.files import write_text
+from snowsplat.util.files import make_parent, write_text
 from snowsplat.util.safe_json import printable
 
 _WEB = Path(__file__).with_name("web")
@@ -75,6 +75,7 @@ def write_page(path: Path | str, arrangement: Arrangement, name: str) -> None:
         about=json.dumps(about).replace("<", "\\u003c"),
         script=script,
     )
+    make_parent(Path(path))
     write_text(Path(path), page)
 
 

@@ -10,6 +10,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 
@@ -86,10 +87,10 @@ class Image:
             f"SSIM {end.ssim:.4f}, {end.step:,} steps in {duration(end.seconds)}"
         )
         print(
-            f"{result.output / 'image.gimg'}: {result.file_bytes:,} bytes, "
+            f"{result.output / 'image.gimg'}: {format_bytes(result.file_bytes)}, "
             f"{result.bits_per_pixel:.2f} bits per pixel, PSNR {result.file_psnr:.2f} dB"
         )
-        print(f"{result.output / 'report.html'}: the report")
+        print(f"to see it: open {result.output / 'report.html'} in a browser")
         return 0
 
     def _decode(self, compact: Path, target: Path) -> int:

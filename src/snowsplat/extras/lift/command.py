@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -116,6 +117,7 @@ class Lift:
             print(f"held-out photos of {evaluation.size}: PSNR {evaluation.psnr:.2f} dB")
         if result.swing is not None:
             print(f"{result.swing}: the video")
+        print(see_and_share(self.output))
         return 0
 
     def _lift(self, photo: Path, output: Path, source: DepthSource) -> LiftResult:

@@ -6,6 +6,7 @@ import html
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 import torch
 from PIL import Image
@@ -20,9 +21,19 @@ from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene, ready
+from snowsplat.viewer.web.served_file import FileOnDisk, Served
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page
 
-SCENE, POSTER = "scene.sog", "poster.jpg"
+PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
+_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".jpg": "image/jpeg",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".txt": "text/plain; charset=utf-8",
+    ".webp": "image/webp",
+}
 #: The size that services recommend for the picture of a link (Open Graph).
 POSTER_SIZE = (1200, 630)
 
@@ -87,7 +98,25 @@ def write_site(
     policy = html.escape(content_policy(text, "'self'"))
     rule = f'<meta http-equiv="Content-Security-Policy" content="{policy}" />'
     charset = '<meta charset="UTF-8" />'
-    write_text(folder / "index.html", text.replace(charset, f"{charset}\n        {rule}", 1))
+    write_text(folder / PAGE, text.replace(charset, f"{charset}\n        {rule}", 1))
+
+
+def is_site(folder: Path) -> bool:
+    """Whether a folder contains a site that `write_site` has written."""
+    return (folder / PAGE).is_file() and any((folder / name).is_file() for name in (SCENE, INDEX))
+
+
+def site_files(folder: Path) -> tuple[dict[str, Served], dict[str, str]]:
+    """The files of a site for a `StaticServer`, and the HTTP headers for them."""
+    files: dict[str, Served] = {
+        quote(file.relative_to(folder).as_posix()): FileOnDisk(
+            file, _TYPES.get(file.suffix, "application/octet-stream")
+        )
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
+    # The page contains the rest of its policy.
+    return {"": files[PAGE], **files}, {"Content-Security-Policy": "frame-ancestors 'none'"}
 
 
 def _tags(properties: Mapping[str, str]) -> str:
