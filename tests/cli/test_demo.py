@@ -42,10 +42,11 @@ def test_from_nothing_to_a_scene(run, small, tmp_path, monkeypatch):
     assert (out / "truth" / "images.txt").is_file()
     assert len(read_gaussians(out / "made" / "photos.ply")) > 100
     assert "(14 of 14 photos)" in first.out
-    assert first.out.splitlines()[-1] == (
-        "To see the scene: snowsplat view snowsplat_demo/made; "
-        "with your own photos: snowsplat make PHOTOS"
-    )
+    assert first.out.splitlines()[-2:] == [
+        "to see it: snowsplat view snowsplat_demo/made; "
+        "to share it: snowsplat publish snowsplat_demo/made -o made_site",
+        "with your own photos: snowsplat make PHOTOS",
+    ]
 
     # All stages are finished. With --open, the scene is shown as by `view`.
     shown = []

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.make import print_summary
+from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.view import View
 
@@ -59,7 +60,8 @@ class Demo:
             return 1
         scene = result.made.folder.path.parent
         if not self.open:
-            print("\nwith your own photos: snowsplat make PHOTOS")
+            print(f"\n{see_and_share(scene)}")
+            print("with your own photos: snowsplat make PHOTOS")
             return 0
         return View(scene).run()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,6 +119,7 @@ class Make:
             print(with_flags(str(stopped) or "stopped"))
             return self._stopped()
         print_summary(result)
+        print("\n" + see_and_share(result.folder.path.parent), flush=True)
         if page is not None:
             self._watch(result, page)
         return 0
@@ -162,4 +164,4 @@ def print_summary(made: MakeResult) -> None:
     )
     if made.verdict is not None:
         print("\n" + "\n".join(made.verdict.lines("The scene")))
-    print("\n" + see_and_share(made.folder.path.parent), flush=True)
+    sys.stdout.flush()

@@ -1,0 +1,72 @@
+"""What a command says to do next, and what is said about words that are no subcommand."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.cli.main import SUBCOMMANDS
+from snowsplat.cli.next_steps import next_step, see_and_share
+from snowsplat.cli.subcommands import _WORDS
+from snowsplat.formats import write_gaussians
+from snowsplat.scene.gaussians import Gaussians
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    box = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    write_gaussians(tmp_path / "box.ply", Gaussians.random_in_bounds(box, 200, torch.Generator()))
+    return tmp_path / "box.ply"
+
+
+def test_commands_are_quoted():
+    assert next_step("or", "info", Path("my garden")) == "or: snowsplat info 'my garden'"
+    assert see_and_share(Path("walk_scene")) == (
+        "to see it: snowsplat view walk_scene; "
+        "to share it: snowsplat publish walk_scene -o walk_site"
+    )
+    assert see_and_share(Path("out/a.compressed.ply")).endswith("-o a_site")
+
+
+def test_words_that_are_no_subcommand(refused, scene, monkeypatch):
+    assert "use convert (a file in another format) or publish" in refused("export")
+    assert "publish" in refused("share")
+    assert "there are no meshes" in refused("Mesh")
+    assert f"snowsplat make {scene}; or: snowsplat info {scene}" in refused(scene)
+    for hint, words in _WORDS.items():
+        named = re.match(r"use (\w+)|there are no meshes; (\w+)", hint)
+        assert (named[1] or named[2]) in SUBCOMMANDS
+        assert not set(words.split()) & set(SUBCOMMANDS)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.html", "levels/lod-meta.json"])
+def test_convert_makes_folders_and_says_what_is_next(run, scene, monkeypatch, name):
+    monkeypatch.chdir(scene.parent)
+    target = f"new/deep/{name}"
+    result = run("convert", "box.ply", target)
+    assert (result.code, result.err) == (0, "")
+    first, last = result.out.splitlines()[-2:]
+    assert re.match(rf"{target}: [\d.]+ [kM]B of ", first)
+    page = f"open {target} in a browser"
+    assert last.startswith(f"to see it: {page if name == 'a.html' else 'snowsplat view'}")
+
+
+def test_an_unwritable_target_is_named_without_its_temporary_file(refused, scene, monkeypatch):
+    monkeypatch.chdir(scene.parent)
+    assert "box.ply/a.spz: a part of its folder is a file" in refused(
+        "convert", "box.ply", "box.ply/a.spz"
+    )
+
+    def fails(*_, **__):
+        raise FileNotFoundError(2, "No such file or directory", f"{scene.parent}/.a.spz.x1y2.tmp")
+
+    monkeypatch.setattr("snowsplat.util.files.tempfile.mkstemp", fails)
+    monkeypatch.setattr("snowsplat.util.files.fcntl", None)
+    assert refused("convert", "box.ply", "a.spz") == "snowsplat: a.spz: No such file or directory"
+
+
+def test_info_tells_sizes_and_what_is_next(run, scene):
+    lines = run("info", scene).out.splitlines()
+    assert [line for line in lines if re.match(r"size +\d+ kB$", line)]
+    assert lines[-1].startswith("to see it: snowsplat view ")
