@@ -89,7 +89,7 @@ def test_the_size_of_the_file(run, refused, ply, tmp_path):
         assert result.code == 0, result.err
         limit = file_size(size)
         assert 0.8 * limit < (tmp_path / name).stat().st_size <= limit
-    assert "no scene fits into 1,000 bytes" in refused(
+    assert "no scene fits into 1.0 kB" in refused(
         "convert", ply, tmp_path / "c.ply", "--decimate", "1KB"
     )
     assert sorted(path.name for path in tmp_path.iterdir() if path != ply) == [
