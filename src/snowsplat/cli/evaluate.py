@@ -48,13 +48,10 @@ class Evaluate(SceneFlags):
 
     def run(self) -> int:
         """Returns the exit code, 0."""
-        if self.model_paths:
-            for path in self.model_paths:
-                replace(self, model_path=path, model_paths=())._evaluate()
-        else:
+        for path in self.model_paths:
+            replace(self, model_path=path, model_paths=())._evaluate()
+        if not self.model_paths:
             self._evaluate()
-            out = self.output_path()
-            print(next_step("to see the renders", "render", out, "--split", self.split))
         return 0
 
     def _evaluate(self) -> None:
@@ -85,3 +82,5 @@ class Evaluate(SceneFlags):
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
         print(f"iteration {scene.iteration}, {which}: {where}")
+        out = self.output_path()
+        print(next_step("to see the renders", "render", out, "--split", self.split))
