@@ -241,8 +241,11 @@ def test_make_without_a_compiler_names_the_package_to_install(bare_path):
 
 @pytest.mark.parametrize(
     ("driver", "index", "installed"),
-    [(True, True, [".[dev,docs]"]), (False, True, ["torch", ".[dev,docs]"])]
-    + [(False, False, ["torch", ".[dev,docs]"])],
+    [
+        (True, True, [".[dev,docs]"]),
+        (False, True, ["torch", ".[dev,docs]"]),
+        (False, False, ["torch", ".[dev,docs]"]),
+    ],
 )
 def test_make_takes_the_small_build_of_pytorch_without_a_driver(tmp_path, driver, index, installed):
     """The environment is a script that notes what pip is asked to install."""
