@@ -25,8 +25,10 @@ RUN --mount=type=bind,from=wheel,source=/wheel,target=/wheel \
     pip install --no-cache-dir /wheel/snowsplat-*.whl
 
 FROM python AS cpu
-# Another address for a mirror of PyTorch's index.
-ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# Empty: the default build of PyTorch.
+ARG TORCH_BACKEND=cpu
 RUN --mount=type=bind,from=wheel,source=/wheel,target=/wheel \
-    pip install --no-cache-dir torch --index-url ${TORCH_INDEX} && \
-    pip install --no-cache-dir /wheel/snowsplat-*.whl
+    pip install --no-cache-dir uv && \
+    uv pip install --no-cache --python /opt/snowsplat/bin/python \
+        ${TORCH_BACKEND:+--torch-backend=${TORCH_BACKEND}} /wheel/snowsplat-*.whl && \
+    pip uninstall --yes uv
