@@ -64,9 +64,19 @@ COMPILING := cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
 	.venv/bin/python -m pip install --quiet --no-compile --requirement .venv/tools.txt
 	@touch $@
 
+# Without an NVIDIA driver, the CPU build of PyTorch: it needs none of the CUDA libraries (2.4 GB of 3.2 GB). pip
+# takes the default build after all if the index of the CPU build cannot be reached; with TORCH_BACKEND= at once.
+TORCH_BACKEND ?= cpu
+NO_INDEX := snowsplat: the CPU build of PyTorch cannot be had here; the default build is installed
+HAS_DRIVER := import ctypes, sys; sys.platform == "linux" and ctypes.CDLL("libcuda.so.1")
+
 # The editable installation builds nothing: `make native` installs the libraries into src/. Python
 # compiles the modules that it imports; most of those of torch are never imported.
 .venv/.installed: .venv/.tools
+	@$(if $(TORCH_BACKEND),$(BOOTSTRAP) -c '$(HAS_DRIVER)' 2>/dev/null || { \
+	    .venv/bin/python -m pip install --quiet uv && UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 .venv/bin/python -m uv \
+	    pip install --quiet --python .venv/bin/python --torch-backend=$(TORCH_BACKEND) torch 2>/dev/null; } || \
+	    echo "$(NO_INDEX)" >&2)
 	.venv/bin/python -m pip install --no-compile --no-build-isolation --editable '.[dev,docs]' \
 	    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
 	@touch $@

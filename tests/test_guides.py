@@ -24,7 +24,20 @@ START = [ROOT / "docs" / name for name in ("index.md", "installation.md", "quick
 PAGES = [ROOT / "README.md", *START, *GUIDES, ROOT / "docs" / "environment-variables.md"]
 TEXTS = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
 # Programs besides snowsplat that the pages use.
-TOOLS = {".", "apt", "cp", "make", "mkdir", "npm", "pip", "python", "python3", "ssh", "torchrun"}
+TOOLS = {
+    ".",
+    "apt",
+    "cp",
+    "docker",
+    "make",
+    "mkdir",
+    "npm",
+    "pip",
+    "python",
+    "python3",
+    "ssh",
+    "torchrun",
+}
 
 
 def examples(page: str) -> list[str]:

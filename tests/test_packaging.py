@@ -239,6 +239,46 @@ def test_make_without_a_compiler_names_the_package_to_install(bare_path):
     assert result.stderr.splitlines()[0] == NO_COMPILER
 
 
+PACKAGES = {"uv", "torch", ".[dev,docs]"}
+
+
+@pytest.mark.parametrize(
+    ("driver", "index", "installed"),
+    [
+        (True, True, [".[dev,docs]"]),
+        (False, True, ["uv", "torch", ".[dev,docs]"]),
+        (False, False, ["uv", "torch", ".[dev,docs]"]),
+        (False, None, [".[dev,docs]"]),
+    ],
+)
+def test_make_takes_the_small_build_of_pytorch_without_a_driver(tmp_path, driver, index, installed):
+    """The environment is a script that notes what pip is asked to install.
+
+    ``index``: whether that of PyTorch can be reached; None: there is none.
+    """
+    shutil.copy(REPOSITORY / "Makefile", tmp_path)
+    (tmp_path / "pyproject.toml").touch()
+    log = tmp_path / "log"
+    bootstrap, python = tmp_path / "bootstrap", tmp_path / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    bootstrap.write_text(f"#!/bin/sh\nexit {int(not driver)}\n")
+    fails = "" if index else "case $* in *' torch') exit 1;; esac\n"
+    python.write_text(f'#!/bin/sh\necho "$*" >>{log}\n{fails}')
+    for script in (bootstrap, python):
+        script.chmod(0o755)
+    (tmp_path / ".venv" / ".tools").touch()
+    command = ["make", f"BOOTSTRAP={bootstrap}", ".venv/.installed"]
+    command += ["TORCH_BACKEND="] if index is None else []
+    result = run(*command, cwd=tmp_path, env=os.environ | {"CXX": "sh"})
+    assert result.returncode == 0, result.stderr
+    lines = [line for line in log.read_text().splitlines() if " pip install " in line]
+    packages = [line.split(" pip install ")[1].split() for line in lines]
+    packages = [word for words in packages for word in words if word in PACKAGES]
+    assert packages == installed
+    assert all("--torch-backend=cpu" in line for line in lines if line.endswith(" torch"))
+    assert ("the default build is installed" in result.stderr) == (index is False)
+
+
 def test_command_is_installed():
     pyproject = (REPOSITORY / "pyproject.toml").read_text()
     assert 'snowsplat = "snowsplat.cli.main:main"' in pyproject

@@ -43,10 +43,10 @@ class Brighter(Part):
 
 
 class Counted:
-    """A `Record` that counts. The work runs when it is queued, not when it is recorded."""
+    """A `Recorder` that counts. The work runs when it is queued, not when it is recorded."""
 
     def __init__(self) -> None:
-        self.recorded = self.queued = 0
+        self.recorded = self.queued = self.forgotten = 0
 
     def __call__(self, work: Callable[[], None]) -> Callable[[], None]:
         self.recorded += 1
@@ -56,6 +56,14 @@ class Counted:
             work()
 
         return queue
+
+    def forget(self) -> None:
+        self.forgotten += 1
+
+
+class Failing(Counted):
+    def __call__(self, work: Callable[[], None]) -> Callable[[], None]:
+        raise RuntimeError("no memory\nat line 3")
 
 
 def losses(trainer: Trainer, steps: int) -> list[float]:
@@ -77,6 +85,7 @@ def test_recordings_change_nothing(dataset: Dataset, config: TrainConfig) -> Non
     assert losses(trainer, 60) == expected
     assert record.recorded > 4  # two for each recording
     assert record.queued > record.recorded
+    assert record.forgotten > 1  # densification replaced the Gaussians
 
 
 def test_the_least_recently_used_recording_is_replaced(dataset: Dataset) -> None:
@@ -102,13 +111,10 @@ def test_the_least_recently_used_recording_is_replaced(dataset: Dataset) -> None
 
 
 def test_a_failed_recording_is_reported_once(dataset: Dataset) -> None:
-    def record(work: Callable[[], None]) -> Callable[[], None]:
-        raise RuntimeError("no memory\nat line 3")
-
     notes: list[str] = []
     expected = losses(Trainer(dataset, BUSY), 9)
     trainer = Trainer(dataset, BUSY)
-    trainer.graphs = ViewGraphs(record, notes.append)
+    trainer.graphs = ViewGraphs(Failing(), notes.append)
     assert losses(trainer, 9) == expected
     assert notes == ["training continues without CUDA graphs, more slowly: no memory"]
 

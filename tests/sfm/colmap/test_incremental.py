@@ -79,6 +79,27 @@ def test_a_model_starts_with_other_photos_each_time(mapping):
     assert first != second
 
 
+def test_the_photos_of_a_small_model_are_available_for_a_large_one(mapping, scene, monkeypatch):
+    """The first pair was unsuitable, so a model ended with three photos in the middle of a walk."""
+    grow = mapping_module.IncrementalMapper.grow
+    starts = []
+
+    def stopped(self, model, photos, adjust):
+        if adjust:
+            starts.append(set(model.reg_image_ids()))
+        if len(starts) == 1:
+            first = min(starts[0])
+            photos = {first, first + 1, first + 2} | starts[0]
+        grow(self, model, photos, adjust)
+
+    monkeypatch.setattr(mapping_module.IncrementalMapper, "grow", stopped)
+    (model,) = mapping.run("incremental")
+    assert set(model.reg_image_ids()) == EVERY
+    assert largest_centre_error(model, scene) < 0.05
+    assert len(starts) == 2
+    assert not starts[0] & starts[1]
+
+
 def test_photos_of_another_place_make_another_model(mapping):
     with closing_database(mapping.database) as database:
         for i in range(1, 9):

@@ -36,6 +36,9 @@ MIN_PHOTOS = 3
 # photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0
 _MAX_MODELS = 20  # a model is started at most this number of times
+# A model is small if it has fewer photos than this, and than this share of the photos that are in
+# no model (as COLMAP's min_model_size, and its condition for few photos).
+_SMALL_MODEL, _LARGE_SHARE = 10, 0.8
 # With at least this number of photos, global bundle adjustment runs less often: when the model has
 # grown by 40% (default of COLMAP: 10%). It then runs once (default of COLMAP: up to 5 times), with
 # at most 20 iterations. Local bundle adjustment runs after each new photo, as with fewer photos.
@@ -192,22 +195,33 @@ class Mapping:
         return _MIN_FORWARD_ANGLE if self.forward else _MIN_ANGLE
 
     def _map_incrementally(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
-        """Make models one after the other, each from the photos that are in no earlier model."""
+        """Make models one after the other, each from the photos that are in no earlier model.
+
+        A small model may be the result of an unsuitable first pair, so its photos remain available:
+        they may connect the two halves of a large one. No model starts with them again.
+        """
         graph = ViewGraph.read(self.database)
         models: list[pycolmap.Reconstruction] = []
-        left, first = graph, self._first(graph)
+        left, in_small = graph, set[int]()
         # With weak matches, none can be spared.
         with nullcontext() if relaxed or self.forward else self._long_tracks() as reduced:
             mapper = self._mapper(graph, relaxed, reduced)
             for _ in range(_MAX_MODELS):
-                model = mapper.start(first) if len(left.names) >= MIN_PHOTOS else None
+                first = self._first(left)
+                enough = len(left.names) >= MIN_PHOTOS
+                model = mapper.start(first - in_small) if enough else None
                 if model is None:
                     break
                 self._grow(mapper, model, left, first)
-                if model.num_reg_images() >= MIN_PHOTOS:
-                    models.append(model)
-                    left = left.of_photos(set(left.names) - set(model.reg_image_ids()))
-                    first = self._first(left)
+                if model.num_reg_images() < MIN_PHOTOS:
+                    continue
+                models.append(model)
+                photos = set(model.reg_image_ids())
+                if len(photos) < min(_SMALL_MODEL, _LARGE_SHARE * len(left.names)):
+                    in_small |= photos
+                else:
+                    left = left.of_photos(set(left.names) - photos)
+        models = usable_models(models)
         if reduced is not None:
             for model in models:
                 mapper.triangulate_all(model, pairs=False)

@@ -61,8 +61,8 @@ class Cost:
 #: Measured with Gaussians that touch about seven tiles each: 1.0 to 1.1 kB per Gaussian besides
 #: parameters and moments. `DECODERS` threads decode photos at a time, at 18 bytes per pixel.
 CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150, decoding=18 * DECODERS)
-#: Computed from the sizes of the tensors that are allocated. Photos are decoded in the memory of
-#: the CPU.
+#: Computed from the sizes of the tensors that are allocated; measured on a GPU, 0.85 to 0.9 times
+#: as much. Photos are decoded in the memory of the CPU.
 GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240, decoding=0)
 
 

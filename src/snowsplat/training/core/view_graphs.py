@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -34,9 +34,19 @@ from snowsplat.training.parts.part import Part
 MOST_RECORDINGS = 4
 
 Loss = Callable[[Tensor, LoadedImage, Tensor], Tensor]
-Record = Callable[[Callable[[], None]], Callable[[], None]]
-"""Records the kernels that a function queues, without running them; returns a function that queues
-them again."""
+
+
+class Recorder(Protocol):
+    """Records kernels, so that they can be queued without the Python code that queued them."""
+
+    def __call__(self, work: Callable[[], None]) -> Callable[[], None]:
+        """Record the kernels that ``work`` queues, without running them; the returned function
+        queues them again."""
+        ...
+
+    def forget(self) -> None:
+        """All recordings were deleted: give their memory back."""
+        ...
 
 
 def recordable(parts: Sequence[Part]) -> bool:
@@ -89,7 +99,7 @@ class _Recording:
         sh_degree: int,
         runner: StepRunner,
         loss: Loss,
-        record: Record,
+        record: Recorder,
     ) -> None:
         self.inputs = inputs
 
@@ -113,13 +123,12 @@ class _Recording:
 class ViewGraphs:
     """The recordings of the present Gaussians. The least recently used one is replaced."""
 
-    def __init__(self, record: Record, note: Callable[[str], None]) -> None:
+    def __init__(self, record: Recorder, note: Callable[[str], None]) -> None:
         """
         Args:
-            record: a `GraphRecorder`.
             note: takes a line for the user.
         """
-        self.record: Record | None = record
+        self._record: Recorder | None = record
         self._note = note
         self._recordings: dict[Any, _Recording] = {}
         self._memory: Any = None  # of the Gaussians
@@ -143,12 +152,14 @@ class ViewGraphs:
             photo: what the image is compared with.
             loss: takes an image (H, W, 3), the photo and the background (3,).
         """
-        if self.record is None:
+        if self._record is None:
             return None
         memory = tuple((p.data_ptr(), p.shape) for p in gaussians.parameters().values())
         if memory != self._memory:
-            self._recordings.clear()
             self._memory = memory
+            if self._recordings:
+                self._recordings.clear()
+                self._record.forget()
         key = _key(gaussians, view, photo, sh_degree, runner)
         repeated, self._last = (memory, key) == self._last, (memory, key)
         recording = self._recordings.pop(key, None)
@@ -159,9 +170,9 @@ class ViewGraphs:
                 del self._recordings[next(iter(self._recordings))]
             inputs = _Inputs.like(view, photo, gaussians.means.dtype)
             try:
-                recording = _Recording(inputs, gaussians, sh_degree, runner, loss, self.record)
+                recording = _Recording(inputs, gaussians, sh_degree, runner, loss, self._record)
             except RuntimeError as error:  # for example, the memory does not suffice
-                self.record = None
+                self._record = None
                 self._recordings.clear()
                 reason = (str(error).splitlines() or ["no reason is known"])[0]
                 self._note(f"training continues without CUDA graphs, more slowly: {reason}")
@@ -188,10 +199,7 @@ def _key(
 
 
 class GraphRecorder:
-    """Records CUDA graphs on a GPU: a `Record`.
-
-    All graphs share memory, because they never run at the same time.
-    """
+    """A `Recorder` of CUDA graphs, which share memory, because they never run at the same time."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -199,15 +207,11 @@ class GraphRecorder:
         # Not the default stream, where nothing can be recorded. The backward pass runs on the
         # stream of the forward pass, so both are recorded on the same one.
         self._stream = torch.cuda.Stream(device)
-        self._kept: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self, work: Callable[[], object]) -> Callable[[], None]:
-        if self._kept is None:
-            # torch does not accept the pool again after its last graph was deleted.
-            self._kept = self._recorded(lambda: torch.zeros(1, device=self._device))
-        return self._recorded(work).replay
-
-    def _recorded(self, work: Callable[[], object]) -> torch.cuda.CUDAGraph:
+    def __call__(self, work: Callable[[], None]) -> Callable[[], None]:
+        """See `Recorder`."""
+        # A graph cannot use the memory that torch keeps after a step without graphs.
+        torch.cuda.empty_cache()
         graph, present = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self._device)
         self._stream.wait_stream(present)
         with torch.cuda.stream(self._stream):
@@ -218,4 +222,10 @@ class GraphRecorder:
             finally:
                 graph.capture_end()
         present.wait_stream(self._stream)
-        return graph
+        return graph.replay
+
+    def forget(self) -> None:
+        """See `Recorder`."""
+        # torch does not accept a pool again after its last graph was deleted.
+        self._pool = torch.cuda.graph_pool_handle()
+        torch.cuda.empty_cache()
