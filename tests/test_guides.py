@@ -37,6 +37,7 @@ TOOLS = {
     "python3",
     "ssh",
     "torchrun",
+    "uv",
 }
 
 
