@@ -67,7 +67,7 @@ _SHARED = (
     _own("--source_path", "-s"),
     _own("--model_path", "-m"),
     _own("--resolution", "-r", note="-1 reduces no photo, however wide it is"),
-    _ignored("--data_device", "photos stay decoded as far as they fit into memory, see --memory", 1),
+    _ignored("--data_device", "photos stay decoded as far as memory suffices, see --memory", 1),
     _ignored("--convert_SHs_python", "it chooses another way to the same image"),
     _ignored("--compute_cov3D_python", "it chooses another way to the same image"),
     _ignored("--debug", _ONE_CAUSE),
