@@ -81,7 +81,7 @@ def test_wheel_contains_gpu_kernels_as_cubins_and_sources(wheel):
     files = [path.stem for path in native_folder.glob("cuda/*.cu")]
     assert cubins == {
         f"snowsplat/_lib/cuda/sm_{number}/{file}.cubin"
-        for number in (75, 80, 86, 89, 90, 100, 120)
+        for number in (70, 75, 80, 86, 89, 90, 100, 120)
         for file in files
     }
     assert wheel.stat().st_size < 10e6

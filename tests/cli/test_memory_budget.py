@@ -61,7 +61,7 @@ def test_a_dataset_of_four_times_the_memory_trains(dataset: Path, tmp_path: Path
     )
     run = snowsplat_cli("train", str(dataset), *arguments)
     assert run.returncode == 0, run.stderr
-    line = r"^training on .* threads, \w+; memory: \d+ MB at most \(.*photos \d+ MB\)$"
+    line = r"^training on .* threads, \w+; memory: [\d.]+ MB at most \(.*photos [\d.]+ MB\)$"
     assert re.search(line, run.stdout, re.MULTILINE)
     assert re.search(r"^for lack of memory: at most [\d,]+ Gaussians", run.stdout, re.MULTILINE)
     assert "of the photos stay decoded" in run.stdout
