@@ -288,7 +288,7 @@ def test_keys(page):
     type_key(page, "n", "KeyN", lambda: photo_of(page) is not None)
     at_photo, first = settled(page), photo_of(page)
     type_key(page, "p", "KeyP", lambda: photo_of(page) not in (None, first))
-    wait(lambda: differ(scene(page), at_photo) > 1)
+    assert differ(settled(page), at_photo) > 1
     # The whole scene.
     nowhere = "document.body.innerText.includes('click one to view the scene')"
     type_key(page, "f", "KeyF", lambda: page.evaluate(nowhere))
