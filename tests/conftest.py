@@ -46,6 +46,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(_OF_FOLDERS[folder])
         for fixture in _OF_FIXTURES.keys() & getattr(item, "fixturenames", ()):
             item.add_marker(_OF_FIXTURES[fixture])
+    # The tests of a page share a browser and a training run. At the end of the tests, a second
+    # process would take over some of them.
+    items.sort(key=lambda item: "browser" not in {mark.name for mark in item.iter_markers()})
 
 
 def pytest_collection_finish() -> None:
