@@ -129,8 +129,7 @@ def convert(
     Args:
         sources: scene files of any format, or output folders, whose last scene is used.
         target: the file to write, in a folder that is created if it does not exist; its suffix
-            selects the format. FOLDER/lod-meta.json stands for
-            levels of detail in this folder.
+            selects the format. FOLDER/lod-meta.json stands for levels of detail in this folder.
         edits: changes to the merged scene; default: none.
         dataset: with ``decimate``: train the result for a moment on the photos of this dataset.
         spz_version: the version of an .spz file, 2 to 4; default: 3.

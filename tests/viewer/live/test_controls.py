@@ -286,8 +286,9 @@ def test_keys(page):
     pause(page)
     page.drag(100, 240, 101, 240)  # the scene gets the keyboard
     type_key(page, "n", "KeyN", lambda: photo_of(page) is not None)
-    at_photo, first = settled(page), photo_of(page)
-    type_key(page, "p", "KeyP", lambda: photo_of(page) not in (None, first))
+    assert photo_of(page) == "At view_01.png"
+    at_photo = settled(page)
+    type_key(page, "p", "KeyP", lambda: photo_of(page) not in (None, "At view_01.png"))
     assert differ(settled(page), at_photo) > 1
     # The whole scene.
     nowhere = "document.body.innerText.includes('click one to view the scene')"

@@ -46,7 +46,8 @@ class Part:
     `loss` and `regularizer`. With several processes, all of them call the same methods in the same
     order, but `background`, `target`, `image` and `loss` only in the process that blends the view:
     these must not call `Run.render` or methods of ``run.shards``. On a GPU, these four may be
-    called twice for a view, if the memory of the rasterizer was too small.
+    called twice for a view. A GPU is faster if no part overrides `background`, `image` or `loss`:
+    see `training.core.view_graphs`.
 
     Attributes:
         name: of the part in checkpoints and messages; default: the name of the class.
