@@ -270,7 +270,8 @@ def test_make_takes_the_small_build_of_pytorch_without_a_driver(tmp_path, driver
     command = ["make", f"BOOTSTRAP={bootstrap}", ".venv/.installed"]
     command += ["TORCH_BACKEND="] if index is None else []
     # The caller's choice of the build, and its variables of make, are not those of this test.
-    environment = {k: v for k, v in os.environ.items() if k not in ("TORCH_BACKEND", "MAKEFLAGS", "PYTHON")}
+    own = {"TORCH_BACKEND", "MAKEFLAGS", "PYTHON"}
+    environment = {name: value for name, value in os.environ.items() if name not in own}
     result = run(*command, cwd=tmp_path, env=environment | {"CXX": "sh"})
     assert result.returncode == 0, result.stderr
     lines = [line for line in log.read_text().splitlines() if " pip install " in line]
