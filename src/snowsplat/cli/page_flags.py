@@ -1,4 +1,4 @@
-"""The flags `--view`, `--port`, `--host` and `--allow-host`: a page in the browser; its addresses."""
+"""A page in the browser: the flags `--view`, `--port`, `--host`, `--allow-host`; addresses."""
 
 from __future__ import annotations
 

@@ -40,7 +40,8 @@ th { color: var(--soft); font-weight: 500; } .facts th { width: 16em; }
 code, pre { font-family: ui-monospace, Menlo, Consolas, monospace; font-size: .9em; }
 pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px;
   padding: 10px 14px; overflow-x: auto; margin: 8px 0; }
-.bar { display: inline-block; width: calc(var(--share) * min(35vw, 400px)); height: .7em; border-radius: 2px; background: var(--accent); }
+.bar { display: inline-block; width: calc(var(--share) * min(35vw, 400px)); height: .7em;
+  border-radius: 2px; background: var(--accent); }
 summary { cursor: pointer; color: var(--soft); } ol { margin: 6px 0; padding-left: 1.4em; }
 .wide { overflow-x: auto; } [role="button"] { cursor: zoom-in; }
 dialog { max-width: none; max-height: none; border: 0; padding: 0; background: none; color: #fff;
