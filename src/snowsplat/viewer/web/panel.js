@@ -22,10 +22,29 @@ const shownBy = (fov, { width, height }, [widest, highest] = UNLIMITED) => {
 /** The share of what the window would show of a rectangle, if it were not limited. */
 const zoomWithin = (fov, size, limits) => shownBy(fov, size, limits)[1] / shownBy(fov, size)[1];
 
-/** The page begins with the first photo beside which other photos show enough to fill the window. */
+/** How much of the radius of the subject is in the window, above, below and at the sides; at most 1. */
+const shownOfSubject = ([x, y, z, u, v, w, fov], size, limits) => {
+    const scaled = (a) => a.map((value) => value / Math.hypot(...a));
+    const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
+    const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+    const ahead = scaled([u - x, v - y, w - z]);
+    const right = scaled(cross(ahead, [0, 1, 0]));
+    const to = [scene.subject[0] - x, scene.subject[1] - y, scene.subject[2] - z];
+    const distance = dot(to, ahead);
+    if (distance <= 0) return -Infinity;
+    const [across, down] = shownBy(fov, size, limits);
+    const beside = [across * distance - Math.abs(dot(to, right)), down * distance - Math.abs(dot(to, cross(right, ahead)))];
+    return Math.min(1, Math.min(...beside) / scene.subject[3]);
+};
+
+/** The page begins with the first photo, or if it would show little of it, with one that shows the subject. */
 const ENOUGH = 0.8;
-const zooms = stops.map((view, i) => zoomWithin(view[6], { width: innerWidth, height: innerHeight }, seen[i]));
-const first = Math.max(0, zooms.findIndex((zoom) => zoom >= Math.min(ENOUGH, Math.max(...zooms))));
+const firstStop = (size) => {
+    if (!stops.length || zoomWithin(stops[0][6], size, seen[0]) >= ENOUGH) return 0;
+    const shown = stops.map((view, i) => shownOfSubject(view, size, seen[i]));
+    return shown.findIndex((share) => share >= Math.max(...shown) - 0.05);
+};
+const first = Math.max(0, firstStop({ width: innerWidth, height: innerHeight }));
 const start = first ? stops[first] : scene.start;
 
 const addView = ([x, y, z, u, v, w, fov]) => ({ position: [x, y, z], target: [u, v, w], fov });
