@@ -138,7 +138,7 @@ class Guard:
         coding = response.headers["Content-Encoding"]
         if coding not in self._titled:
             zipped = coding == "gzip"
-            page = gzip.decompress(response.body) if zipped else response.body
+            page = gzip.decompress(response.body) if zipped else bytes(response.body)
             page = page.replace(b"<title>Viser</title>", self._title, 1)
             self._titled[coding] = gzip.compress(page) if zipped else page
         response.body = self._titled[coding]
