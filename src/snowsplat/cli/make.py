@@ -146,12 +146,15 @@ class Make:
 
     def _show(self, made: MakeResult, page: LivePage) -> None:
         """Show the scene until Ctrl-C, on the page of the training if there was one."""
-        if page.has_trained:
-            with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
-                print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
-                page.show_result()
-            return
+        from snowsplat.formats import read_gaussians
         from snowsplat.pipeline.compute import Compute
+
+        if page.has_trained:
+            with suppress(KeyboardInterrupt):  # Ctrl-C may arrive before the scene is shown
+                gaussians = read_gaussians(made.scene)
+                print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
+                page.show_result(gaussians.to(Compute(self.device, self.threads).apply()))
+            return
         from snowsplat.pipeline.watch import watch
 
         with WatchObserver() as observer:

@@ -98,7 +98,7 @@ def train_on_all(
         config_from_json(read_json(folder.path / "config.json")["training"]),
         scene.gaussians,
         (iteration, steps),
-        (scene.dataset.extent, len(used)),
+        (scene.dataset.extent, len(scene.dataset.train)),
         exposures=bool(exposures),
     )
     trainer = Trainer(

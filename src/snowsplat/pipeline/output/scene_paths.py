@@ -92,6 +92,14 @@ def file_of_make(folder: Path) -> Path | None:
     return file if file is not None and file.is_file() else None
 
 
+def has_seen_all_photos(scene: Path) -> bool:
+    """Whether a scene file is that of `make` after its last part: no photo can judge it."""
+    made = OutputFolder(scene.parent / SCENE)
+    return scene == file_of_make(scene.parent) and not any(
+        filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]
+    )
+
+
 def folder_of_make(path: Path) -> Path:
     """The folder of `make` around ``path``, which is its scene or the output folder of its
     training; ``path`` itself if there is none."""
