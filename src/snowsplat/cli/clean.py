@@ -10,6 +10,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import see_and_share
+from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
 
 
@@ -49,13 +50,15 @@ class Clean:
         from snowsplat.pipeline.clean import clean
         from snowsplat.pipeline.compute import Compute
 
-        done = clean(
-            self.scene,
-            self.target,
-            dataset=self.dataset,
-            overwrite=self.overwrite,
-            compute=Compute(self.device, self.threads),
-        )
+        with TerminalObserver() as observer:
+            done = clean(
+                self.scene,
+                self.target,
+                dataset=self.dataset,
+                overwrite=self.overwrite,
+                compute=Compute(self.device, self.threads),
+                observer=observer,
+            )
         before, after = done.psnr
         print(
             f"{self.target}: {done.before - done.after:,} of {done.before:,} Gaussians removed; "

@@ -56,6 +56,9 @@ class TerminalObserver(Observer):
             for detail in details:
                 self._stages.say(f"          {detail}")
 
+    def leave(self) -> None:
+        self._stages.hide()
+
     def steps_begin(self, step: int, iterations: int) -> None:
         self._stages.hide()
         if not self._quiet:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from snowsplat.sfm.progress import Report, silent
@@ -32,6 +34,17 @@ class Observer:
 
     def end(self, stage: str, outcome: Outcome) -> None:
         """The stage has finished, now or in an earlier run."""
+
+    def leave(self) -> None:
+        """The stage that began last is over; there is nothing to tell about it."""
+
+    @contextmanager
+    def waiting(self, stage: str) -> Iterator[Report]:
+        """A context of a stage that may take a while and has no outcome; its progress callback."""
+        try:
+            yield self.begin(stage)
+        finally:
+            self.leave()
 
     def steps_begin(self, step: int, iterations: int) -> None:
         """A training run begins after ``step`` of ``iterations`` steps."""
