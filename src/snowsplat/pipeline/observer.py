@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from snowsplat.sfm.progress import Report, silent
 
@@ -12,7 +12,16 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome
-    from snowsplat.viewer.live.viewer import NetworkViewer
+
+
+class Page(Protocol):
+    """A page in the browser: its address, and those for other computers if they differ."""
+
+    @property
+    def url(self) -> str: ...
+
+    @property
+    def others(self) -> list[str]: ...
 
 
 class Observer:
@@ -58,8 +67,8 @@ class Observer:
     def trained(self, result: TrainResult) -> None:
         """The training has finished; its files are written."""
 
-    def page_opened(self, viewer: NetworkViewer) -> None:
-        """A page shows the scene in the browser at ``viewer.url``."""
+    def page_opened(self, page: Page) -> None:
+        """A page shows the scene in the browser at ``page.url``."""
 
 
 #: An observer that does nothing.
