@@ -90,6 +90,10 @@ def parse(arguments: Sequence[str]) -> Any:
     rest, notes = translated(name, rest)
     for note in notes:
         _print_error(note)
+    if name in SUBCOMMANDS and "--config" in (text.partition("=")[0] for text in rest):
+        from snowsplat.cli.config_file import expanded
+
+        rest = expanded(load_subcommand(name), rest)
     union: Any = Union[tuple(_choices(name))]  # noqa: UP007 (made at run time)
     printed = io.StringIO()
     try:

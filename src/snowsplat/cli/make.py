@@ -66,6 +66,8 @@ class Make:
     """draft: a quick preview; best: takes several times as long as normal. With --minutes, the
     quality determines only the effort to estimate the camera poses; the training uses the remaining
     time."""
+    config: Annotated[Path | None, flag("FILE")] = None
+    """A JSON or TOML file with values of these flags. Flags have priority."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time. If there are too many photos for this time, some of them are used,
     evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
