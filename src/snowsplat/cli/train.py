@@ -59,10 +59,14 @@ class Train(TrainFlags):
             OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
+        from snowsplat.pipeline.observer import Observers
+        from snowsplat.pipeline.step_logs import LOGS
         from snowsplat.pipeline.train import resume, train
 
+        logs = [LOGS[name](self.output) for name in self.log]
         page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
-        with TerminalObserver(self.quiet) as observer, page or nullcontext():
+        with TerminalObserver(self.quiet) as terminal, page or nullcontext():
+            observer = Observers(terminal, *logs)
             try:
                 if self.resume:
                     result = resume(

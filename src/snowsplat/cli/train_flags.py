@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -92,6 +92,11 @@ class JobFlags:
     """Steps after which to save the scene, in addition to the last step."""
     source_path: Annotated[Path | None, flag("DATASET", "-s")] = None
     """The same as DATASET. This is the flag of the reference implementation."""
+    log: Annotated[
+        tuple[Literal["csv", "tensorboard"], ...], flag("[{csv,tensorboard} ...]", default="none")
+    ] = ()
+    """Also write loss, number of Gaussians and metrics of the steps: csv: to OUT/log.csv;
+    tensorboard: to OUT/tensorboard, which needs the package snowsplat[tensorboard]."""
     quiet: Annotated[bool, switch("-q")] = False
     """Print only the result and no progress."""
 

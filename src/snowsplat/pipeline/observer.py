@@ -71,5 +71,53 @@ class Observer:
         """A page shows the scene in the browser at ``page.url``."""
 
 
+class Observers(Observer):
+    """Passes everything on to several observers."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self.all = observers
+
+    def note(self, line: str) -> None:
+        for each in self.all:
+            each.note(line)
+
+    def begin(self, stage: str) -> Report:
+        reports = [each.begin(stage) for each in self.all]
+
+        def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
+            for each in reports:
+                each(done, total, what, left)
+
+        return report
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        for each in self.all:
+            each.end(stage, outcome)
+
+    def leave(self) -> None:
+        for each in self.all:
+            each.leave()
+
+    def steps_begin(self, step: int, iterations: int) -> None:
+        for each in self.all:
+            each.steps_begin(step, iterations)
+
+    def step(self, progress: Progress) -> None:
+        for each in self.all:
+            each.step(progress)
+
+    def steps_end(self) -> None:
+        for each in self.all:
+            each.steps_end()
+
+    def trained(self, result: TrainResult) -> None:
+        for each in self.all:
+            each.trained(result)
+
+    def page_opened(self, page: Page) -> None:
+        for each in self.all:
+            each.page_opened(page)
+
+
 #: An observer that does nothing.
 SILENT = Observer()
