@@ -10,11 +10,12 @@ import tyro
 
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
 from snowsplat.cli.flags import flag
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
 
 
 @dataclass
-class Benchmark:
+class Benchmark(Reports):
     """Train and evaluate all scenes of a folder by the protocol of the papers.
 
     Examples:
@@ -56,6 +57,8 @@ class Benchmark:
     """Number of scenes trained at the same time. They share the CPU; job i uses GPU i."""
     device: Annotated[Literal["cpu", "cuda"] | None, flag("{cpu,cuda}", default="a GPU")] = None
     """Device for the training."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 2 if a scene could not be trained, otherwise 0."""
@@ -79,5 +82,6 @@ class Benchmark:
         report = benchmark(
             self.folder, self.output, options, on_line=lambda line: print(line, flush=True)
         )
+        self.report = report
         print(f"\n{report}\n\n{self.output / 'index.html'}: the results as a page")
         return 2 if report.failures else 0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.scene_flags import SceneFlags
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Evaluate(SceneFlags):
+class Evaluate(SceneFlags, Reports):
     """Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.
 
     Examples:
@@ -45,16 +46,19 @@ class Evaluate(SceneFlags):
 
     model_paths: Annotated[tuple[Path, ...], flag("OUT [OUT ...]")] = ()
     """Several output folders, one after the other."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
-        for path in self.model_paths:
-            replace(self, model_path=path, model_paths=())._evaluate()
-        if not self.model_paths:
-            self._evaluate()
+        several = [
+            replace(self, model_path=path, model_paths=())._evaluate() for path in self.model_paths
+        ]
+        self.report = several or self._evaluate()
         return 0
 
-    def _evaluate(self) -> None:
+    def _evaluate(self) -> dict[str, Any]:
+        """Print the figures of one folder; returns them."""
         from snowsplat.evaluation.lpips import Lpips
         from snowsplat.pipeline.evaluate import evaluate, views_of
 
@@ -84,3 +88,5 @@ class Evaluate(SceneFlags):
         print(f"iteration {scene.iteration}, {which}: {where}")
         out = self.output_path()
         print(next_step("to see the renders", "render", out, "--split", self.split))
+        about = {"folder": out, "iteration": scene.iteration, "split": self.split}
+        return about | {"size": evaluation.size, **evaluation.as_json()}
