@@ -51,8 +51,8 @@ class Benchmark(Reports):
     """Maximum number of Gaussians; 0: no limit."""
     resolution: Annotated[int | None, flag("N", "-r", default="set by the suite")] = None
     """1, 2, 4 or 8: divide the size of the photos by this number; another number: the width."""
-    lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
-    """File with the weights for LPIPS, see snowsplat evaluate."""
+    lpips: Annotated[Path | None, flag("{vgg,alex,FILE}", default="not measured")] = None
+    """Network for LPIPS, or a file with its weights, see snowsplat evaluate."""
     jobs: Annotated[int, flag("N", default="1")] = 1
     """Number of scenes trained at the same time. They share the CPU; job i uses GPU i."""
     device: Annotated[Literal["cpu", "cuda"] | None, flag("{cpu,cuda}", default="a GPU")] = None

@@ -22,7 +22,7 @@ class Evaluate(SceneFlags, Reports):
     Examples:
       snowsplat evaluate out/garden
       snowsplat evaluate out/garden --split train
-      snowsplat evaluate out/garden --lpips lpips_vgg.safetensors
+      snowsplat evaluate out/garden --lpips vgg
 
     Notes:
       The metrics of each view and their means are printed, and written to
@@ -32,17 +32,16 @@ class Evaluate(SceneFlags, Reports):
       photo do not count. The photos have the size of the training, which
       a time limit may have reduced; -r 1: their own size.
 
-    To create the file of weights for LPIPS, run this where lpips is installed:
-      weights = lpips.LPIPS(net="vgg").state_dict()
-      weights = {name: weight.clone() for name, weight in weights.items()}
-      safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
+    The weights of LPIPS are those of the package lpips (pip install lpips), which
+    downloads a network once. For a computer without it, this writes a file:
+      python -m snowsplat.evaluation.lpips vgg lpips_vgg.safetensors
     """
 
     split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
     """test: the held-out photos; train: the training photos."""
-    lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
-    """File with the weights for LPIPS (of AlexNet or VGG16, and of the linear layers), in the
-    safetensors format."""
+    lpips: Annotated[Path | None, flag("{vgg,alex,FILE}", default="not measured")] = None
+    """Measure LPIPS with this network, or with the weights in a safetensors file (of AlexNet or
+    VGG16, and of the linear layers)."""
 
     model_paths: Annotated[tuple[Path, ...], flag("OUT [OUT ...]")] = ()
     """Several output folders, one after the other."""
@@ -82,7 +81,7 @@ class Evaluate(SceneFlags, Reports):
         )
         show(evaluation, "mean")
         if network is None:
-            print("LPIPS was not measured: it needs a weights file, see --help")
+            print("LPIPS was not measured; to measure it: --lpips vgg")
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
         print(f"iteration {scene.iteration}, {which}: {where}")
