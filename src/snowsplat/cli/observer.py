@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
+from snowsplat.cli.page_flags import for_other_computers
 from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
 from snowsplat.pipeline.observer import Observer
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
-from snowsplat.viewer.hosts import LOCAL_HOST
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.observer import Page
@@ -95,11 +94,8 @@ class TerminalObserver(Observer):
 
     def page_opened(self, page: Page) -> None:
         print(f"watch it in a browser: {page.url}", flush=True)
-        for url in page.others:
-            print(f"from other computers: {url}", flush=True)
-        if page.url.startswith(f"http://{LOCAL_HOST}:"):
-            port = urlsplit(page.url).port
-            print(f"from another computer: ssh -L {port}:localhost:{port} THIS_ONE", flush=True)
+        for line in for_other_computers(page.url, page.others):
+            print(line, flush=True)
 
 
 class WatchObserver(TerminalObserver):

@@ -16,6 +16,7 @@ from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
@@ -394,7 +395,7 @@ class _Job:
             photos=self.photos,
         )
         if self.page is not None:
-            self.page.open_training(trainer, self.out.path.name, self.observer)
+            self.page.open_training(trainer, scene_name(self.out.path), self.observer)
         return run.run()
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:

@@ -12,6 +12,7 @@ from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
@@ -48,7 +49,7 @@ def viewed_scene(
         UserError: the scene is missing or damaged, or has no Gaussians.
     """
     path = Path(path)
-    title = path.resolve().name
+    title = scene_name(path)
     published, index = is_site(path), _levels_in(path)
     if iteration is not None and (published or index is not None):
         raise UserError("`iteration` selects a scene of an output folder; leave it out")

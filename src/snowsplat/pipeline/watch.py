@@ -16,7 +16,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
-from snowsplat.pipeline.output.scene_paths import existing_folder
+from snowsplat.pipeline.output.scene_paths import existing_folder, scene_name
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.watchers import PageReply, PageRequest, socket_in
@@ -70,7 +70,7 @@ def watch(
     newest = NewestScene(folder, iteration, (compute or Compute()).apply(), data.origin)
     newest()  # a scene that cannot be shown is reported before the page opens
     with suppress(KeyboardInterrupt):  # Ctrl-C is the normal end as soon as the page is open
-        page.open(data, background, folder.path.absolute().name, observer)
+        page.open(data, background, scene_name(folder.path), observer)
         page.show(newest)
 
 
