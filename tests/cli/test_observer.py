@@ -1,6 +1,7 @@
 """`TerminalObserver`: notes during a training run."""
 
 import io
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -29,6 +30,15 @@ def test_a_line_above_the_bar_is_printed_as_it_is():
     progress.say(line)
     progress.close()
     assert line in terminal.getvalue()
+
+
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_a_wait_is_shown_in_a_terminal_only(stream, monkeypatch):
+    shown = stream()
+    monkeypatch.setattr(sys, "stdout", shown)
+    with TerminalObserver() as observer, observer.waiting("reading"):
+        pass
+    assert ("reading" in shown.getvalue()) == (stream is Terminal)
 
 
 def test_a_remote_shell_gets_the_command_that_forwards_the_port(capsys, monkeypatch):

@@ -15,6 +15,7 @@ from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -40,7 +41,7 @@ _RESUMED_FLAGS = (
 
 
 @dataclass
-class Make:
+class Make(Reports):
     """Make a scene from photos or a video: sfm, train and render in one command.
 
     Examples:
@@ -69,6 +70,8 @@ class Make:
     """draft: a quick preview; best: takes several times as long as normal. With --minutes, the
     quality determines only the effort to estimate the camera poses; the training uses the remaining
     time."""
+    config: Annotated[Path | None, flag("FILE")] = None
+    """A JSON or TOML file with values of these flags. Flags have priority."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time. If there are too many photos for this time, some of them are used,
     evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
@@ -99,6 +102,8 @@ class Make:
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
     """Name of a proxy through which browsers open the page. Can be repeated."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""
@@ -129,6 +134,7 @@ class Make:
             except KeyboardInterrupt as stopped:
                 print(with_flags(str(stopped) or "stopped"))
                 return self._stopped()
+            self.report = {**vars(result), "folder": result.folder.path}
             print_summary(result)
             print("\n" + see_and_share(result.folder.path.parent), flush=True)
             if page is not None:

@@ -64,12 +64,15 @@ def viewed_scene(
         page = site(about, coarse, [], (0.0, 0.0, 0.0), lambda _: index, counts[0])
         yield ViewedScene(index, counts[0], *page)
         return
-    scene = load_viewable(path, iteration)
+    with observer.waiting("reading"):
+        scene = load_viewable(path, iteration)
     _check(scene.file, scene.gaussians)
     about = Description(title, made=made_on(scene.file))
     what = about, scene.gaussians, scene.cameras, scene.background
     if len(scene.gaussians) <= _LARGE:
-        yield ViewedScene(scene.file, len(scene.gaussians), *site(*what))
+        with observer.waiting("preparing"):
+            page = site(*what)
+        yield ViewedScene(scene.file, len(scene.gaussians), *page)
         return
     with TemporaryDirectory(prefix="snowsplat-levels-") as folder:
 
@@ -79,7 +82,9 @@ def viewed_scene(
             observer.note(f"to keep them: snowsplat convert {path} FOLDER/{INDEX}")
             return target
 
-        yield ViewedScene(scene.file, len(scene.gaussians), *site(*what, levels))
+        with observer.waiting("preparing"):
+            page = site(*what, levels)
+        yield ViewedScene(scene.file, len(scene.gaussians), *page)
 
 
 def _levels_in(path: Path) -> Path | None:

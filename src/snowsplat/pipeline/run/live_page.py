@@ -106,6 +106,17 @@ class LivePage:
         assert self._viewer is not None
         return self._viewer.url
 
+    @property
+    def others(self) -> list[str]:
+        """The addresses for other computers, if they differ."""
+        assert self._viewer is not None
+        return self._viewer.others
+
+    def resume(self) -> None:
+        """Resume the training if a user has paused it; may be called in any thread."""
+        if (viewer := self._viewer) is not None:
+            viewer.session.resume()
+
     def end_training(self, about: list[str]) -> None:
         """Show lines of text about the finished training run."""
         assert self._training is not None

@@ -24,6 +24,7 @@ from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
+from snowsplat.pipeline.run.watchers import Watchers
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.pace import Pace
@@ -81,6 +82,7 @@ class TrainingRun:
         self.history = History.read(self.out.history, self.first_step)
         self._left = StepsLeft(Work.for_training(self.config, self.trainer.dataset))
         self.together = Collective(self.trainer)
+        self.watchers = Watchers(self.out.path, self.trainer, self.page)
         self.transients = self.trainer.part(Transients)
         self.overfitting = self.trainer.part(OverfittingCheck)
         self.poses = self.trainer.part(PoseRefinement)
@@ -99,7 +101,8 @@ class TrainingRun:
                 self._finish_interrupted_writes()
                 self.together.proceed()
                 self.history.step_begins()
-                self.trainer.run(self._record)
+                with self.watchers:
+                    self.trainer.run(self._record)
             finally:
                 self.observer.steps_end()
         except KeyboardInterrupt:
@@ -142,10 +145,10 @@ class TrainingRun:
             self._save_checkpoint()
         if self.trainer.schedule.contains(progress.step, self.save_iterations):
             self._save_scene()
-        if self.page is not None:
-            paused = self.page.after_step(
-                progress.step, progress.iterations, progress.loss, self.trainer.gaussians
-            )
+        paused = self.watchers.after_step(
+            progress.step, progress.iterations, progress.loss, self.trainer.gaussians
+        )
+        if paused:
             self._left.postpone(paused)
             if self.pace is not None and self.budget is not None:
                 self.pace.postpone(paused)
