@@ -186,7 +186,8 @@ def test_the_page_of_a_finished_training_says_so(tmp_path):
         viewer.session.pause()
         training.end(["Finished: 9 steps", "PSNR <20 dB"])
         panel = training._panel
-        wait(lambda: not panel._pause.visible)  # the last control is hidden after the others
+        # The server's thread adds the controls; it hides this one after the others.
+        wait(lambda: hasattr(panel, "_key") and not panel._pause.visible)
         assert "Finished: 9 steps<br>PSNR &lt;20 dB" in panel._status.content
         assert panel._bar.value == 100.0
         assert not viewer.session.paused
