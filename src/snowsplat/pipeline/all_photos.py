@@ -76,6 +76,13 @@ def train_on_all(
     left_out = set(read_json(folder.path / "metrics.json").get("left_out", []))
     used = [view for view in scene.dataset.train if view.name not in left_out]
     views = [*used, *scene.dataset.test]
+    steps = round(SHARE * iteration)
+    if math.isfinite(seconds):
+        last = History.read(folder.history, iteration).stretches[-_LAST_STRETCHES:]
+        pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
+        steps = min(steps, int(seconds / pace)) if pace > 0 else 0
+    if steps < len(views):
+        return LastPart(None, 0, 0, "it would have less than one step for each photo")
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
     with ImageLoader(views, device=background.device) as images:
         wrong = unexplained_views(
@@ -86,13 +93,6 @@ def train_on_all(
             sh_degree=scene.gaussians.sh_degree,
         )
     views = [view for i, view in enumerate(views) if i < len(used) or i not in wrong]
-    steps = round(SHARE * iteration)
-    if math.isfinite(seconds):
-        last = History.read(folder.history, iteration).stretches[-_LAST_STRETCHES:]
-        pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
-        steps = min(steps, int(seconds / pace)) if pace > 0 else 0
-    if steps < len(views):
-        return LastPart(None, 0, 0, "it would have less than one step for each photo")
     exposures = folder.exposures()
     config = _last_config(
         config_from_json(read_json(folder.path / "config.json")["training"]),
