@@ -95,10 +95,12 @@ def test_many_photos_are_matched_with_similar_ones():
     assert max(partners(choice.pairs, 50)) >= 59  # and some at a distance
     assert len(choice.pairs) < 12 * count
     assert choice.pairs == sorted(set(choice.pairs))
-    assert "similar" in choice.description and f"{len(choice.pairs)} pairs" in choice.description
+    assert "similar" in choice.description
+    assert f"{len(choice.pairs)} pairs" in choice.description
     every = choice.whole()
     assert partners(every.pairs, 50) >= set(range(40, 61)) - {50}
-    assert len(every.pairs) == len(choice.pairs) + len(choice.reserve) and not every.reserve
+    assert len(every.pairs) == len(choice.pairs) + len(choice.reserve)
+    assert not every.reserve
 
 
 def partners(pairs, photo):
