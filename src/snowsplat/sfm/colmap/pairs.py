@@ -131,9 +131,9 @@ def choose_pairs(
     if covered:
         pairs |= nearest(alike, range(round(_LOOP_SHARE * effort.neighbours)))
         return PairChoice(sorted(pairs), ", ".join(rules))
-    every = range(effort.neighbours)
-    pairs |= nearest(alike, _growing(every))
-    reserve = nearest(alike, every) - pairs
+    places = range(effort.neighbours)
+    pairs |= nearest(alike, _growing(places))
+    reserve = nearest(alike, places) - pairs
     return PairChoice(sorted(pairs), ", ".join(rules), sorted(reserve))
 
 

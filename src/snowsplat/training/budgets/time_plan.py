@@ -134,6 +134,9 @@ def make_plan(
         work = Work(sized, width * height, len(dataset.test))
         initial = initial_count(dataset, sized)
         steps, mean = _steps(work, left, time_ratio, initial)
+        sized = replace(sized, iterations=steps).staged(len(dataset.train))
+        work = replace(work, config=sized)
+        steps, mean = _steps(work, left, time_ratio, initial)
         if more_often:
             sized = _densified_in(sized, steps)
             work = replace(work, config=sized)
