@@ -2,6 +2,8 @@
 
 import signal
 import socket
+import sys
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -39,12 +41,33 @@ def test_watch_until_ctrl_c(start, trained):
     process = start("watch", trained)
     url = url_of(process)
     assert url.startswith("http://127.0.0.1:")
-    assert "ssh -L" in process.stdout.readline()
     assert process.stdout.readline() == "Ctrl-C ends it\n"
+    assert b"<title>out - snowsplat</title>" in page_at(url)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no local sockets")
+def test_watch_opens_the_page_of_a_training_that_goes_on_without_it(start, dataset, tmp_path):
+    out = tmp_path / "out"
+    training = start("train", dataset, "-o", out, "--iterations", 100_000)
+    end = time.monotonic() + 120
+    while not (out / ".snowsplat.watch" / "socket").exists():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    process = start("watch", out)
+    assert "after the present step" in process.stdout.readline()
+    assert process.stdout.readline() == "closing the page does not end the training\n"
+    url = url_of(process)
     assert b"<html" in page_at(url)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
+    training.send_signal(signal.SIGINT)  # it still runs
+    shown, err = training.communicate(timeout=60)
+    assert "stopped after step" in shown + err
+    assert not (out / ".snowsplat.watch").exists()
 
 
 def test_errors(refused, trained, tmp_path):

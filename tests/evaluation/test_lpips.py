@@ -1,11 +1,14 @@
 """LPIPS compared with the same networks built from torch.nn layers, with random weights."""
 
+import sys
+from types import SimpleNamespace
+
 import pytest
 import torch
 from safetensors.torch import save_file as save
 from torch import nn
 
-from snowsplat.evaluation.lpips import Lpips
+from snowsplat.evaluation.lpips import Lpips, _main
 from snowsplat.util.errors import UserError
 
 
@@ -126,3 +129,31 @@ def test_invalid_files_are_rejected(network, tmp_path):
         save(state, path)
         with pytest.raises(UserError, match="at least 32 pixels"):
             Lpips.load(path)(torch.zeros(31, 80, 3), torch.zeros(31, 80, 3))
+
+
+def test_weights_of_the_package_and_a_file_of_them(network, tmp_path, monkeypatch):
+    name, *_, state = network
+    package = SimpleNamespace(
+        LPIPS=lambda net, verbose: SimpleNamespace(state_dict=lambda: state if net == name else {})
+    )
+    monkeypatch.setitem(sys.modules, "lpips", package)
+    monkeypatch.chdir(tmp_path)
+    save(state, tmp_path / "weights.safetensors")
+    expected = Lpips.load(tmp_path / "weights.safetensors")(*images())
+    assert Lpips.load(name)(*images()) == expected
+    assert _main([name, "written.safetensors"]) is None
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    assert Lpips.load("written.safetensors")(*images()) == expected
+    with pytest.raises(UserError, match="pip install lpips"):
+        Lpips.load(name)
+    assert "pip install lpips" in (_main([name, "x"]) or "")
+    assert "use: python -m" in (_main(["resnet", "x"]) or "")
+
+
+def test_no_network(tmp_path, monkeypatch):
+    def offline(net, verbose):
+        raise OSError("no route to host")
+
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=offline))
+    with pytest.raises(UserError, match="cannot download its network"):
+        Lpips.load("vgg")

@@ -16,6 +16,7 @@ from PIL import Image
 from snowsplat.data.colmap import read_model, read_points, write_model
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.scene.geometry import look_at
+from snowsplat.sfm import dataset_report
 from snowsplat.sfm.dataset_report import write_report
 from snowsplat.sfm.photo_problems import DARK
 
@@ -80,6 +81,7 @@ def facts(**sfm: Any) -> dict[str, Any]:
         "undistorted": {"sizes": [[158, 118, 30]], "resampled": True},
         "seconds": {"photos": 3.21, "poses": 6000.0, "images": 130.0},
         "problems": {},
+        "alone": True,
         "verdict": Verdict.of([Reason("usable", "30 photos < 31", "take <more>")]).as_json(),
     }
 
@@ -97,8 +99,12 @@ def test_page_is_well_formed_and_self_contained(dataset):
     sources = re.findall(r'(?:src|href)="([^"]*)"', text)
     assert sources
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
-    assert "<script" not in text
+    assert text.count("<script>") == 1  # that opens the pictures
     assert "url(" not in text
+
+
+def test_a_dataset_of_make_needs_no_next_step(dataset):
+    assert "snowsplat train" not in visible_text(write_report(dataset, facts() | {"alone": False}))
 
 
 def test_page_says_what_is_fixed_to_the_frame(dataset):
@@ -145,7 +151,8 @@ def test_all_cameras_appear_in_both_drawings(dataset):
         assert sorted(titles) == sorted([*NAMES, "walk.mp4"])
 
 
-def test_thumbnails_are_small_images(dataset):
+def test_pictures_are_reduced_images(dataset, monkeypatch):
+    monkeypatch.setattr(dataset_report, "_PICTURE_HEIGHT", 60)
     root = ET.parse(write_report(dataset, facts())).getroot()
     images = list(root.iter("img"))
     assert len(images) == 24
@@ -153,7 +160,7 @@ def test_thumbnails_are_small_images(dataset):
     for image in images:
         with Image.open(io.BytesIO(base64.b64decode(image.attrib["src"].split(",")[1]))) as decoded:
             assert decoded.format == "JPEG"
-            assert decoded.height == 110
+            assert decoded.height == 60
     assert (dataset / "dataset_report.html").stat().st_size < 600_000
 
 

@@ -8,6 +8,8 @@ from PIL import Image
 from snowsplat.util import html
 from snowsplat.util.duration import duration
 
+from ..browser import Browser
+
 
 def test_page_is_xml_for_any_text():
     nasty = "a <b> & 'c' \"d\" \x00\x1b \udcff 雪"
@@ -28,6 +30,55 @@ def test_page_is_xml_for_any_text():
     assert ".own { color: red; }" in page
     assert root.find(".//img").get("src").startswith("data:image/jpeg;base64,")
     assert root.find(".//img").get("alt").startswith("a <b>")
+
+
+def a_page(folder):
+    """A page with two pictures, a table of eight columns, and long words, which is opened."""
+    pictures = [
+        html.picture(Image.new("RGB", (900, 600), color), color) for color in ("red", "blue")
+    ]
+    wide = html.table(["a column"] * 8, [["1.234&#160;dB"] * 7 + [html.bar(1.0)]])
+    facts = html.table([], [["degree of the spherical harmonics", "0123456789abcdef " * 8]])
+    style = "main img { height: 110px; }"
+    path = folder / "page.html"
+    parts = ["<h1>a_very_long_name_of_a_folder_without_spaces_in_it</h1>", *pictures, wide, facts]
+    path.write_text(html.page("a page", parts, style), encoding="utf-8")
+    return path.as_uri()
+
+
+@pytest.mark.browser
+def test_a_page_fits_a_phone(tmp_path):
+    with Browser(390, 844) as browser:
+        page = browser.open(a_page(tmp_path))
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert not page.errors
+
+
+@pytest.mark.browser
+def test_pictures_open_large_by_click_and_key(tmp_path):
+    """Escape is left to the browser; the arrow keys show the next picture."""
+    shown = "document.querySelector('dialog[open] img')?.alt ?? ''"
+
+    def press(key):
+        event = f"new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}})"
+        return page.evaluate(f"document.activeElement.dispatchEvent({event}), {shown}")
+
+    with Browser(800, 600) as browser:
+        page = browser.open(a_page(tmp_path))
+        page.evaluate("document.querySelectorAll('main img')[0].click()")
+        assert page.evaluate(shown) == "red"
+        assert page.evaluate("document.querySelector('dialog img').height") > 500
+        page.evaluate("document.querySelector('dialog').click()")
+        assert page.evaluate(shown) == ""
+        page.evaluate("document.querySelectorAll('main img')[1].focus()")
+        assert press("Enter") == "blue"
+        assert page.evaluate("document.querySelector('dialog').contains(document.activeElement)")
+        assert press("ArrowRight") == "red"
+        assert not page.errors
+
+
+def test_a_page_without_pictures_has_no_script():
+    assert "<script" not in html.page("a page", ["<p>words</p>"])
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,12 @@ import tyro
 
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
 from snowsplat.cli.flags import flag
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
 
 
 @dataclass
-class Benchmark:
+class Benchmark(Reports):
     """Train and evaluate all scenes of a folder by the protocol of the papers.
 
     Examples:
@@ -50,12 +51,14 @@ class Benchmark:
     """Maximum number of Gaussians; 0: no limit."""
     resolution: Annotated[int | None, flag("N", "-r", default="set by the suite")] = None
     """1, 2, 4 or 8: divide the size of the photos by this number; another number: the width."""
-    lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
-    """File with the weights for LPIPS, see snowsplat evaluate."""
+    lpips: Annotated[Path | None, flag("{vgg,alex,FILE}", default="not measured")] = None
+    """Network for LPIPS, or a file with its weights, see snowsplat evaluate."""
     jobs: Annotated[int, flag("N", default="1")] = 1
     """Number of scenes trained at the same time. They share the CPU; job i uses GPU i."""
     device: Annotated[Literal["cpu", "cuda"] | None, flag("{cpu,cuda}", default="a GPU")] = None
     """Device for the training."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 2 if a scene could not be trained, otherwise 0."""
@@ -79,5 +82,6 @@ class Benchmark:
         report = benchmark(
             self.folder, self.output, options, on_line=lambda line: print(line, flush=True)
         )
+        self.report = report
         print(f"\n{report}\n\n{self.output / 'index.html'}: the results as a page")
         return 2 if report.failures else 0

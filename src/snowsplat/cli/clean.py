@@ -10,11 +10,13 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import see_and_share
+from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
 
 
 @dataclass
-class Clean:
+class Clean(Reports):
     """Remove floaters: Gaussians that hang in front of the surfaces.
 
     Examples:
@@ -41,6 +43,8 @@ class Clean:
     """Number of CPU threads."""
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to compute on."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -49,17 +53,20 @@ class Clean:
         from snowsplat.pipeline.clean import clean
         from snowsplat.pipeline.compute import Compute
 
-        done = clean(
-            self.scene,
-            self.target,
-            dataset=self.dataset,
-            overwrite=self.overwrite,
-            compute=Compute(self.device, self.threads),
-        )
+        with TerminalObserver() as observer:
+            done = clean(
+                self.scene,
+                self.target,
+                dataset=self.dataset,
+                overwrite=self.overwrite,
+                compute=Compute(self.device, self.threads),
+                observer=observer,
+            )
         before, after = done.psnr
         print(
             f"{self.target}: {done.before - done.after:,} of {done.before:,} Gaussians removed; "
             f"PSNR of {done.compared} {before:.2f} dB before, {after:.2f} dB after"
         )
         print(see_and_share(self.target))
+        self.report = {"file": self.target, "bytes": self.target.stat().st_size, **vars(done)}
         return 0

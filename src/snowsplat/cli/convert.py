@@ -11,6 +11,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
@@ -19,7 +20,7 @@ Box = tuple[float, float, float, float, float, float]
 
 
 @dataclass
-class Convert:
+class Convert(Reports):
     """Write a scene in another file format; crop, decimate, transform or merge scenes.
 
     Examples:
@@ -78,6 +79,8 @@ class Convert:
     it, they are relative to the origin that is noted in the file or beside it."""
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -105,7 +108,9 @@ class Convert:
                 overwrite=self.overwrite,
                 observer=observer,
             )
-        written = f"{format_bytes(format.size(target))} of {format.name}"
+        size = format.size(target)
+        written = f"{format_bytes(size)} of {format.name}"
+        self.report = {"file": target, "bytes": size, "format": format.name, "lost": format.loses}
         print(f"{target}: {written}; lost in this format: {format.loses}")
         page = format.name == "HTML"
         print(f"to see it: open {target} in a browser" if page else see_and_share(target))

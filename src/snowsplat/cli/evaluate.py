@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.scene_flags import SceneFlags
 
 if TYPE_CHECKING:
@@ -15,13 +16,13 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Evaluate(SceneFlags):
+class Evaluate(SceneFlags, Reports):
     """Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.
 
     Examples:
       snowsplat evaluate out/garden
       snowsplat evaluate out/garden --split train
-      snowsplat evaluate out/garden --lpips lpips_vgg.safetensors
+      snowsplat evaluate out/garden --lpips vgg
 
     Notes:
       The metrics of each view and their means are printed, and written to
@@ -31,30 +32,32 @@ class Evaluate(SceneFlags):
       photo do not count. The photos have the size of the training, which
       a time limit may have reduced; -r 1: their own size.
 
-    To create the file of weights for LPIPS, run this where lpips is installed:
-      weights = lpips.LPIPS(net="vgg").state_dict()
-      weights = {name: weight.clone() for name, weight in weights.items()}
-      safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
+    The weights of LPIPS are those of the package lpips (pip install lpips), which
+    downloads a network once. For a computer without it, this writes a file:
+      python -m snowsplat.evaluation.lpips vgg lpips_vgg.safetensors
     """
 
     split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
     """test: the held-out photos; train: the training photos."""
-    lpips: Annotated[Path | None, flag("FILE", default="not measured")] = None
-    """File with the weights for LPIPS (of AlexNet or VGG16, and of the linear layers), in the
-    safetensors format."""
+    lpips: Annotated[Path | None, flag("{vgg,alex,FILE}", default="not measured")] = None
+    """Measure LPIPS with this network, or with the weights in a safetensors file (of AlexNet or
+    VGG16, and of the linear layers)."""
 
     model_paths: Annotated[tuple[Path, ...], flag("OUT [OUT ...]")] = ()
     """Several output folders, one after the other."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
-        for path in self.model_paths:
-            replace(self, model_path=path, model_paths=())._evaluate()
-        if not self.model_paths:
-            self._evaluate()
+        several = [
+            replace(self, model_path=path, model_paths=())._evaluate() for path in self.model_paths
+        ]
+        self.report = several or self._evaluate()
         return 0
 
-    def _evaluate(self) -> None:
+    def _evaluate(self) -> dict[str, Any]:
+        """Print the figures of one folder; returns them."""
         from snowsplat.evaluation.lpips import Lpips
         from snowsplat.pipeline.evaluate import evaluate, views_of
 
@@ -78,9 +81,11 @@ class Evaluate(SceneFlags):
         )
         show(evaluation, "mean")
         if network is None:
-            print("LPIPS was not measured: it needs a weights file, see --help")
+            print("LPIPS was not measured; to measure it: --lpips vgg")
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
         print(f"iteration {scene.iteration}, {which}: {where}")
         out = self.output_path()
         print(next_step("to see the renders", "render", out, "--split", self.split))
+        about = {"folder": out, "iteration": scene.iteration, "split": self.split}
+        return about | {"size": evaluation.size, **evaluation.as_json()}

@@ -30,7 +30,7 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         kind: the dataclass of the subcommand.
         message: what tyro has printed; it is used if the arguments do not show the reason.
     """
-    flags = dict(_flags(kind))
+    flags = spellings(kind)
     for number, argument in enumerate(arguments):
         if not _FLAG.match(argument):
             continue
@@ -39,7 +39,7 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         if spelling not in flags:
             advice = similar(spelling, list(flags)) or "; leave it out"
             return f"{printable(name)}: unknown flag{advice}"
-        hint, declared = flags[spelling]
+        _, hint, declared = flags[spelling]
         kinds = [each for each in kinds_of(hint) if each is not NoneType]
         if kinds == [bool]:
             continue
@@ -58,12 +58,20 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
     return " ".join(lines[:end]).rstrip(".") or "invalid flags"
 
 
-def _flags(kind: Any) -> Iterator[tuple[str, tuple[Any, Setting]]]:
-    """Each spelling of a flag -> its type, and its declaration if it is a setting."""
+def spellings(kind: Any) -> dict[str, tuple[str, Any, Setting]]:
+    """Each spelling of a flag of a subcommand -> its field, its type, and its declaration.
+
+    Args:
+        kind: the dataclass of the subcommand.
+    """
+    return dict(_flags(kind))
+
+
+def _flags(kind: Any) -> Iterator[tuple[str, tuple[str, Any, Setting]]]:
     from snowsplat.cli.config_flags import SETTINGS  # analysed only if there is an error
 
     settings = {name: declared for name, _, declared in SETTINGS}
-    yield from (("-h", (bool, Setting())), ("--help", (bool, Setting())))
+    yield from ((name, ("help", bool, Setting())) for name in ("-h", "--help"))
     for name, hint in get_type_hints(kind, include_extras=True).items():
         extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
         if tyro.conf.Positional in extras:
@@ -72,7 +80,7 @@ def _flags(kind: Any) -> Iterator[tuple[str, tuple[Any, Setting]]]:
         aliases = [each for extra in extras for each in getattr(extra, "aliases", None) or ()]
         declared = settings.get(name, Setting()) if get_origin(type_) is not Literal else Setting()
         for spelling in ("--" + name.replace("_", "-"), *aliases):
-            yield spelling, (type_, declared)
+            yield spelling, (name, type_, declared)
 
 
 def _values(arguments: Sequence[str]) -> list[str]:

@@ -24,6 +24,7 @@ from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.reference_flags import translated
+from snowsplat.cli.reports import run
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
@@ -54,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(overview())
         return 0
     try:
-        return int(parse(arguments).run())
+        return run(parse(arguments))
     except SettingError as error:
         return _fail(with_flags(f"`{error.setting}`: {error.problem}"), 2)
     except UserError as error:
@@ -90,6 +91,10 @@ def parse(arguments: Sequence[str]) -> Any:
     rest, notes = translated(name, rest)
     for note in notes:
         _print_error(note)
+    if name in SUBCOMMANDS and "--config" in (text.partition("=")[0] for text in rest):
+        from snowsplat.cli.config_file import expanded
+
+        rest = expanded(load_subcommand(name), rest)
     union: Any = Union[tuple(_choices(name))]  # noqa: UP007 (made at run time)
     printed = io.StringIO()
     try:

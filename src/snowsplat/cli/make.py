@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +15,7 @@ from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 
@@ -27,6 +28,7 @@ _RESUMED_FLAGS = (
     "output",
     "quality",
     "minutes",
+    "title",
     "exposure",
     "threads",
     "device",
@@ -37,7 +39,7 @@ _RESUMED_FLAGS = (
 
 
 @dataclass
-class Make:
+class Make(Reports):
     """Make a scene from photos or a video: sfm, train and render in one command.
 
     Examples:
@@ -66,10 +68,14 @@ class Make:
     """draft: a quick preview; best: takes several times as long as normal. With --minutes, the
     quality determines only the effort to estimate the camera poses; the training uses the remaining
     time."""
+    config: Annotated[Path | None, flag("FILE")] = None
+    """A JSON or TOML file with values of these flags. Flags have priority."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time. If there are too many photos for this time, some of them are used,
     evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
     counted, and its training resumes with the time that remained."""
+    title: Annotated[str | None, flag("TEXT", default="the name of the input")] = None
+    """The name of the scene in its report and on its pages."""
     exposure: Annotated[
         Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default="auto")
     ] = None
@@ -91,6 +97,8 @@ class Make:
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
     """Name of a proxy through which browsers open the page. Can be repeated."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""
@@ -101,27 +109,30 @@ class Make:
             quality=self.quality,
             minutes=self.minutes,
             memory=self.memory,
+            title=self.title,
             exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
         )
         page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
-        try:
-            with TerminalObserver() as observer, page or nullcontext():
-                result = make(
-                    self.inputs,
-                    self.output,
-                    options,
-                    overwrite=self.overwrite,
-                    observer=observer,
-                    page=page,
-                )
-        except KeyboardInterrupt as stopped:
-            print(with_flags(str(stopped) or "stopped"))
-            return self._stopped()
-        print_summary(result)
-        print("\n" + see_and_share(result.folder.path.parent), flush=True)
-        if page is not None:
-            self._watch(result, page)
+        with page or nullcontext():
+            try:
+                with TerminalObserver() as observer:
+                    result = make(
+                        self.inputs,
+                        self.output,
+                        options,
+                        overwrite=self.overwrite,
+                        observer=observer,
+                        page=page,
+                    )
+            except KeyboardInterrupt as stopped:
+                print(with_flags(str(stopped) or "stopped"))
+                return self._stopped()
+            self.report = {**vars(result), "folder": result.folder.path}
+            print_summary(result)
+            print("\n" + see_and_share(result.folder.path.parent), flush=True)
+            if page is not None:
+                self._show(result, page)
         return 0
 
     def _stopped(self) -> int:
@@ -133,11 +144,17 @@ class Make:
         print(f"resume with: {shlex.join(words)}")
         return 130
 
-    def _watch(self, made: MakeResult, page: LivePage) -> None:
+    def _show(self, made: MakeResult, page: LivePage) -> None:
+        """Show the scene until Ctrl-C, on the page of the training if there was one."""
+        if page.has_trained:
+            with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
+                print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
+                page.show_result()
+            return
         from snowsplat.pipeline.compute import Compute
         from snowsplat.pipeline.watch import watch
 
-        with WatchObserver() as observer, page:
+        with WatchObserver() as observer:
             watch(
                 made.folder.path,
                 page,

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import sys
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
+from snowsplat.cli.page_flags import for_other_computers
 from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
 from snowsplat.pipeline.observer import Observer
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
-from snowsplat.viewer.hosts import LOCAL_HOST
 
 if TYPE_CHECKING:
+    from snowsplat.pipeline.observer import Page
     from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.sfm.progress import Report
     from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome
-    from snowsplat.viewer.live.viewer import NetworkViewer
 
 
 class TerminalObserver(Observer):
@@ -56,6 +55,9 @@ class TerminalObserver(Observer):
             for detail in details:
                 self._stages.say(f"          {detail}")
 
+    def leave(self) -> None:
+        self._stages.hide()
+
     def steps_begin(self, step: int, iterations: int) -> None:
         self._stages.hide()
         if not self._quiet:
@@ -90,18 +92,15 @@ class TerminalObserver(Observer):
             print(f"{spent} in total, of {given}")
         sys.stdout.flush()
 
-    def page_opened(self, viewer: NetworkViewer) -> None:
-        print(f"watch it in a browser: {viewer.url}", flush=True)
-        for url in viewer.others:
-            print(f"from other computers: {url}", flush=True)
-        if viewer.url.startswith(f"http://{LOCAL_HOST}:"):
-            port = urlsplit(viewer.url).port
-            print(f"from another computer: ssh -L {port}:localhost:{port} THIS_ONE", flush=True)
+    def page_opened(self, page: Page) -> None:
+        print(f"watch it in a browser: {page.url}", flush=True)
+        for line in for_other_computers(page.url, page.others):
+            print(line, flush=True)
 
 
 class WatchObserver(TerminalObserver):
     """The observer of `snowsplat watch`, which Ctrl-C ends."""
 
-    def page_opened(self, viewer: NetworkViewer) -> None:
-        super().page_opened(viewer)
+    def page_opened(self, page: Page) -> None:
+        super().page_opened(page)
         print("Ctrl-C ends it", flush=True)

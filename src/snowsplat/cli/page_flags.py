@@ -1,14 +1,20 @@
-"""The flags `--view`, `--port`, `--host` and `--allow-host`: a page in the browser."""
+"""A page in the browser: the flags `--view`, `--port`, `--host`, `--allow-host`; addresses."""
 
 from __future__ import annotations
 
+import getpass
+import os
+import socket
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import tyro
 
 from snowsplat.cli.flags import flag
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.hosts import LOCAL_HOST
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.run.live_page import LivePage
@@ -43,3 +49,22 @@ class PageFlags:
             if given[name]:
                 raise UserError(f"{name} sets the address of a page; add --view to open one")
         return None
+
+
+def for_other_computers(url: str, others: Sequence[str]) -> list[str]:
+    """Lines that say how other computers open a page: at its other addresses or, if it is only for
+    this computer and this shell is a remote one, through a forwarded port."""
+    here = urlsplit(url)
+    if here.hostname == LOCAL_HOST and not others and over_ssh():
+        return [f"from your computer: {_forwarding(here.port)}"]
+    return [f"from other computers: {other}" for other in others]
+
+
+def over_ssh() -> bool:
+    """Whether this shell is a remote one."""
+    return any(name in os.environ for name in ("SSH_CONNECTION", "SSH_TTY"))
+
+
+def _forwarding(port: int | None) -> str:
+    """The command that forwards a port of this machine to the computer of the user."""
+    return f"ssh -L {port}:{LOCAL_HOST}:{port} {getpass.getuser()}@{socket.gethostname()}"

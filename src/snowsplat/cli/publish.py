@@ -11,12 +11,13 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
 
 @dataclass
-class Publish:
+class Publish(Reports):
     """Write a static web site that shows a scene.
 
     Examples:
@@ -49,6 +50,8 @@ class Publish:
     """If OUT contains several scenes, the step after which the scene was saved."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -68,6 +71,7 @@ class Publish:
                 threads=self.threads,
                 observer=observer,
             )
+        self.report = result
         print(f"{result.folder}: {result.gaussians:,} Gaussians, {format_bytes(result.bytes)}")
         look = next_step("to look at it", "view", result.folder)
         print(f"{look}; to share it: copy the folder to a web host, and send the address")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.scene_flags import SceneFlags
 from snowsplat.util.errors import UserError
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Render(SceneFlags):
+class Render(SceneFlags, Reports):
     """Render images at the camera poses of the photos, or a video.
 
     Examples:
@@ -82,6 +83,8 @@ class Render(SceneFlags):
     """Write one video with colour on the left and depth on the right."""
     video: Annotated[Path | None, flag("FILE.mp4", "--film", default="in OUT/videos")] = None
     """File to which the video is written."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -109,6 +112,7 @@ class Render(SceneFlags):
             rendered = render_images(
                 self.load(), splits=splits, depth=self.depth, antialias=self._antialias()
             )
+        self.report = {"images": rendered}
         for folder, count in rendered.items():
             print(f"{folder}: {count} images")
         print(next_step("for a video", "render", self.output_path(), "--path", "ellipse"))
@@ -140,7 +144,7 @@ class Render(SceneFlags):
             projection=self.projection,
         )
         with TerminalObserver() as observer:
-            render_video(
+            videos = render_video(
                 scene,
                 options,
                 target=target,
@@ -148,4 +152,5 @@ class Render(SceneFlags):
                 compute=self.compute(),
                 observer=observer,
             )
+        self.report = {"videos": videos}
         print(see_and_share(scene))

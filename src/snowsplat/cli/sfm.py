@@ -11,6 +11,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Sfm:
+class Sfm(Reports):
     """Estimate the camera poses of photos or a video, and create a dataset.
 
     Examples:
@@ -76,6 +77,8 @@ class Sfm:
     """Replace the dataset in DATASET even if it was made from other photos."""
     quiet: Annotated[bool, switch("-q")] = False
     """Print only the result and no progress."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -100,6 +103,8 @@ class Sfm:
         for line in [] if verdict is None else verdict.lines("the photos"):
             print(line)
         print(next_step("train it with", "train", folder, "-o", "OUT", "--eval"))
+        results = {stage: outcome.result for stage, outcome in outcomes.items()}
+        self.report = {"dataset": folder, **results}
         return 0
 
     def _inputs_and_folder(self) -> tuple[tuple[Path, ...], Path]:

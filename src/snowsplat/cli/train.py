@@ -10,13 +10,14 @@ from snowsplat.cli.flags import with_flags
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import PageFlags
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.train_flags import TrainFlags
 from snowsplat.util.errors import UserError
 from snowsplat.util.run_lock import one_run
 
 
 @dataclass
-class Train(TrainFlags):
+class Train(TrainFlags, Reports):
     """Train a scene from photos with known camera poses (COLMAP or transforms.json).
 
     Examples:
@@ -35,6 +36,9 @@ class Train(TrainFlags):
       Ctrl-C stops the training and saves the current scene and a checkpoint.
       The flags of the reference implementation are accepted (-s -m -i -r -w …).
     """
+
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
@@ -59,10 +63,14 @@ class Train(TrainFlags):
             OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
+        from snowsplat.pipeline.observer import Observers
+        from snowsplat.pipeline.step_logs import LOGS
         from snowsplat.pipeline.train import resume, train
 
+        logs = [LOGS[name](self.output) for name in self.log]
         page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
-        with TerminalObserver(self.quiet) as observer, page or nullcontext():
+        with TerminalObserver(self.quiet) as terminal, page or nullcontext():
+            observer = Observers(terminal, *logs)
             try:
                 if self.resume:
                     result = resume(
@@ -84,6 +92,9 @@ class Train(TrainFlags):
                     raise
                 print(next_step("resume with", "train", "-o", self.output, "--resume"))
                 return 130
+            step, metrics = result.evaluation or (None, None)
+            measured = None if metrics is None else {"step": step, **metrics.as_json()}
+            self.report = {**vars(result), "evaluation": measured}
             if result.verdict is not None:
                 print("\n".join(result.verdict.lines("the scene")), flush=True)
             if not self.quiet:

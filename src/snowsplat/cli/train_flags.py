@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from snowsplat.cli.config_file import training_in
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, ConfigFlags, RecipeName
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.page_flags import AllowHost
@@ -32,6 +33,9 @@ class JobFlags:
     steps, designed for CPUs; classic: the default recipe of version 0.1; paper: the 30,000 steps of
     the paper; mcmc: 30,000 steps with a fixed maximum number of Gaussians; mcmc-short: the same in
     3000 steps."""
+    config: Annotated[Path | None, flag("FILE")] = None
+    """A JSON or TOML file with values of these flags, such as {"iterations": 3000, "eval": true},
+    or the config.json of an earlier training, whose settings are used. Flags have priority."""
     minutes: Annotated[float | None, flag("F", default="none")] = None
     """Finish within this time, including evaluation and saving. The number of steps, the size of
     the photos and the maximum number of Gaussians are chosen for this time, unless flags set them.
@@ -88,6 +92,11 @@ class JobFlags:
     """Steps after which to save the scene, in addition to the last step."""
     source_path: Annotated[Path | None, flag("DATASET", "-s")] = None
     """The same as DATASET. This is the flag of the reference implementation."""
+    log: Annotated[
+        tuple[Literal["csv", "tensorboard"], ...], flag("[{csv,tensorboard} ...]", default="none")
+    ] = ()
+    """Also write loss, number of Gaussians and metrics of the steps: csv: to OUT/log.csv;
+    tensorboard: to OUT/tensorboard, which needs the package snowsplat[tensorboard]."""
     quiet: Annotated[bool, switch("-q")] = False
     """Print only the result and no progress."""
 
@@ -100,20 +109,30 @@ class TrainFlags(ConfigFlags, JobFlags):
         """The dataset, or None. Raises: UserError: it is named twice."""
         if self.dataset is not None and self.source_path is not None:
             raise UserError("the dataset is named twice; leave out DATASET or -s")
-        return self.dataset or self.source_path
+        given = self.dataset or self.source_path
+        if given is None and self.config is not None and not self.resume:
+            earlier = training_in(self.config)[1].path
+            given = Path(earlier) if earlier else None
+        return given
 
     def options(self) -> TrainOptions:
         """The options of `pipeline.train.train`. Raises: UserError: contradictory flags."""
         from snowsplat.pipeline.compute import Compute
         from snowsplat.pipeline.train import TrainOptions
 
+        config, earlier = (None, None) if self.config is None else training_in(self.config)
+        before = {} if earlier is None else asdict(earlier)
+        if self.eval or self.test_list is not None:
+            before |= dict.fromkeys(("hold_out", "first_held_out", "test_list"))
         return TrainOptions(
             recipe=self.recipe,
+            config=config,
             settings=self._settings(),
-            images=self.images,
-            resolution=self.resolution,
-            hold_out=8 if self.eval else None,
-            test_list=self.test_list,
+            images=before.get("images") if self.images is None else self.images,
+            resolution=before.get("resolution") if self.resolution is None else self.resolution,
+            hold_out=8 if self.eval else before.get("hold_out"),
+            first_held_out=before.get("first_held_out"),
+            test_list=self.test_list or before.get("test_list"),
             minutes=self.minutes,
             memory=self.memory,
             trust_cameras=self.trust_cameras,

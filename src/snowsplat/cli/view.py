@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import getpass
 import os
 import signal
-import socket
 import sys
 import threading
 import webbrowser
@@ -19,7 +17,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.page_flags import AllowHost
+from snowsplat.cli.page_flags import AllowHost, for_other_computers, over_ssh
 from snowsplat.util.errors import UserError
 
 
@@ -75,25 +73,13 @@ class View:
             site = scene.gaussians is None
             print(f"{scene.file}: {'a web site' if site else f'{scene.gaussians:,} Gaussians'}")
             print(f"open this in a browser, Ctrl-C ends it: {server.url}", flush=True)
-            for url in server.others:
-                print(f"from other computers: {url}", flush=True)
-            if not server.others and over_ssh():
-                print(f"from your computer: {forwarding(server.port)}", flush=True)
+            for line in for_other_computers(server.url, server.others):
+                print(line, flush=True)
             if not self.no_browser and has_screen():
                 open_browser(server.url)
             while not interrupted.wait(1.0):  # on Windows Ctrl-C arrives only between two waits
                 pass
         return 0
-
-
-def over_ssh() -> bool:
-    """Whether this shell is a remote one."""
-    return any(name in os.environ for name in ("SSH_CONNECTION", "SSH_TTY"))
-
-
-def forwarding(port: int) -> str:
-    """The command that forwards a port of this machine to the computer of the user."""
-    return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{socket.gethostname()}"
 
 
 def has_screen() -> bool:

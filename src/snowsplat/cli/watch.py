@@ -20,9 +20,11 @@ class Watch(SceneFlags):
       snowsplat watch out/garden --port 9000
 
     Notes:
-      While the training is running, the page shows the newest scene or checkpoint
-      that has been saved (see --checkpoint-every of snowsplat train).
-      Ctrl-C closes the page.
+      A training that is running on this computer shows its present state and can
+      be paused, also without --view. Closing the page does not end it. Of one on
+      another computer, in several processes, or on Windows, the page shows the
+      newest scene or checkpoint that has been saved (see --checkpoint-every of
+      snowsplat train). Ctrl-C closes the page.
     """
 
     port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None

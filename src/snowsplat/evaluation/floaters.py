@@ -14,7 +14,7 @@ surface.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +24,13 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.scene.sight import blended, reduced
+
+Report = Callable[[int, int, str], None]
+
+
+def _silent(done: int, total: int, what: str) -> None:
+    pass
+
 
 #: A pixel has a surface if the Gaussians that may form one cover this share of it.
 _COVERED = 0.5
@@ -60,22 +67,31 @@ class Coverage:
         return self.largest < _PIXELS
 
 
-def coverage(gaussians: Gaussians, cameras: Sequence[Camera]) -> Coverage:
+def coverage(gaussians: Gaussians, cameras: Sequence[Camera], report: Report = _silent) -> Coverage:
     """Render each view, and find out which Gaussians it shows, and which are in front.
 
     Args:
         gaussians: N Gaussians.
         cameras: those of the photos.
+        report: called with the number of rendered views, of all, and the word "views"; each view
+            is rendered several times.
     """
     small = [reduced(camera) for camera in cameras]
     solid = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    found = _measure(gaussians, solid, small)
-    for _ in range(_ROUNDS - 1):
-        found = _measure(gaussians, ~found.floaters, small)
+    for i in range(_ROUNDS):
+        found = _measure(gaussians, solid, _counted(small, i, report))
+        solid = ~found.floaters
     return found
 
 
-def _measure(gaussians: Gaussians, solid: Tensor, cameras: Sequence[Camera]) -> Coverage:
+def _counted(cameras: Sequence[Camera], finished: int, report: Report) -> Iterator[Camera]:
+    """The cameras of a round, after ``finished`` rounds."""
+    for i, camera in enumerate(cameras):
+        report(finished * len(cameras) + i, _ROUNDS * len(cameras), "views")
+        yield camera
+
+
+def _measure(gaussians: Gaussians, solid: Tensor, cameras: Iterable[Camera]) -> Coverage:
     """One round; the Gaussians ``solid`` (N,) form the surface."""
     surface = gaussians.select(solid)
     weight, largest, front, position = torch.zeros(4, len(gaussians), device=solid.device)
@@ -113,6 +129,7 @@ def clean(
     cameras: Sequence[Camera],
     quality: Callable[[Gaussians], float],
     enough: float = math.inf,
+    report: Report = _silent,
 ) -> Gaussians:
     """The Gaussians without those that explain nothing, and without floaters if that does no harm.
 
@@ -125,8 +142,10 @@ def clean(
         cameras: those of the photos with which the scene was trained.
         quality: the larger, the better; for example the PSNR of held-out photos.
         enough: see above.
+        report: as in `coverage`; then with the number of floaters that are kept or removed, of
+            all, and the word "floaters".
     """
-    found = coverage(gaussians, cameras)
+    found = coverage(gaussians, cameras, report)
     kept = ~found.useless
     floaters = (found.floaters & kept).nonzero()[:, 0]
     floaters = floaters[found.position[floaters].argsort(stable=True)]
@@ -137,6 +156,7 @@ def clean(
             del groups[0]
         if not groups:
             break
+        report(len(floaters) - sum(map(len, groups)), len(floaters), "floaters")
         group = groups.pop(0)
         kept[group] = False
         rest = quality(gaussians.select(kept))

@@ -1,11 +1,11 @@
 """LPIPS, a learned perceptual distance of images (Zhang, Isola, Efros, Shechtman, Wang, CVPR 2018).
 
 It needs the weights of a network that was trained on photos, and of its five linear heads. They are
-not part of this package; the user provides a file with both. Where the `lpips` package is
-installed, this code writes such a file:
+not part of this package. Where the package `lpips` is installed, ``Lpips.load("vgg")`` takes them
+from it; it downloads the network of torchvision when it is first used. For a computer without it,
+this command writes a file with both:
 
-    weights = {name: w.clone() for name, w in lpips.LPIPS(net="vgg").state_dict().items()}
-    safetensors.torch.save_file(weights, "lpips_vgg.safetensors")
+    python -m snowsplat.evaluation.lpips vgg lpips_vgg.safetensors
 
 Files of `torch.save` are not read: they are pickles, that is, programs. Even if torch restricts
 them to a few harmless functions, a pickle of a hundred bytes can allocate any amount of memory.
@@ -21,6 +21,8 @@ The shape of the first layer shows whether the backbone is AlexNet or VGG16.
 from __future__ import annotations
 
 import re
+import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +40,8 @@ _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 # Smallest width and height of an image in pixels. The backbones halve it several times.
 _MIN_SIDE = 32
+#: The backbones that the package `lpips` has.
+NAMES = ("vgg", "alex")
 _BACKBONE = re.compile(r"(?:.*\.)?(?:features|net\.slice\d)\.(\d{1,3})\.(weight|bias)")
 _HEAD = re.compile(r"lin(\d)\.model\.1\.weight")
 
@@ -93,11 +97,17 @@ class Lpips:
     def load(path: Path | str) -> Lpips:
         """Read a weights file; its format is described at the top of this module.
 
+        Args:
+            path: a file; or "vgg" or "alex", without a file of this name: the weights of the
+                package `lpips`.
+
         Raises:
             UserError: the file is missing or has another format, or a layer is missing or has
-                another shape.
+                another shape; `lpips` is not installed, or cannot download its network.
         """
-        state = _read_state(Path(path))
+        path = Path(path)
+        packaged = str(path) in NAMES and not path.exists()
+        state = _packaged_state(str(path)) if packaged else _read_state(path)
         backbone: dict[tuple[int, str], Tensor] = {}
         heads: dict[int, Tensor] = {}
         for name, value in state.items():
@@ -172,6 +182,24 @@ def _unit(features: Tensor) -> Tensor:
     return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-10)
 
 
+def _packaged_state(name: str) -> dict[str, Tensor]:
+    """The weights of the package `lpips`."""
+    try:
+        import lpips  # type: ignore[import-not-found,unused-ignore]
+    except ImportError:
+        raise UserError(
+            f"LPIPS ({name}) needs its weights: pip install lpips, or give a file of them; "
+            "see snowsplat evaluate --help"
+        ) from None
+    try:
+        with warnings.catch_warnings():  # it uses torchvision as that was years ago
+            warnings.simplefilter("ignore")
+            network = lpips.LPIPS(net=name, verbose=False)
+    except OSError as error:  # of urllib
+        raise UserError(f"lpips: cannot download its network ({error})") from None
+    return {key: value.clone() for key, value in network.state_dict().items()}
+
+
 def _read_state(path: Path) -> dict[str, Tensor]:
     try:
         check_header(path)
@@ -182,3 +210,19 @@ def _read_state(path: Path) -> dict[str, Tensor]:
         raise UserError(
             f"{path}: not a safetensors file; see snowsplat evaluate --help for how to make one"
         ) from None
+
+
+def _main(arguments: list[str]) -> str | None:
+    """Write the weights of a network to a file; returns what is wrong with the arguments."""
+    if len(arguments) != 2 or arguments[0] not in NAMES:
+        return "use: python -m snowsplat.evaluation.lpips vgg|alex FILE.safetensors"
+    try:
+        state = _packaged_state(arguments[0])
+    except UserError as error:
+        return str(error)
+    safetensors.torch.save_file(state, arguments[1])
+    return None
+
+
+if __name__ == "__main__":
+    sys.exit(_main(sys.argv[1:]))

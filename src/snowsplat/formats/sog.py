@@ -219,17 +219,29 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
         UserError: more Gaussians than an image can have pixels.
         OSError: the folder is missing or not writable, or the disk is full.
     """
-    path = Path(path)
+    content = sog_bytes(Path(path), gaussians)
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(content)
+
+
+def sog_bytes(path: Path, gaussians: GaussianArrays) -> bytes:
+    """The content of the file that `write_sog` writes; errors name ``path``.
+
+    Raises:
+        UserError: see `write_sog`.
+    """
     packable = packing.packable(path, gaussians)
     if len(packable.means) > (_SIDE_LIMIT - 3) ** 2:
         count = len(packable.means)
         raise UserError(f"{path}: {count} Gaussians are too many for SOG; write .ply or .spz")
     members = encode_sog(packable.select(packing.spatial_order(packable.means)))
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as bundle:
         # Not compressed again, because WebP is compressed. ZipInfo has a fixed date, so that equal
         # scenes result in equal files.
         for name, content in members.items():
             bundle.writestr(zipfile.ZipInfo(name), content)
+    return file.getvalue()
 
 
 def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:

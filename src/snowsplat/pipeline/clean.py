@@ -15,6 +15,7 @@ from snowsplat.data import Dataset
 from snowsplat.evaluation.floaters import clean as without_floaters
 from snowsplat.evaluation.metrics import compare, evaluate_views, size_text
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
 from snowsplat.pipeline.output.scene_paths import folder_around
 from snowsplat.pipeline.output.scene_source import Color, load_viewable
@@ -61,6 +62,7 @@ def clean(
     dataset: Path | str | None = None,
     overwrite: bool = False,
     compute: Compute | None = None,
+    observer: Observer = SILENT,
 ) -> Cleaned:
     """Remove Gaussians that hang in front of the surfaces, and those that no photo shows.
 
@@ -75,6 +77,7 @@ def clean(
         dataset: the photos of the scene; default: the photos of the training, if they still exist.
         overwrite: replace ``target``.
         compute: the device; default: a GPU if there is one.
+        observer: gets the stages "reading" and "cleaning".
 
     Raises:
         UserError: a missing or damaged scene or dataset; the cameras are unknown; ``target``
@@ -86,8 +89,9 @@ def clean(
         raise UserError(f"{target}: exists; use `overwrite` to replace it")
     format_for_writing(target)
     device = (compute or Compute()).apply()
-    source = load_viewable(scene)
-    photos = _photos(source.file, None if dataset is None else Path(dataset))
+    with observer.waiting("reading"):
+        source = load_viewable(scene)
+        photos = _photos(source.file, None if dataset is None else Path(dataset))
     gaussians, cameras = source.gaussians, source.cameras
     if photos is not None:
         gaussians = seen_from_dataset(gaussians, photos.origin)
@@ -98,10 +102,10 @@ def clean(
         )
     gaussians = gaussians.to(device)
     cameras = [camera.to(device) for camera in cameras]
-    with single_threaded():
+    with observer.waiting("cleaning") as report, single_threaded():
         judge = _judge(gaussians, cameras, photos, source.background)
         before = judge.psnr(gaussians)
-        cleaned = without_floaters(gaussians, cameras, judge.psnr, judge.enough(before))
+        cleaned = without_floaters(gaussians, cameras, judge.psnr, judge.enough(before), report)
         after = judge.psnr(cleaned)
     make_parent(target)
     write_gaussians(target, cleaned.to(torch.device("cpu")))

@@ -166,7 +166,8 @@ def convert(
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
     decimation = _decimation(edits, files, dataset, observer)
-    parts = [read_gaussians(file) for file in files]
+    with observer.waiting("reading"):
+        parts = [read_gaussians(file) for file in files]
     if len({part.antialiased for part in parts}) > 1:
         logger.warning(
             "%s: only some of the scenes are antialiased; all are marked as the first one", target
@@ -193,8 +194,9 @@ def convert(
 
     def write_placed(path: Path, gaussians: Gaussians) -> None:
         # The scene is moved last: cameras and photos show it in its place.
-        written[:] = [edits.placed(gaussians)]
-        write(path, *written)
+        with observer.waiting("writing"):
+            written[:] = [edits.placed(gaussians)]
+            write(path, *written)
 
     if size is not None:
         write_within(size, target, scene, write_placed, decimation)

@@ -67,7 +67,8 @@ class Decimation:
 
     def merged(self, scene: Gaussians, count: int) -> Gaussians:
         """``count`` Gaussians, see `simplify`; fewer if the scene has fewer."""
-        return simplify(seen_from_dataset(scene, self.origin), count, self.cameras)
+        with self.observer.waiting("merging"):
+            return simplify(seen_from_dataset(scene, self.origin), count, self.cameras)
 
     def fitted(self, smaller: Gaussians, scene: Gaussians) -> Gaussians:
         """Merged Gaussians that look more like ``scene``, of which they were made."""

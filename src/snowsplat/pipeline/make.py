@@ -29,6 +29,7 @@ from snowsplat.pipeline.output.output_folder import (
     DatasetSettings,
     OutputFolder,
 )
+from snowsplat.pipeline.output.scene_paths import RECORD
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
 from snowsplat.pipeline.render import render_images
@@ -55,7 +56,6 @@ from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
-RECORD = "make.json"
 # Every 8th photo is held out, from the fifth on. The first photo of a walk is at its end: it shows
 # places that no other photo shows, so it says little about the scene.
 HOLD_OUT, FIRST_HELD_OUT = 8, 4
@@ -92,6 +92,7 @@ class MakeOptions(Settings):
             Stages that an earlier run has finished are not counted. A resumed training run has the
             time that was left at its interruption.
         memory: memory limit of the training; see `TrainOptions`.
+        title: the name of the scene in reports and on pages; None: the name of its photos.
         exposure: whether to learn a gain for each photo and channel; see ``TrainConfig.exposure``.
         compute: device and threads.
 
@@ -102,6 +103,7 @@ class MakeOptions(Settings):
     quality: Quality | None = None
     minutes: float | None = option.minutes()
     memory: int | str | None = option.memory()
+    title: str | None = None
     exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
     compute: Compute = field(default_factory=Compute)
 
@@ -226,6 +228,9 @@ class _Job:
             self._check_inputs()
             self.given = self._given()
             self.plan = self._plan()
+            self.stages.about["title"] = (
+                self.options.title or self.stages.about.get("title") or self.name
+            )
             self.stages.save()  # from now on, the folder is recognised as an output of `make`
             if self.given is None:
                 self._make_dataset()

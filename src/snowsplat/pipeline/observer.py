@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol
 
 from snowsplat.sfm.progress import Report, silent
 
@@ -10,7 +12,16 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome
-    from snowsplat.viewer.live.viewer import NetworkViewer
+
+
+class Page(Protocol):
+    """A page in the browser: its address, and those for other computers if they differ."""
+
+    @property
+    def url(self) -> str: ...
+
+    @property
+    def others(self) -> list[str]: ...
 
 
 class Observer:
@@ -33,6 +44,17 @@ class Observer:
     def end(self, stage: str, outcome: Outcome) -> None:
         """The stage has finished, now or in an earlier run."""
 
+    def leave(self) -> None:
+        """The stage that began last is over; there is nothing to tell about it."""
+
+    @contextmanager
+    def waiting(self, stage: str) -> Iterator[Report]:
+        """A context of a stage that may take a while and has no outcome; its progress callback."""
+        try:
+            yield self.begin(stage)
+        finally:
+            self.leave()
+
     def steps_begin(self, step: int, iterations: int) -> None:
         """A training run begins after ``step`` of ``iterations`` steps."""
 
@@ -45,8 +67,56 @@ class Observer:
     def trained(self, result: TrainResult) -> None:
         """The training has finished; its files are written."""
 
-    def page_opened(self, viewer: NetworkViewer) -> None:
-        """A page shows the scene in the browser at ``viewer.url``."""
+    def page_opened(self, page: Page) -> None:
+        """A page shows the scene in the browser at ``page.url``."""
+
+
+class Observers(Observer):
+    """Passes everything on to several observers."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self.all = observers
+
+    def note(self, line: str) -> None:
+        for each in self.all:
+            each.note(line)
+
+    def begin(self, stage: str) -> Report:
+        reports = [each.begin(stage) for each in self.all]
+
+        def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
+            for each in reports:
+                each(done, total, what, left)
+
+        return report
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        for each in self.all:
+            each.end(stage, outcome)
+
+    def leave(self) -> None:
+        for each in self.all:
+            each.leave()
+
+    def steps_begin(self, step: int, iterations: int) -> None:
+        for each in self.all:
+            each.steps_begin(step, iterations)
+
+    def step(self, progress: Progress) -> None:
+        for each in self.all:
+            each.step(progress)
+
+    def steps_end(self) -> None:
+        for each in self.all:
+            each.steps_end()
+
+    def trained(self, result: TrainResult) -> None:
+        for each in self.all:
+            each.trained(result)
+
+    def page_opened(self, page: Page) -> None:
+        for each in self.all:
+            each.page_opened(page)
 
 
 #: An observer that does nothing.

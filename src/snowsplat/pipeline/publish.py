@@ -79,7 +79,8 @@ def publish(
         iteration: an iteration of an output folder; default: the last one.
         overwrite: whether to replace a web site in ``folder``.
         threads: number of CPU threads; None: all cores.
-        observer: gets the progress of levels of detail, the stage "levels", and notes.
+        observer: gets the stages "reading" and "writing", the progress of levels of detail, the
+            stage "levels", and notes.
 
     Raises:
         UserError: the scene is missing, damaged or has no Gaussians; ``folder`` contains other
@@ -90,7 +91,8 @@ def publish(
     if folder.exists():
         _check_free(folder, overwrite)
     Compute("cpu", threads).apply()
-    source = load_viewable(scene, iteration)
+    with observer.waiting("reading"):
+        source = load_viewable(scene, iteration)
     if not len(source.gaussians):
         raise UserError(f"{source.file}: contains no Gaussians; there is nothing to see")
 
@@ -101,10 +103,11 @@ def publish(
         observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
     what = source.gaussians, source.cameras, source.background, about, url
-    if len(source.gaussians) <= _LARGE:
-        write_site(folder, *what)
-    else:
-        write_site(folder, *what, partial(_write_levels, observer))
+    with observer.waiting("writing"):
+        if len(source.gaussians) <= _LARGE:
+            write_site(folder, *what)
+        else:
+            write_site(folder, *what, partial(_write_levels, observer))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
 

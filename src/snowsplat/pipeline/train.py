@@ -16,6 +16,7 @@ from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
@@ -57,6 +58,7 @@ class TrainOptions(Settings):
 
     Attributes:
         recipe: name of the recipe, which defines the defaults of all settings.
+        config: a complete configuration, in the place of a recipe.
         settings: names and values of changed settings, see
             `snowsplat.training.settings.names.changed`.
         images: name of the folder of photos in the dataset; default: "images".
@@ -85,6 +87,7 @@ class TrainOptions(Settings):
     """
 
     recipe: str | None = option.recipe()
+    config: TrainConfig | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     images: str | None = None
     resolution: int | None = option.resolution()
@@ -102,6 +105,16 @@ class TrainOptions(Settings):
         super().__post_init__()
         if self.minutes is not None and self.iterations is not None:
             raise UserError("`minutes` and `iterations` cannot be combined; set one of them")
+        if self.recipe is not None and self.config is not None:
+            raise UserError("`recipe` and `config` both contain all settings; leave one out")
+
+    def configuration(self) -> TrainConfig:
+        """The configuration with the changed settings.
+
+        Raises:
+            SettingError: a setting is unknown or invalid.
+        """
+        return changed(self.config or recipe(self.recipe or "default"), **self.settings)
 
     @property
     def iterations(self) -> int | None:
@@ -161,7 +174,7 @@ def train(
     """
     started = time.monotonic()
     options = options or TrainOptions()
-    recipe(options.recipe or "default", **options.settings)  # reports an invalid setting first
+    options.configuration()  # reports an invalid setting first
     out = OutputFolder(Path(output))
     with one_run(out.path):
         out.check_free(resume=False, overwrite=overwrite)
@@ -253,8 +266,8 @@ class _Job:
         options = self.options
         budget = TimeBudget.for_run(options.minutes, None, self.started)
         settings = options.dataset_settings(path)
-        name = options.recipe or "default"
-        config = recipe(name, **options.settings)
+        name = "custom" if options.config is not None else options.recipe or "default"
+        config = options.configuration()
         files = settings.read_files()
         dataset = files.dataset(settings.resolution)
         self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
@@ -268,8 +281,10 @@ class _Job:
                 config,
                 self.device,
                 resize=options.resolution is None,
-                more_gaussians=options.settings.get("max_gaussians") is None,
-                more_often=all(
+                more_gaussians=options.config is None
+                and options.settings.get("max_gaussians") is None,
+                more_often=options.config is None
+                and all(
                     options.settings.get(setting) is None
                     for setting in ("densify_interval", "densify_from")
                 ),
@@ -382,7 +397,7 @@ class _Job:
             photos=self.photos,
         )
         if self.page is not None:
-            self.page.open_training(trainer, self.out.path.name, self.observer)
+            self.page.open_training(trainer, scene_name(self.out.path), self.observer)
         return run.run()
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:
@@ -436,7 +451,7 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
         raise UserError(
             f"{start.path}: was made with the recipe {meta.recipe}; resume without `recipe`"
         )
-    resumed = changed(config, **options.settings)
+    resumed = changed(options.config or config, **options.settings)
     same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
     if same != config:
         raise _other_settings(start)

@@ -12,6 +12,7 @@ from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
@@ -48,7 +49,7 @@ def viewed_scene(
         UserError: the scene is missing or damaged, or has no Gaussians.
     """
     path = Path(path)
-    title = path.resolve().name
+    title = scene_name(path)
     published, index = is_site(path), _levels_in(path)
     if iteration is not None and (published or index is not None):
         raise UserError("`iteration` selects a scene of an output folder; leave it out")
@@ -63,12 +64,15 @@ def viewed_scene(
         page = site(about, coarse, [], (0.0, 0.0, 0.0), lambda _: index, counts[0])
         yield ViewedScene(index, counts[0], *page)
         return
-    scene = load_viewable(path, iteration)
+    with observer.waiting("reading"):
+        scene = load_viewable(path, iteration)
     _check(scene.file, scene.gaussians)
     about = Description(title, made=made_on(scene.file))
     what = about, scene.gaussians, scene.cameras, scene.background
     if len(scene.gaussians) <= _LARGE:
-        yield ViewedScene(scene.file, len(scene.gaussians), *site(*what))
+        with observer.waiting("preparing"):
+            page = site(*what)
+        yield ViewedScene(scene.file, len(scene.gaussians), *page)
         return
     with TemporaryDirectory(prefix="snowsplat-levels-") as folder:
 
@@ -78,7 +82,9 @@ def viewed_scene(
             observer.note(f"to keep them: snowsplat convert {path} FOLDER/{INDEX}")
             return target
 
-        yield ViewedScene(scene.file, len(scene.gaussians), *site(*what, levels))
+        with observer.waiting("preparing"):
+            page = site(*what, levels)
+        yield ViewedScene(scene.file, len(scene.gaussians), *page)
 
 
 def _levels_in(path: Path) -> Path | None:

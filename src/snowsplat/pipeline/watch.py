@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import socket
+import sys
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +16,16 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
-from snowsplat.pipeline.output.scene_paths import existing_folder
+from snowsplat.pipeline.output.scene_paths import existing_folder, scene_name
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.run.live_page import LivePage
+from snowsplat.pipeline.run.watchers import PageReply, PageRequest, socket_in
 from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import from_json, parse_json
 from snowsplat.viewer.live.viewer import Scene
 
 _NOTHING = [
@@ -38,23 +44,67 @@ def watch(
     compute: Compute | None = None,
     observer: Observer = SILENT,
 ) -> None:
-    """Show the newest scene or checkpoint of a training run until Ctrl-C, with cameras and photos.
+    """Show a training run until Ctrl-C, with cameras and photos.
+
+    A training run on this computer that still runs opens ``page`` itself, with its controls; at
+    its end, and otherwise, the newest scene or checkpoint in the folder is shown.
 
     Args:
         output: the folder of `train` or `make`.
         iteration: show only the scene of this iteration; default: the newest.
-        dataset, resolution, compute: as in `load_trained`.
+        dataset, resolution, compute: as in `load_trained`. With one of these, or with
+            ``iteration``, only the folder is shown.
 
     Raises:
         UserError: scene, settings or dataset are missing or damaged; an unusable device.
     """
     folder = watched_folder(Path(output))
+    of_folder = any(each is not None for each in (iteration, dataset, resolution))
+    if not of_folder and compute in (None, Compute()):
+        try:
+            if _attached(folder.path, page, observer):
+                observer.note("the training has ended; its result follows")
+        except KeyboardInterrupt:
+            return
     data, background = load_dataset_of(folder, dataset, resolution)
     newest = NewestScene(folder, iteration, (compute or Compute()).apply(), data.origin)
     newest()  # a scene that cannot be shown is reported before the page opens
     with suppress(KeyboardInterrupt):  # Ctrl-C is the normal end as soon as the page is open
-        page.open(data, background, folder.path.absolute().name, observer)
+        page.open(data, background, scene_name(folder.path), observer)
         page.show(newest)
+
+
+def _attached(output: Path, page: LivePage, observer: Observer) -> bool:
+    """Let the training that runs in a folder open the page, and wait until it ends.
+
+    Returns False at once if no training runs here that this process can reach.
+
+    Raises:
+        UserError: the training cannot open the page.
+        KeyboardInterrupt: Ctrl-C; the training closes the page, and continues.
+    """
+    if sys.platform == "win32":
+        return False
+    request = PageRequest(page.port, page.host, tuple(page.allow_host))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        try:
+            with socket_in(output) as path:
+                connection.connect(path)
+            connection.sendall(json.dumps(asdict(request)).encode() + b"\n")
+        except OSError:  # it has ended, or runs on another computer
+            return False
+        with connection.makefile("rb") as replies:
+            observer.note("the training opens its page after the present step")
+            line = replies.readline()
+            if not line:
+                return True
+            reply = from_json(PageReply, parse_json(line))
+            if reply.error:
+                raise UserError(reply.error)
+            observer.note("closing the page does not end the training")
+            observer.page_opened(reply)
+            replies.readline()
+    return True
 
 
 def watched_folder(path: Path) -> OutputFolder:

@@ -102,7 +102,7 @@ def make_dataset(
     Args:
         inputs: what to make the dataset from, or what `find_sources` has found there.
         overwrite: replace a dataset in ``folder`` that was made from other inputs.
-        later: the rest of the job, which the time left includes.
+        later: the rest of the job, which the time left includes; None: the dataset is all of it.
 
     Returns:
         The outcome of each stage. Its result is a JSON value: a `Gathered` for "photos", an
@@ -132,7 +132,8 @@ def make_dataset(
             stages.about = {"inputs": paths, "in_place": in_place}
             stages.save()  # from here on the folder is recognised as a dataset
             left = _time_left(sources, options, later or Later())
-            return _run(stages, sources, folder, options, watcher, in_place, left)
+            alone = later is None
+            return _run(stages, sources, folder, options, watcher, in_place, left, alone)
 
 
 def _time_left(sources: Sources, options: DatasetOptions, later: Later) -> SfmTimeLeft:
@@ -150,6 +151,7 @@ def _run(
     watcher: Watcher,
     in_place: bool,
     left: SfmTimeLeft,
+    alone: bool,
 ) -> dict[str, Outcome]:
     outcomes: dict[str, Outcome] = {}
 
@@ -224,6 +226,7 @@ def _run(
             "seconds": {name: outcome.seconds for name, outcome in outcomes.items()},
             "problems": bad,
             "verdict": verdict.as_json(),
+            "alone": alone,
         }
         return {"file": write_report(folder, facts).name, "verdict": facts["verdict"]}
 

@@ -27,8 +27,8 @@ from snowsplat.util.html import bar, cards, page, picture, table, text
 from snowsplat.util.safe_json import printable
 
 REPORT = "dataset_report.html"
-_MAX_THUMBNAILS = 24  # evenly spaced over the photos
-_THUMBNAIL_HEIGHT = 110  # pixels
+_MAX_PICTURES = 24  # evenly spaced over the photos
+_PICTURE_HEIGHT = 480  # pixels, of the pictures that can be opened
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
 
 # By `focal_from` and `focal_held` of a camera; earlier versions did not have the latter.
@@ -55,7 +55,8 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     Args:
         facts: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
             an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage;
-            "problems", what is wrong with single photos, by name; "verdict", a `Verdict`.
+            "problems", what is wrong with single photos, by name; "verdict", a `Verdict`; "alone",
+            whether the user has to start the training.
 
     Raises:
         UserError: the model in ``sparse/0`` or an image cannot be read.
@@ -78,7 +79,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _lenses(facts["sfm"], facts["undistorted"]),
         _left_out(facts),
         _timing(facts),
-        _next_step(dataset),
+        _next_step(dataset) if facts["alone"] else "",
     ]
     path = dataset / REPORT
     write_text(path, page(f"{name} – dataset", body, _STYLE + verdict.STYLE))
@@ -165,11 +166,11 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
 
 def _bad_photos(dataset: Path, bad: dict[str, str]) -> str:
     rows = [
-        [picture(_thumbnail(_file_of(dataset, name)), name), text(name), text(problem)]
-        for name, problem in list(bad.items())[:_MAX_THUMBNAILS]
+        [picture(_reduced(_file_of(dataset, name)), name), text(name), text(problem)]
+        for name, problem in list(bad.items())[:_MAX_PICTURES]
     ]
-    rest = "" if len(bad) <= _MAX_THUMBNAILS else f", and {len(bad) - _MAX_THUMBNAILS:,} more"
-    names = ", ".join(list(bad)[_MAX_THUMBNAILS:_MAX_UNUSED])
+    rest = "" if len(bad) <= _MAX_PICTURES else f", and {len(bad) - _MAX_PICTURES:,} more"
+    names = ", ".join(list(bad)[_MAX_PICTURES:_MAX_UNUSED])
     others = f'<p class="soft">{text(names)}{rest}.</p>' if rest else ""
     return table(["", "photo", "what is wrong"], rows, "names") + others
 
@@ -233,10 +234,10 @@ def _placed(placement: Placement | None) -> str:
 
 
 def _strip(dataset: Path, names: Sequence[str]) -> str:
-    count = min(len(names), _MAX_THUMBNAILS)
+    count = min(len(names), _MAX_PICTURES)
     chosen = [names[i * len(names) // count] for i in range(count)]
     images = "".join(
-        picture(_thumbnail(dataset / "images" / name), name)
+        picture(_reduced(dataset / "images" / name), name)
         for name in chosen
         if (dataset / "images" / name).is_file()
     )
@@ -249,12 +250,12 @@ def _file_of(dataset: Path, photo: str) -> Path:
     return path if path.is_file() else dataset / "input" / photo
 
 
-def _thumbnail(path: Path) -> Image.Image:
+def _reduced(path: Path) -> Image.Image:
     with Image.open(path) as image:
-        image.draft("RGB", (4 * _THUMBNAIL_HEIGHT, 2 * _THUMBNAIL_HEIGHT))  # faster JPEG decoding
-        width = max(1, round(image.width * _THUMBNAIL_HEIGHT / image.height))
-        small = plain_pixels(image, path)
-        small = small.resize((width, _THUMBNAIL_HEIGHT), Image.Resampling.LANCZOS)
+        image.draft("RGB", (2 * _PICTURE_HEIGHT, _PICTURE_HEIGHT))  # faster JPEG decoding
+        scale = min(1.0, _PICTURE_HEIGHT / image.height)
+        size = max(1, round(image.width * scale)), round(image.height * scale)
+        small = plain_pixels(image, path).resize(size, Image.Resampling.LANCZOS)
     if small.mode == "RGBA":
         ground = Image.new("RGBA", small.size, (128, 128, 128, 255))
         small = Image.alpha_composite(ground, small).convert("RGB")

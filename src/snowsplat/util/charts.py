@@ -20,10 +20,13 @@ _TICKS_Y = 5
 
 #: CSS for pages with charts.
 STYLE = """
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(340px, 100%), 1fr));
+  gap: 22px 28px; } .charts figure { max-width: 620px; }
 svg.chart { width: 100%; height: auto; display: block; }
 .chart text { fill: var(--soft); font-size: 12px; font-variant-numeric: tabular-nums; }
 .chart .grid { stroke: var(--line); } .chart .dot { fill: var(--accent); }
 .chart .curve { fill: none; stroke: var(--accent); stroke-width: 2; stroke-linejoin: round; }
+@media (max-width: 600px) { .chart text { font-size: 15px; } }
 .chart .raw { fill: none; stroke: var(--accent); stroke-width: 1; opacity: .3; }
 """
 

@@ -40,8 +40,49 @@ th { color: var(--soft); font-weight: 500; } .facts th { width: 16em; }
 code, pre { font-family: ui-monospace, Menlo, Consolas, monospace; font-size: .9em; }
 pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px;
   padding: 10px 14px; overflow-x: auto; margin: 8px 0; }
-.bar { display: inline-block; height: .7em; border-radius: 2px; background: var(--accent); }
+.bar { display: inline-block; width: calc(var(--share) * min(35vw, 400px)); height: .7em;
+  border-radius: 2px; background: var(--accent); }
 summary { cursor: pointer; color: var(--soft); } ol { margin: 6px 0; padding-left: 1.4em; }
+.wide { overflow-x: auto; } [role="button"] { cursor: zoom-in; }
+dialog { max-width: none; max-height: none; border: 0; padding: 0; background: none; color: #fff;
+  text-align: center; cursor: zoom-out; } dialog::backdrop { background: #000d; }
+dialog img { display: block; width: 96vw; height: calc(96vh - 3em); object-fit: contain; }
+@media (max-width: 600px) { main { padding: 20px 14px 48px; } .card { flex-basis: 130px; }
+  .card b { font-size: 1.35rem; } th, td { padding-right: 8px; } .facts th { width: 40%; }
+  .bar { width: calc(var(--share) * 9vw); } }
+"""
+
+# Each picture is a button that opens it as large as it is stored; Escape or a click closes it, and
+# the arrow keys show the next one. Without scripts, the pictures remain small. The script is part
+# of a well-formed document, so it contains neither "<" nor "&".
+_LARGE = """<script>
+const pictures = [...document.querySelectorAll('main img')];
+const dialog = document.body.appendChild(document.createElement('dialog'));
+const large = dialog.appendChild(new Image());
+const name = dialog.appendChild(document.createElement('p'));
+let shown = 0;
+const show = (number) => {
+  shown = (number + pictures.length) % pictures.length;
+  large.src = pictures[shown].src;
+  name.textContent = large.alt = pictures[shown].alt;
+  if (!dialog.open) dialog.showModal();
+};
+pictures.forEach((picture, number) => {
+  picture.tabIndex = 0;
+  picture.setAttribute('role', 'button');
+  picture.onclick = () => show(number);
+  picture.onkeydown = (event) => {
+    if (!['Enter', ' '].includes(event.key)) return;
+    event.preventDefault();
+    show(number);
+  };
+});
+dialog.onclick = () => dialog.close();
+dialog.onkeydown = (event) => {
+  const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+  if (by) show(shown + by);
+};
+</script>
 """
 
 
@@ -53,11 +94,13 @@ def page(title: str, html: Iterable[str], style: str = "") -> str:
         html: the parts of the page, from top to bottom; empty parts are skipped.
         style: additional CSS.
     """
+    body = "\n".join(filter(None, html))
+    script = _LARGE if "<img " in body else ""
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
         f"<title>{text(title)}</title><style>{_STYLE}{style}</style></head>\n"
-        "<body><main>\n" + "\n".join(filter(None, html)) + "\n</main></body></html>\n"
+        f"<body><main>\n{body}\n</main>{script}</body></html>\n"
     )
 
 
@@ -80,7 +123,8 @@ def table(heads: Sequence[str], html: Iterable[Sequence[str]], kind: str = "plai
         return f"<table class='facts'><tbody>{''.join(lines)}</tbody></table>"
     top = "".join(f"<th>{head}</th>" for head in heads)
     body = "".join(f"<tr>{_cells(row)}</tr>" for row in html)
-    return f"<table class='{kind}'><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+    rows = f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody>"
+    return f"<div class='wide'><table class='{kind}'>{rows}</table></div>"
 
 
 def _cells(html: Sequence[str]) -> str:
@@ -90,12 +134,14 @@ def _cells(html: Sequence[str]) -> str:
 def bar(share: float) -> str:
     """A horizontal bar for a table cell; ``share`` is its length relative to the longest bar."""
     share = max(0.01, min(1.0, share))
-    width = f"width:{35 * share:.1f}vw;max-width:{400 * share:.0f}px"
-    return f'<span class="bar" style="{width}"></span>'
+    return f'<span class="bar" style="--share:{share:.3f}"></span>'
 
 
 def picture(image: Image.Image, alt: str, quality: int = 75) -> str:
-    """An RGB image as an <img> element with embedded JPEG data."""
+    """An RGB image as an <img> element with embedded JPEG data, which opens large in a `page`.
+
+    The style sheet of the page says how large it is at first.
+    """
     data = io.BytesIO()
     image.save(data, "JPEG", quality=quality)
     source = base64.b64encode(data.getvalue()).decode("ascii")

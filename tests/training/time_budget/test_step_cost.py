@@ -18,11 +18,43 @@ def test_a_densification_adds_a_quarter_until_the_limit():
     assert limited.parts_ahead(Schedule(2000), 0, 10_000)[-1] == (1, 15_000)
 
 
-def test_an_outlier_counts_as_five_steps():
+def test_a_geometric_growth_reaches_the_limit_early():
+    work = Work(recipe("default", iterations=2000, max_gaussians=20_000), 500_000.0, 6)
+    counts = [count for _, count in work.parts_ahead(Schedule(2000), 50, 10_000, 1.5)]
+    # The first densification is at step 100, the second at 200; parts are 49 steps long.
+    assert counts[:5] == [10_000, 15_000, 15_000, 20_000, 20_000]
+    assert counts[-1] == 20_000
+
+
+def observed(*factors):
+    """The cost after steps that took these multiples of the modelled time, and its parts ahead."""
     work = Work(recipe("default"), 500_000.0, 6)
-    predictions = []
-    for factor in (5.0, 1000.0):
-        cost = StepCost(work, 1.0, 3.0)
-        cost.observe(factor * work.seconds(1, 50_000), 1, 50_000)
-        predictions.append(cost.predict(1, 50_000))
-    assert predictions[0] == predictions[1] > work.seconds(1, 50_000)
+    cost, usual = StepCost(work, 1.0, 3.0), work.seconds(1, 50_000)
+    for factor in factors:
+        cost.observe(factor * usual, 1, 50_000)
+    return cost.predict(1, 50_000) / usual, cost.mean([(1, 50_000.0)]) / usual
+
+
+def test_a_long_step_is_rare_and_does_not_change_the_others():
+    assert observed(1, 8, 1, 1) == observed(1, 8000, 1, 1) == pytest.approx((1.0, 1.0))
+
+
+def test_what_repeats_itself_is_expected_again():
+    """Steps with a densification take longer; a sleep of the computer is not expected again."""
+    usual, mean = observed(*[1, 1, 1, 8, 1] * 4)
+    assert usual == pytest.approx(1.0)
+    assert mean == pytest.approx(1.0 + 7 / 5)
+    assert observed(*[1, 1, 1, 8, 1] * 4, 9000)[1] == pytest.approx(2.4, abs=0.3)
+
+
+def test_a_machine_that_has_become_slow_is_noticed():
+    assert observed(*[4] * 1000)[0] == pytest.approx(4.0, rel=0.01)
+    assert observed(1, 4000, 4000)[0] == observed(1, 5, 5)[0] > 1.0
+
+
+def test_without_a_ratio_that_of_the_second_step_is_taken():
+    work = Work(recipe("default"), 500_000.0, 6)
+    cost, usual = StepCost(work, None, 3.0), work.seconds(1, 50_000)
+    for factor in (50, 2):  # the first step waits for its photo
+        cost.observe(factor * usual, 1, 50_000)
+    assert cost.predict(2, 80_000) == pytest.approx(2 * work.seconds(2, 80_000))

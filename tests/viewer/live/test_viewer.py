@@ -1,10 +1,13 @@
 """The page's server with a client that sends poses as a browser does."""
 
+import gzip
 import threading
 import time
+import urllib.request
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +17,10 @@ from snowsplat.data import load_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.near_plane import NEAR
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.key_cameras import KeyCameras
 from snowsplat.viewer.live.session import MOVE_SECONDS
+from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 from ...training.test_unit import scaled
@@ -153,3 +158,48 @@ def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
         np.testing.assert_array_equal(start, starts[0])
         assert images[0].std() > 5
         assert np.abs(image - images[0]).max() <= 1
+
+
+def test_the_page_of_a_finished_training_says_so(tmp_path):
+    """The result stays, without the controls of the training, and further images are served."""
+    dataset = load_dataset(write_toy_dataset(tmp_path, "colmap-bin", 3, 48, 36, n_points=50))
+    gaussians = Gaussians.from_points(dataset.points)
+    viewer = NetworkViewer(dataset, label="a <scene>")
+    ended = threading.Event()
+
+    def show() -> None:
+        serve = viewer.serve
+
+        def until_ended(*args: Any, **options: Any) -> bool:
+            if ended.is_set():
+                raise KeyboardInterrupt
+            return serve(*args, **options)
+
+        viewer.serve = until_ended
+        with suppress(KeyboardInterrupt):
+            training.show(9, gaussians)
+
+    thread = threading.Thread(target=show)
+    try:
+        training = TrainingViewer(viewer, SampledPsnr([], viewer.background))
+        training.after_step(8, 9, 0.5, gaussians)
+        viewer.session.pause()
+        training.end(["Finished: 9 steps", "PSNR <20 dB"])
+        panel = training._panel
+        wait(lambda: not panel._pause.visible)  # the last control is hidden after the others
+        assert "Finished: 9 steps<br>PSNR &lt;20 dB" in panel._status.content
+        assert panel._bar.value == 100.0
+        assert not viewer.session.paused
+        thread.start()
+        with Visitor(viewer.url) as visitor:
+            visitor.send_camera()
+            assert visitor.pictures(20.0, most=1) == 1
+        with urllib.request.urlopen(viewer.url, timeout=10) as page:
+            assert b"<title>a &lt;scene&gt; - snowsplat</title>" in page.read()
+        request = urllib.request.Request(viewer.url, headers={"Accept-Encoding": "gzip"})
+        with urllib.request.urlopen(request, timeout=10) as page:
+            assert b"<title>a &lt;scene&gt;" in gzip.decompress(page.read())
+    finally:
+        ended.set()
+        thread.join(timeout=20.0)
+        viewer.close()

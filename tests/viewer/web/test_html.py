@@ -41,15 +41,17 @@ def test_the_scene_is_embedded(tmp_path):
     page = path.read_text(encoding="utf-8")
     assert "<title>a &lt;b&gt;</title>" in page
     (scene,) = re.findall(r'<script type="text/plain" id="scene">(.*?)</script>', page)
-    (tmp_path / "scene.ply").write_bytes(base64.b64decode(scene))
-    back = read_gaussians(tmp_path / "scene.ply")
+    (tmp_path / "scene.sog").write_bytes(base64.b64decode(scene))
+    write_gaussians(tmp_path / "site.sog", three_balls())
+    assert (tmp_path / "scene.sog").read_bytes() == (tmp_path / "site.sog").read_bytes()
+    back = read_gaussians(tmp_path / "scene.sog")
     assert sorted(back.means.round(decimals=2).tolist()) == sorted(three_balls().means.tolist())
     (bootstrap,) = re.findall(r'id="sse-bootstrap">(.*?)</script>', page)
-    assert json.loads(bootstrap)["contentFilename"] == "scene.compressed.ply"
+    assert json.loads(bootstrap)["contentFilename"] == "scene.sog"
     assert "./index.js" not in page
     assert "./index.css" not in page
     assert "createViewer({ container" in page
-    assert sorted(p.name for p in tmp_path.iterdir()) == [path.name, "scene.ply"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [path.name, "scene.sog", "site.sog"]
 
 
 def test_html_files_cannot_be_read(tmp_path):

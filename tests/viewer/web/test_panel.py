@@ -4,14 +4,20 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
 import pytest
+import torch
 
+from snowsplat.data import Points
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, view_numbers
 from snowsplat.viewer.web.scene import ReadyScene, ready
+from snowsplat.viewer.web.stops import stops_of
 
 from ...browser import Browser, Page
 
@@ -22,7 +28,9 @@ MODE = "window.sse.viewer.state.cameraMode"
 
 @pytest.fixture(scope="module")
 def scene(trained) -> ReadyScene:
-    return ready(trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
+    """What is beside each photo is in others, as far as the windows of these tests show it."""
+    scene = ready(trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
+    return scene._replace(stops=scene.stops._replace(seen=[(3.0, 3.0)] * len(scene.stops.views)))
 
 
 @pytest.fixture(scope="module")
@@ -91,10 +99,7 @@ def test_the_panel(file, scene):
         assert page.evaluate(loaded) == 12 * round(128 * 96 / 72)
         page.evaluate(f"{strip}.children[3].click()")
         wait_for_pose(page, pose_of(stops[3]))
-        clear = "document.querySelector('.snow-matte').classList.contains('snow-clear')"
-        assert not page.evaluate(clear)
         page.drag(100, 280, 180, 290)
-        assert page.evaluate(clear)
         assert page.evaluate(MODE) == "orbit"
         # Frame: the camera looks at the subject, which fits into the window.
         press(page, "f")
@@ -147,6 +152,52 @@ def test_windows_of_any_shape_show_the_complete_photo(file, scene):
             fov = math.degrees(2 * math.atan(max(width, height) / 2 / camera.fx))
             page.wait_for(f"Math.abs({component}.fov - {fov}) < 0.01", 30)
             assert page.evaluate(f"{component}.horizontalFov") == (width > height)
+
+
+@pytest.mark.browser
+def test_a_window_shows_no_more_than_the_photos_do(scene, tmp_path):
+    """Also after a phone is turned. It begins with a photo that then shows a large subject best."""
+    seen = [(1.0, 1.5), (1.0, 1.0), (1.25, 1.0), (3.0, 1.0), *[(1.0, 1.0)] * 8]
+    path, aspect, views = tmp_path / "limited.html", scene.start.aspect, scene.stops.views
+    stops = scene.stops._replace(seen=seen, radius=3.0 * scene.stops.radius)
+    write_html(path, scene._replace(stops=stops))
+    shown = f"(c => [c.aspectRatio, Math.tan(c.fov * Math.PI / 360)])({ENTITY}.camera)"
+
+    def half_height(view) -> float:
+        longer = math.tan(math.radians(view_numbers(view, aspect)[6] / 2))
+        return longer / max(aspect, 1.0)
+
+    with opened(path, 600, 300) as page:  # 1.5 times as wide as the photos
+        wait_for_pose(page, pose_of(view_numbers(views[3], aspect)))
+        for i, times in ((2, 1.25 / 1.5), (3, 1.0)):
+            page.evaluate(f"document.querySelector('.snow-stops').children[{i}].click()")
+            wait_for_pose(page, pose_of(view_numbers(views[i], aspect)))
+            expected = times * half_height(views[i])
+            page.wait_for(f"Math.abs({shown}[1] / {shown}[0] - {expected}) < 0.01", 30)
+        size = {"width": 300, "height": 600}
+        page.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
+        page.wait_for(f"{shown}[0] < 0.6", 30)
+        page.wait_for(f"Math.abs({shown}[1] - {half_height(views[3])}) < 0.01", 30)
+
+
+def test_what_photos_show_beside_a_photo():
+    """A wall at z = 4, which photos from x = −1, 0 and 1 show; its parts are counted by angles."""
+    wall = torch.cartesian_prod(torch.linspace(-9, 9, 91), torch.linspace(-9, 9, 91))
+    means = torch.cat([wall, torch.full((len(wall), 1), 4.0)], 1)
+    gaussians = replace(
+        Gaussians.from_points(Points(means, torch.zeros(len(means), 3, dtype=torch.uint8))),
+        opacity_logits=torch.full((len(means),), 5.0),
+    )
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    cameras = []
+    for x in (0.0, -1.0, 1.0):
+        there = pose.clone()
+        there[0, 3] = -x
+        cameras.append(Camera(80, 60, 80.0, 80.0, 40.0, 30.0, there))
+    first = stops_of(gaussians, cameras, 4.0, (0.0, 0.0, 0.0)).seen[0]
+    # The photo is 4 wide and 3 high there; the photos beside it show 1 more on each side.
+    assert first[0] == pytest.approx(1.0 + 2.0 / 4.0 / 0.85, abs=0.1)
+    assert first[1] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.browser

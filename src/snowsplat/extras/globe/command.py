@@ -10,12 +10,13 @@ import tyro
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
 
 @dataclass
-class Globe:
+class Globe(Reports):
     """Put a scene into a snow globe: a web page, and a video.
 
     Examples:
@@ -51,6 +52,8 @@ class Globe:
     """If OUT contains several scenes, the step after which the scene was saved."""
     threads: Annotated[int | None, flag("N", default="all cores")] = None
     """Number of CPU threads."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -72,6 +75,7 @@ class Globe:
                 observer=observer,
             )
         size = format_bytes(result.page.stat().st_size)
+        self.report = result
         print(f"{result.page}: {result.gaussians:,} Gaussians, {size}")
         print(f"to see it: open {result.page} in a browser; to share it: send this file")
         return 0

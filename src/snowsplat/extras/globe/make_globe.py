@@ -116,9 +116,10 @@ def make_globe(
     if video is not None and Path(video).suffix.lower() != ".mp4":
         raise UserError(f"{video}: the name of a video must end in .mp4")
     Compute("cpu", threads).apply()
-    source = load_viewable(scene, iteration)
-
-    arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
+    with observer.waiting("reading"):
+        source = load_viewable(scene, iteration)
+    with observer.waiting("arranging"):
+        arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
     name = options.name or scene_name(scene)[:_LONGEST_NAME]
     write_page(target, arrangement, name)
     if video is not None:

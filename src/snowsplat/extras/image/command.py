@@ -10,6 +10,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -18,7 +19,7 @@ _COMPACT = ".gimg"
 
 
 @dataclass
-class Image:
+class Image(Reports):
     """Approximate a photo by 2D Gaussians, or render such an approximation.
 
     Examples:
@@ -56,6 +57,8 @@ class Image:
     """Replace an earlier fit in OUT."""
     quiet: Annotated[bool, switch("-q")] = False
     """Print only the result and no progress."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -82,6 +85,15 @@ class Image:
                 observer=observer,
             )
         end = result.moments[-1]
+        self.report = {
+            "output": result.output,
+            "gaussians": end.gaussians,
+            "psnr": end.psnr,
+            "ssim": end.ssim,
+            "steps": end.step,
+            **{name: getattr(result, name) for name in ("file_psnr", "file_bytes")},
+            "bits_per_pixel": result.bits_per_pixel,
+        }
         print(
             f"{result.output}: {end.gaussians:,} Gaussians, PSNR {end.psnr:.2f} dB, "
             f"SSIM {end.ssim:.4f}, {end.step:,} steps in {duration(end.seconds)}"

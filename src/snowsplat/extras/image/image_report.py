@@ -30,8 +30,6 @@ _STYLE = (
   grid-template-columns: repeat(auto-fit, minmax(min(250px, 100%), 1fr)); }
 .pictures img, .pictures video { display: block; width: 100%; height: auto; border-radius: 4px; }
 .pictures .photo img { image-rendering: pixelated; }
-.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
-  gap: 22px 28px; }
 td { font-variant-numeric: tabular-nums; }
 """
 )

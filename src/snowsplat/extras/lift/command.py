@@ -11,6 +11,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
+from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Lift:
+class Lift(Reports):
     """Make a scene from one photo and its depth map.
 
     Examples:
@@ -78,6 +79,8 @@ class Lift:
     """Replace an earlier scene in OUT."""
     quiet: Annotated[bool, switch("-q")] = False
     """Print only the result and no progress."""
+    json: JsonFlag = False
+    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""
@@ -98,6 +101,7 @@ class Lift:
             result = self._lift(self.photo, self.output, source)
         else:
             result = self._refine(self.photo, self.output, source, self.refine)
+        self.report = result
         if result.alignment is not None:
             fit = result.alignment
             print(

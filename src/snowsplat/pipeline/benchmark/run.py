@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from snowsplat.data.transforms_json import find_transforms
+from snowsplat.evaluation.lpips import NAMES, Lpips
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
@@ -32,7 +33,8 @@ class BenchmarkOptions(Settings):
         recipe: the recipe of the training.
         settings: changed settings, see `TrainOptions`.
         resolution: replaces that of the suite; see `TrainOptions`.
-        lpips: a file of weights, see `snowsplat.evaluation.lpips`; None: LPIPS is not measured.
+        lpips: a file of weights, or "vgg" or "alex", see `snowsplat.evaluation.lpips`; None: LPIPS
+            is not measured.
         jobs: number of scenes that are trained at the same time. They share the CPU threads; with
             GPUs, job i uses GPU i.
         device: "cpu" or "cuda"; None: GPUs if there are any.
@@ -88,8 +90,11 @@ def benchmark(
     name = options.suite or suite_of(path.name for path in datasets)
     jobs = [_job(path, output / path.name, name, options) for path in datasets]
     finished = {job.scene for job in jobs if SceneResult.read(job) is not None}
-    if options.lpips is not None and not options.lpips.is_file():
-        raise SettingError("lpips", f"{options.lpips}: no such file")
+    if options.lpips is not None:
+        try:  # what is wrong is reported before hours of training
+            Lpips.load(options.lpips)
+        except UserError as error:
+            raise SettingError("lpips", str(error)) from None
     output.mkdir(parents=True, exist_ok=True)
     on_line(f"{SUITES[name].title}: {len(jobs)} scenes, {len(finished)} finished")
     waiting = [job for job in jobs if job.scene not in finished]
@@ -134,7 +139,7 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
         {**suite.settings, **options.settings},
         options.resolution or suite.resolutions.get(dataset.name),
         suite.hold_out,
-        None if options.lpips is None else str(options.lpips.absolute()),
+        None if options.lpips is None else _lpips(options.lpips),
     )
 
 
@@ -189,3 +194,9 @@ def _devices(options: BenchmarkOptions) -> list[str | None]:
     if count == 0:
         return [options.device] * options.jobs
     return [f"cuda:{number % count}" for number in range(options.jobs)]
+
+
+def _lpips(weights: Path) -> str:
+    """The name of a network, or the absolute path of a file."""
+    packaged = str(weights) in NAMES and not weights.exists()
+    return str(weights if packaged else weights.absolute())

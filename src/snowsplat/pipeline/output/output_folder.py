@@ -71,8 +71,12 @@ _NAMESPACE_LIMIT = 1 << 20  # characters
 # have three words, NAME = VALUE; one more word is stored to detect longer arguments.
 _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
-_RESULTS = ("point_cloud", "checkpoints", "refined", "train", "test", "videos", "films", "masks")
-_REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html")
+_TENSORBOARD = "tensorboard"
+_RESULTS = (
+    *("point_cloud", "checkpoints", "refined", "train", "test", "videos", "films", "masks"),
+    _TENSORBOARD,
+)
+_REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html", "log.csv")
 _CAMERAS = "cameras.json"
 _FILES = (
     "cfg_args",
@@ -254,6 +258,7 @@ class OutputFolder:
             return
         for name in _FILES:
             (self.path / name).unlink(missing_ok=True)
+        shutil.rmtree(self.path / _TENSORBOARD, ignore_errors=True)
         self._remove_unwritten_scenes()
         with suppress(OSError):  # missing, or not empty
             (self.path / "point_cloud").rmdir()

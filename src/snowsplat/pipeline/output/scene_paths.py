@@ -12,7 +12,10 @@ from snowsplat.formats.lod import INDEX
 from snowsplat.formats.sog import META, is_sog
 from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
 from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import read_json
 
+#: The record of `make` in its folder. "title": the name of the scene for people.
+RECORD = "make.json"
 _HEAD_BYTES = 16_384
 
 
@@ -78,7 +81,24 @@ def folder_around(scene: Path) -> OutputFolder:
     return OutputFolder(scene)
 
 
+def folder_of_make(path: Path) -> Path:
+    """The folder of `make` around ``path``, which is its scene or the output folder of its
+    training; ``path`` itself if there is none."""
+    return path.parent if path.name == SCENE and (path.parent / RECORD).is_file() else path
+
+
 def scene_name(scene: Path) -> str:
-    """The name of a scene: the name of its folder, or of its file without suffixes."""
+    """The name of a scene: the title that `make` has recorded; else the name of the folder, or of
+    the file without suffixes."""
     scene = scene.resolve()
-    return scene.name.split(".")[0] or scene.name
+    record = folder_of_make(scene) / RECORD
+    title = _recorded_title(record) if record.is_file() else None
+    return title or scene.name.split(".")[0] or scene.name
+
+
+def _recorded_title(record: Path) -> str | None:
+    try:
+        title = read_json(record).get("title")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return title if isinstance(title, str) else None

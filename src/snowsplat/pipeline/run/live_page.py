@@ -106,12 +106,33 @@ class LivePage:
         assert self._viewer is not None
         return self._viewer.url
 
+    @property
+    def others(self) -> list[str]:
+        """The addresses for other computers, if they differ."""
+        assert self._viewer is not None
+        return self._viewer.others
+
+    def resume(self) -> None:
+        """Resume the training if a user has paused it; may be called in any thread."""
+        if (viewer := self._viewer) is not None:
+            viewer.session.resume()
+
+    def end_training(self, about: list[str]) -> None:
+        """Show lines of text about the finished training run."""
+        assert self._training is not None
+        self._training.end(about)
+
+    @property
+    def has_trained(self) -> bool:
+        """Whether the page shows a training run."""
+        return self._training is not None
+
     def show_result(self) -> None:
         """Show the scene of the finished training run until Ctrl-C."""
         assert self._training is not None
         assert self._trainer is not None
         with suppress(KeyboardInterrupt):
-            self._training.end(self._trainer.step, self._trainer.gaussians)
+            self._training.show(self._trainer.step, self._trainer.gaussians)
 
     def show(self, scene: Callable[[], Scene]) -> None:
         """Show the newest scene until Ctrl-C. ``scene`` returns it, and is called repeatedly."""

@@ -15,6 +15,7 @@ from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.output.scene_paths import folder_of_make, scene_name
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.collective import Collective
 from snowsplat.pipeline.run.live_page import LivePage
@@ -23,6 +24,7 @@ from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
+from snowsplat.pipeline.run.watchers import Watchers
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.pace import Pace
@@ -42,6 +44,7 @@ from snowsplat.training.parts.transients import Transients
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.report.scene_verdict import scene_verdict
 from snowsplat.training.settings.stored import config_to_json
+from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
 from snowsplat.util.process_memory import peak_bytes
@@ -79,6 +82,7 @@ class TrainingRun:
         self.history = History.read(self.out.history, self.first_step)
         self._left = StepsLeft(Work.for_training(self.config, self.trainer.dataset))
         self.together = Collective(self.trainer)
+        self.watchers = Watchers(self.out.path, self.trainer, self.page)
         self.transients = self.trainer.part(Transients)
         self.overfitting = self.trainer.part(OverfittingCheck)
         self.poses = self.trainer.part(PoseRefinement)
@@ -97,7 +101,8 @@ class TrainingRun:
                 self._finish_interrupted_writes()
                 self.together.proceed()
                 self.history.step_begins()
-                self.trainer.run(self._record)
+                with self.watchers:
+                    self.trainer.run(self._record)
             finally:
                 self.observer.steps_end()
         except KeyboardInterrupt:
@@ -140,10 +145,10 @@ class TrainingRun:
             self._save_checkpoint()
         if self.trainer.schedule.contains(progress.step, self.save_iterations):
             self._save_scene()
-        if self.page is not None:
-            paused = self.page.after_step(
-                progress.step, progress.iterations, progress.loss, self.trainer.gaussians
-            )
+        paused = self.watchers.after_step(
+            progress.step, progress.iterations, progress.loss, self.trainer.gaussians
+        )
+        if paused:
             self._left.postpone(paused)
             if self.pace is not None and self.budget is not None:
                 self.pace.postpone(paused)
@@ -248,6 +253,8 @@ class TrainingRun:
                 self._record_evaluation(step, self.together.evaluate())
             assert self.evaluation is not None
             self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
+        if self.page is not None:
+            self.page.end_training(self._result_lines(len(gaussians), seconds))
         self.history.write(self.out.history)
         if exposures := self._exposures():
             self.out.write_exposure(exposures)
@@ -278,6 +285,14 @@ class TrainingRun:
         )
         self.observer.trained(result)
         return result
+
+    def _result_lines(self, gaussians: int, seconds: float) -> list[str]:
+        lines = [f"Finished: {self.trainer.step:,} steps in {duration(seconds)}"]
+        lines.append(f"{gaussians:,} Gaussians")
+        if self.evaluation is not None:
+            _, means = self.evaluation
+            lines.append(f"PSNR {means.psnr:.2f} dB, {len(means.views)} held-out photos")
+        return lines
 
     def _exposures(self) -> dict[str, list[float]]:
         """The exposure of each training photo in EV, by name: red, green, blue; empty if no gains
@@ -340,14 +355,15 @@ class TrainingRun:
         self, gaussians: Gaussians, about_poses: str | None, verdict: Verdict | None
     ) -> Path:
         # Users may share the report, so it contains names of files but no paths.
-        out = self.out.path
+        out, folder = self.out.path, folder_of_make(self.out.path)
         dataset = asdict(self.settings)
         for key in ("path", "test_list"):
             dataset[key] = dataset[key] and Path(dataset[key]).name
         write_training_report(
             self.out.report,
             Trained(
-                name=out.resolve().name if out.is_absolute() else str(out),
+                name=scene_name(out),
+                folder=folder.resolve().name if folder.is_absolute() else str(folder),
                 dataset=self._dataset(),
                 gaussians=gaussians,
                 step=self.trainer.step,

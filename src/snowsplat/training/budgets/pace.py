@@ -81,8 +81,7 @@ class Pace:
 
     def _mean(self, schedule: Schedule, step: int, gaussians: int) -> float:
         """Mean seconds of the remaining steps."""
-        parts = self._work.parts_ahead(schedule, step, gaussians)
-        return sum(self._cost.predict(*part) for part in parts) / len(parts)
+        return self._cost.mean(self._work.parts_ahead(schedule, step, gaussians))
 
     def _seconds_left(self, now: float, gaussians: int) -> float:
         """Seconds until the last step has to be completed, before the final evaluation."""

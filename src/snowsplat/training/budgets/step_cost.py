@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,8 +16,9 @@ if TYPE_CHECKING:
 
 # Seconds of a step on the machine of docs/measurements/2026-11-25-kernels.md. Only their
 # proportions matter: the time on this machine with this scene, divided by these seconds, is
-# measured. It is the `time_ratio`.
-_SECONDS_PER_STEP = 0.001
+# measured. It is the `time_ratio`. The fixed part is small: with fox and lego, steps at a quarter
+# of the width take no more than their pixels and Gaussians account for.
+_SECONDS_PER_STEP = 0.0003
 _SECONDS_PER_MEGAPIXEL = 0.035
 _SECONDS_PER_MILLION_GAUSSIANS = 0.07
 
@@ -29,17 +32,18 @@ _SECONDS_PER_VIEW_MEGAPIXEL = 0.05
 _SECONDS_PER_MILLION_WRITTEN = 4.0
 
 #: Factor by which a densification increases the number of Gaussians, below their limit.
-_GROWTH = 1.25
+GROWTH = 1.25
 #: The remaining steps are divided into this number of equal parts, and the time of each is
 #: estimated.
 _PARTS = 40
 
-#: Weight of the initial value of `time_ratio`, relative to the weight of all measurements after a
-#: long time.
-_INITIAL_WEIGHT = 0.3
-#: The measured time of a step is limited to this multiple of the predicted time. A longer step was
-#: delayed by another process.
-_OUTLIER = 5.0
+#: Weight of a known initial value of `time_ratio`, relative to the weight of all measurements after
+#: a long time; and of that of the first step, in steps.
+_INITIAL_WEIGHT, _INITIAL_STEPS = 0.3, 5
+#: A step that takes more than the first multiple of the predicted time, after one that did not,
+#: contains something rare: a densification, or masks of what moves. If long steps follow each
+#: other, the machine has become slow; the time of each is limited to the second multiple.
+_LONG, _LONGEST = 3.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -81,33 +85,44 @@ class Work:
         view = _STEPS_PER_VIEW * step + _SECONDS_PER_VIEW_MEGAPIXEL * self.pixels / 1e6
         return self.held_out * view + _SECONDS_PER_MILLION_WRITTEN * gaussians / 1e6
 
-    def parts_ahead(self, schedule: Schedule, step: int, gaussians: int) -> list[tuple[int, float]]:
+    def parts_ahead(
+        self, schedule: Schedule, step: int, gaussians: int, growth: float | None = None
+    ) -> list[tuple[int, float]]:
         """Downscale and number of Gaussians in equal parts of the steps after ``step``.
 
-        The number of Gaussians is assumed to increase linearly until densification ends. It then is
-        the limit or, without a limit, twice the present number; but each densification increases
-        the number at most by the factor `_GROWTH`.
+        The number of Gaussians is assumed to increase until densification ends, up to the limit or,
+        without a limit, to twice the present number. Each densification multiplies it by
+        ``growth``. If that is None, the increase is linear, and at most that of `GROWTH`.
         """
         density = self.config.density
+        every = density.densify_interval
         last = min(schedule.step_of(density.densify_until), schedule.iterations)
-        times = max(0, last - step) // density.densify_interval
-        most = min(density.max_gaussians or 2 * gaussians, gaussians * _GROWTH ** min(times, 99))
+        most = max(gaussians, density.max_gaussians or 2 * gaussians)
+
+        def grown(times: int, factor: float) -> float:
+            return min(most, gaussians * factor ** min(max(0, times), 99))
+
+        at_end = grown((last - step) // every, GROWTH)
         parts = []
         for i in range(_PARTS):
-            ahead = (i + 0.5) / _PARTS * (schedule.iterations - step)
-            grown = min(1.0, ahead / (last - step)) if last > step else 0.0
-            downscale = self.config.downscale_at(math.ceil(step + ahead), schedule)
-            parts.append((downscale, gaussians + grown * max(0, most - gaussians)))
+            at = step + (i + 0.5) / _PARTS * (schedule.iterations - step)
+            if growth is not None:
+                count = grown(int(min(at, last)) // every - step // every, growth)
+            else:
+                share = min(1.0, (at - step) / (last - step)) if last > step else 0.0
+                count = gaussians + share * (at_end - gaussians)
+            parts.append((self.config.downscale_at(math.ceil(at), schedule), count))
         return parts
 
 
 class StepCost:
     """Predicts the seconds of a training step from the times of previous steps."""
 
-    def __init__(self, work: Work, time_ratio: float, time_constant: float) -> None:
+    def __init__(self, work: Work, time_ratio: float | None, time_constant: float) -> None:
         """
         Args:
-            time_ratio: initial value of the measured seconds divided by `Work.seconds`.
+            time_ratio: initial value of the measured seconds divided by `Work.seconds`; None: that
+                of the second step, because the first one waits until its photo is decoded.
             time_constant: seconds after which the weight of a measurement has decreased to 1/e.
         """
         self._work = work
@@ -118,18 +133,31 @@ class StepCost:
         # wait until photos are decoded.
         self._measured: dict[int, float] = {}
         self._modelled: dict[int, float] = {}
-        self._time_ratio = time_ratio
-        self._initial = _INITIAL_WEIGHT * time_constant / time_ratio
+        self._known = time_ratio is not None
+        self._time_ratio = 1.0 if time_ratio is None else time_ratio
+        self._initial = _INITIAL_WEIGHT * time_constant / self._time_ratio
+        self._steps = 0
+        self._rare: list[float] = []  # what long steps took in addition
+        self._long = False  # whether the last step was long
 
     def observe(self, seconds: float, downscale: int, gaussians: int) -> None:
         """Add the measured ``seconds`` of a step."""
-        expected = self.predict(downscale, gaussians)
-        seconds = min(seconds, _OUTLIER * expected)
-        if downscale not in self._measured:
-            self._measured[downscale] = self._initial * self._time_ratio
-            self._modelled[downscale] = self._initial
-        keep = math.exp(-seconds / self._time_constant)
         modelled = self._work.seconds(downscale, gaussians)
+        self._steps += 1
+        if not self._known and self._steps <= 2:
+            self._time_ratio = seconds / modelled
+            return
+        expected = self.predict(downscale, gaussians)
+        was_long, self._long = self._long, seconds > _LONG * expected
+        if self._long and not was_long:
+            self._rare.append(seconds - expected)
+            seconds = expected
+        seconds = min(seconds, _LONGEST * expected)
+        if downscale not in self._measured:
+            initial = self._initial if self._known else _INITIAL_STEPS * modelled
+            self._measured[downscale] = initial * self._time_ratio
+            self._modelled[downscale] = initial
+        keep = math.exp(-seconds / self._time_constant)
         self._measured[downscale] = keep * self._measured[downscale] + seconds
         self._modelled[downscale] = keep * self._modelled[downscale] + modelled
         self._time_ratio = self._measured[downscale] / self._modelled[downscale]
@@ -140,3 +168,14 @@ class StepCost:
         if downscale in self._measured:
             time_ratio = self._measured[downscale] / self._modelled[downscale]
         return time_ratio * self._work.seconds(downscale, gaussians)
+
+    def mean(self, parts: Sequence[tuple[int, float]]) -> float:
+        """Mean seconds of the steps of ``parts``, see `Work.parts_ahead`, with what is rare.
+
+        The usual time of what is rare is its median. A step during which the computer has slept
+        does not change it.
+        """
+        rare = 0.0
+        if len(self._rare) > 1:
+            rare = statistics.median_low(self._rare) * len(self._rare) / self._steps
+        return sum(self.predict(*part) for part in parts) / len(parts) + rare

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from snowsplat.training.budgets.step_cost import StepCost, Work
+from snowsplat.training.budgets.step_cost import GROWTH, StepCost, Work
 from snowsplat.training.core.step_schedule import Schedule
 
 #: Number of seconds over which measurements are averaged.
@@ -30,7 +30,8 @@ class StepsLeft:
         self._work = work
         self._clock = clock
         self._last_step = clock()
-        self._cost = StepCost(work, 1.0, _AVERAGING_SECONDS)
+        self._cost = StepCost(work, None, _AVERAGING_SECONDS)
+        self._gaussians, self._growth = 0, GROWTH  # in the last step; by the last densification
         self._end = self._last_estimate = -float("inf")
 
     def after(self, schedule: Schedule, step: int, downscale: int, gaussians: int) -> float:
@@ -38,11 +39,13 @@ class StepsLeft:
         now = self._clock()
         self._cost.observe(now - self._last_step, downscale, gaussians)
         self._last_step = now
+        if gaussians > self._gaussians > 0:
+            self._growth = gaussians / self._gaussians
+        self._gaussians = gaussians
         if now - self._last_estimate >= _MIN_INTERVAL:
             self._last_estimate = now
-            parts = self._work.parts_ahead(schedule, step, gaussians)
-            mean = sum(self._cost.predict(*part) for part in parts) / len(parts)
-            self._end = now + mean * (schedule.iterations - step)
+            parts = self._work.parts_ahead(schedule, step, gaussians, self._growth)
+            self._end = now + self._cost.mean(parts) * (schedule.iterations - step)
         return max(0.0, self._end - now)
 
     def postpone(self, seconds: float) -> None:

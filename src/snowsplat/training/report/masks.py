@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data import ImageLoader, View
-from snowsplat.training.report.pictures import small
+from snowsplat.training.report.pictures import reduced
 from snowsplat.util.html import picture, text
 
 #: Largest number of photos that are shown: those with the largest masks.
@@ -47,7 +47,7 @@ def masked(views: Sequence[View], masks: Mapping[str, Image.Image]) -> str:
             moves = np.asarray(masks[name])[:, :, None] == 0
             pixels = np.where(moves, tinted, photo).round().astype(np.uint8)
             figures.append(
-                f"<figure>{picture(small(pixels), f'{name}: masked parts', quality=80)}"
+                f"<figure>{picture(reduced(pixels), f'{name}: masked parts', quality=80)}"
                 f"<figcaption>{text(name)}: {100.0 * shares[name]:.1f}%</figcaption></figure>"
             )
     more = len(masks) - len(figures)

@@ -18,8 +18,8 @@ from snowsplat.util.html import picture, text
 #: Number of views that are shown, of those with the lowest and the highest PSNR.
 _WORST = 3
 _BEST = 2
-#: The longer side of an image, in pixels.
-_IMAGE_SIDE = 360
+#: The longer side of an image, in pixels: about that of a screen, on which it can be opened.
+_IMAGE_SIDE = 1280
 #: The mean difference of the channels that is drawn white.
 _WHITE_ERROR = 0.25
 
@@ -86,7 +86,7 @@ def _triple(
     if loaded.mask is not None:
         difference = torch.where(loaded.mask, difference, 0.0)
     images = "".join(
-        picture(small(pixels), f"{view.name}: {what}", quality=80)
+        picture(reduced(pixels), f"{view.name}: {what}", quality=80)
         for what, pixels in (
             ("photo", _bytes(photo)),
             ("rendering", _bytes(image)),
@@ -110,7 +110,7 @@ def _error_in_color(difference: np.ndarray) -> np.ndarray:
     return np.rint(color).astype(np.uint8)
 
 
-def small(pixels: np.ndarray) -> Image.Image:
+def reduced(pixels: np.ndarray) -> Image.Image:
     """(H, W, 3) uint8 as an image whose longer side has at most `_IMAGE_SIDE` pixels."""
     image = Image.fromarray(pixels)
     scale = min(1.0, _IMAGE_SIDE / max(image.size))

@@ -40,8 +40,6 @@ _STYLE = (
     + masks.STYLE
     + verdict.STYLE
     + """
-.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr));
-  gap: 22px 28px; }
 td { font-variant-numeric: tabular-nums; }
 """
 )
@@ -52,6 +50,7 @@ class Trained:
     """The content of the page."""
 
     name: str  # name of the scene
+    folder: str  # where the commands at the end of the page find it
     dataset: Dataset
     gaussians: Gaussians
     step: int  # the last step
@@ -105,7 +104,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _figures(evaluation, held_out),
             _settings(trained),
             _machine(trained),
-            _next(trained.name),
+            _next(trained.folder),
         ]
     write_text(path, page(f"{trained.name} – training", body, _STYLE))
 
@@ -276,8 +275,8 @@ def _machine(trained: Trained) -> str:
     return f"<h2>Machine</h2>\n{table([], rows)}"
 
 
-def _next(name: str) -> str:
-    out = text(shlex.quote(name))
+def _next(folder: str) -> str:
+    out = text(shlex.quote(folder))
     return f"<h2>Next</h2>\n<pre>snowsplat view {out}\nsnowsplat render {out} --path ellipse</pre>"
 
 

@@ -23,11 +23,11 @@ def config_to_json(config: TrainConfig) -> dict[str, Any]:
     return asdict(config) | {_DENSITY_NAME: type(config.density).__name__}
 
 
-def config_from_json(values: dict[str, Any]) -> TrainConfig:
+def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfig:
     """The configuration that `config_to_json` returned.
 
     Settings that an older version did not have get their default. Settings that this version does
-    not have are ignored, with a warning.
+    not have are ignored, with a warning, or refused if ``strict``.
 
     Raises:
         UserError: the density control is not registered; or the values are damaged.
@@ -48,17 +48,19 @@ def config_from_json(values: dict[str, Any]) -> TrainConfig:
     }
     for part, kind in kinds.items():
         if part in values:
-            values[part] = _known(kind, values[part])
-    config: TrainConfig = _known(TrainConfig, values | {"density": values.get("density")})
+            values[part] = _known(kind, values[part], strict)
+    config: TrainConfig = _known(TrainConfig, values | {"density": values.get("density")}, strict)
     return config
 
 
-def _known(kind: type, values: Any) -> Any:
+def _known(kind: type, values: Any, strict: bool) -> Any:
     """An object of the class ``kind``, from the values that it knows."""
     if not isinstance(values, dict):
         raise UserError(f"the configuration: {quoted(values)} is not valid; start again")
     names = {each.name for each in fields(kind) if each.init}
     for unknown in sorted(values.keys() - names):
+        if strict:
+            raise UserError(f"{quoted(unknown)} is unknown to this version; remove it")
         logger.warning("the configuration: %s is unknown to this version; ignored", quoted(unknown))
     known = {name: value for name, value in values.items() if name in names}
     try:

@@ -134,11 +134,13 @@ class TrainingPanel:
 
         call_in_server_thread(self._server, put)
 
-    def end(self) -> None:
-        """Hide the controls: the training has finished."""
+    def end(self, status: list[str]) -> None:
+        """Show lines of text, and hide the controls: the training has finished."""
 
         def hide() -> None:
-            for control in (self._pause, self._step, self._share):
+            self._status.content = note("<br>".join(map(html.escape, status)))
+            self._bar.value = 100.0  # type: ignore[misc]
+            for control in (self._share, self._step, self._pause):
                 control.visible = False
             self._key.remove()
 

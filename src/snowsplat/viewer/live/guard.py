@@ -23,7 +23,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import gzip
 import hmac
+import html
 import http
 import logging
 import math
@@ -80,11 +82,17 @@ _listen = websockets.asyncio.server.serve
 class Guard:
     """The checks of one server."""
 
-    def __init__(self, hosts: KnownHosts, token: str) -> None:
-        """``token``: the first component of all paths."""
+    def __init__(self, hosts: KnownHosts, token: str, title: str) -> None:
+        """
+        Args:
+            token: the first component of all paths.
+            title: that of the page.
+        """
         self.serves = False  # whether viser has started its server through `serve`
         self.is_open = False  # whether the scene is complete, so that browsers may connect
         self._hosts, self._token = hosts, token.encode()
+        self._title = f"<title>{html.escape(title)}</title>".encode()
+        self._titled: dict[str, bytes] = {}  # the page, by its Content-Encoding
         self._waiting: dict[Connection, None] = {}  # oldest first
         self._pages: set[Connection] = set()
         self._browsers: set[Connection] = set()
@@ -119,9 +127,24 @@ class Guard:
         if response.status_code == http.HTTPStatus.OK:
             self._waiting.pop(connection, None)
             self._pages.add(connection)
+            if request.path == "/":
+                self._set_title(response)
         for name, value in _HEADERS.items():
             response.headers[name] = value
         return response
+
+    def _set_title(self, response: Response) -> None:
+        """Replace the title of viser's page, for which viser has no setting."""
+        coding = response.headers["Content-Encoding"]
+        if coding not in self._titled:
+            zipped = coding == "gzip"
+            page = gzip.decompress(response.body) if zipped else bytes(response.body)
+            page = page.replace(b"<title>Viser</title>", self._title, 1)
+            self._titled[coding] = gzip.compress(page) if zipped else page
+        response.body = self._titled[coding]
+        if "Content-Length" in response.headers:
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
 
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
         """A response that rejects the request. None: it is accepted; the token is removed."""

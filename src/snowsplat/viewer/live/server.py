@@ -63,7 +63,7 @@ def start_server(
     hosts = KnownHosts(host, allow_host)
     free = free_port(host, port)
     token = secrets.token_urlsafe(16)
-    guard = Guard(hosts, token)
+    guard = Guard(hosts, token, f"{label} - snowsplat")
     # viser prints a welcome message, and warns about browsers that have disconnected.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     with contextlib.redirect_stdout(io.StringIO()), _guarded(guard):

@@ -9,7 +9,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.process import raise_deferred_interrupt
 from snowsplat.viewer.live.controls import TrainingPanel
 from snowsplat.viewer.live.curves import Curve, SampledPsnr
-from snowsplat.viewer.live.viewer import NetworkViewer, Scene
+from snowsplat.viewer.live.viewer import NetworkViewer
 
 _SECONDS = 1.0  # time between two updates of the displayed numbers
 _PSNR_SHARE = 0.03  # share of the time for measuring PSNR
@@ -96,11 +96,14 @@ class TrainingViewer:
             self._rate = keep * self._rate + (1.0 - keep) * rate
         return self._rate
 
-    def end(self, step: int, gaussians: Gaussians) -> None:
-        """Show the result of the training until Ctrl-C, which raises KeyboardInterrupt."""
+    def end(self, about: list[str]) -> None:
+        """The training has finished: show lines of text about it instead of its controls."""
         self._session.training = False
         self._session.resume()
-        self._panel.end()
-        about = [f"Finished after {step:,} steps", f"{len(gaussians):,} Gaussians"]
-        scene = Scene(gaussians, step, about)
-        self.viewer.show_newest(lambda: scene)
+        self._panel.end(about)
+
+    def show(self, step: int, gaussians: Gaussians) -> None:
+        """Show the result of the training until Ctrl-C, which raises KeyboardInterrupt."""
+        while True:
+            if not self.viewer.serve(gaussians, step, training=False):
+                self.viewer.wait()

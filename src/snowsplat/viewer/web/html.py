@@ -1,7 +1,8 @@
 """A self-contained page: the viewer and the scene in a single HTML file.
 
 It can be opened from disk in any browser with WebGL 2, and makes no network requests. The scene is
-embedded as a compressed PLY file in base64. Pages are written, but cannot be read.
+embedded as a SOG file in base64, the same as that of a published site. Pages are written, but
+cannot be read.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import base64
 from pathlib import Path
 
 from snowsplat.formats import GaussianArrays
-from snowsplat.formats.compressed_ply import encode_compressed_ply
+from snowsplat.formats.sog import sog_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
 from snowsplat.viewer.web.panel import Description
@@ -54,14 +55,14 @@ def write_html(path: Path | str, scene: ReadyScene, about: Description | None = 
     count = len(scene.gaussians)
     if not count:
         raise UserError(f"{path}: the scene has no Gaussians; a page needs at least one")
-    content = encode_compressed_ply(path, GaussianArrays.from_gaussians(scene.gaussians))
+    content = sog_bytes(path, GaussianArrays.from_gaussians(scene.gaussians))
     if len(content) > _LARGEST:
         raise UserError(
             f"{path}: {count:,} Gaussians are too many for one page; "
             "decimate them, or drop SH degrees"
         )
     pictures = f"data:image/webp;base64,{_base64(scene.stops.pictures)}"
-    bootstrap = scene.bootstrap(about, pictures) | {"contentFilename": "scene.compressed.ply"}
+    bootstrap = scene.bootstrap(about, pictures) | {"contentFilename": "scene.sog"}
     write_text(path, whole_page(about.title, bootstrap, _SCENE.format(scene=_base64(content))))
 
 

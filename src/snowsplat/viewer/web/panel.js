@@ -1,16 +1,51 @@
 // The panel of the page. `options` and `settings` are those of the viewer. A view is an array:
 // position, target, field of view. The field of view is the angle of the longer side of a rectangle
-// of the shape `aspect`; the window shows all of it, whatever its own shape.
+// of the shape `aspect`. The window shows all of it, whatever its own shape, unless no photo shows
+// what is beside it: at a photo, the window then shows a part of the rectangle, which fills it.
 const scene = JSON.parse(document.getElementById('sse-bootstrap').textContent).panel;
-const { aspect, start, stops } = scene;
+const { aspect, seen, stops } = scene;
 const NARROW = 600;
 
-/** Half of the width and of the height of what the window shows at a distance of 1. */
-const shownBy = (fov, { width, height }) => {
+const UNLIMITED = [Infinity, Infinity];
+
+/**
+ * Half of the width and of the height of what the window shows at a distance of 1: the rectangle,
+ * but at most so many times its width and its height.
+ */
+const shownBy = (fov, { width, height }, [widest, highest] = UNLIMITED) => {
     const longer = Math.tan((fov * Math.PI) / 360);
-    const half = Math.max(longer / Math.max(aspect, 1), (longer * Math.min(aspect, 1) * height) / width);
+    const [across, down] = [(longer * Math.min(aspect, 1) * height) / width, longer / Math.max(aspect, 1)];
+    const half = Math.min(Math.max(down, across), widest * across, highest * down);
     return [(half * width) / height, half];
 };
+
+/** The share of what the window would show of a rectangle, if it were not limited. */
+const zoomWithin = (fov, size, limits) => shownBy(fov, size, limits)[1] / shownBy(fov, size)[1];
+
+/** How much of the radius of the subject is in the window, above, below and at the sides; at most 1. */
+const shownOfSubject = ([x, y, z, u, v, w, fov], size, limits) => {
+    const scaled = (a) => a.map((value) => value / Math.hypot(...a));
+    const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
+    const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+    const ahead = scaled([u - x, v - y, w - z]);
+    const right = scaled(cross(ahead, [0, 1, 0]));
+    const to = [scene.subject[0] - x, scene.subject[1] - y, scene.subject[2] - z];
+    const distance = dot(to, ahead);
+    if (distance <= 0) return -Infinity;
+    const [across, down] = shownBy(fov, size, limits);
+    const beside = [across * distance - Math.abs(dot(to, right)), down * distance - Math.abs(dot(to, cross(right, ahead)))];
+    return Math.min(1, Math.min(...beside) / scene.subject[3]);
+};
+
+/** The page begins with the first photo, or if it would show little of it, with one that shows the subject. */
+const ENOUGH = 0.8;
+const firstStop = (size) => {
+    if (!stops.length || zoomWithin(stops[0][6], size, seen[0]) >= ENOUGH) return 0;
+    const shown = stops.map((view, i) => shownOfSubject(view, size, seen[i]));
+    return shown.findIndex((share) => share >= Math.max(...shown) - 0.05);
+};
+const first = Math.max(0, firstStop({ width: innerWidth, height: innerHeight }));
+const start = first ? stops[first] : scene.start;
 
 const addView = ([x, y, z, u, v, w, fov]) => ({ position: [x, y, z], target: [u, v, w], fov });
 
@@ -43,38 +78,26 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     // The viewer sets the field of view before each frame, once the scene is loaded.
     let fov = start[6];
     let fitted = 0;
-    app.on('update', () => {
+    let limits = linkedView() ? UNLIMITED : (seen[first] ?? UNLIMITED);
+    let zoom = zoomWithin(fov, canvas, limits);
+    app.on('update', (seconds) => {
         if (app.xr.active) return;
         if (camera.fov !== fitted) fov = camera.fov;
-        const longest = Math.max(...shownBy(fov, canvas));
+        const step = zoomWithin(fov, canvas, limits) - zoom;
+        zoom += Math.abs(step) < 1e-3 ? step : step * Math.min(1, 5 * seconds);
+        const longest = zoom * Math.max(...shownBy(fov, canvas));
         camera.fov = fitted = (Math.atan(longest) * 360) / Math.PI;
     });
+    new ResizeObserver(() => { zoom = zoomWithin(fov, canvas, limits); }).observe(canvas);
 
-    // In a window of another shape, what is beside a photo may be in no photo. So it fades to the
-    // background until the visitor moves the camera.
-    const matte = element('div', { className: 'snow-matte' });
-    const fitMatte = () => {
-        const { clientWidth, clientHeight } = canvas;
-        const share = (clientWidth / clientHeight) / aspect;
-        const [side, inner] = share > 1 ? ['right', 1 / share] : ['bottom', share];
-        const color = `rgb(${settings.background.color.map((c) => 255 * c).join(' ')} / `;
-        const percent = (fromMiddle) => `${50 + 50 * fromMiddle}%`;
-        const fade = (to) =>
-            `linear-gradient(to ${to}, ${color}0) 50%, ${color}0) ${percent(inner)}, ${color}1) ${percent(inner + 0.2)})`;
-        matte.style.background = `${fade(side)}, ${fade(side === 'right' ? 'left' : 'top')}`;
-    };
-    const showMatte = (shown) => matte.classList.toggle('snow-clear', !shown || !stops.length);
-    canvas.after(matte);
-    new ResizeObserver(fitMatte).observe(canvas);
-
-    /** Move to a view, in orbit around its target; `isPhoto`: that of a photo. */
-    const flyTo = (view, isPhoto = false) => {
+    /** Move to a view, in orbit around its target; for the view of a photo, with its limits. */
+    const flyTo = (view, limitsThere = UNLIMITED) => {
         const { position, target, fov } = addView(view);
         annotations[0] = { position: target, camera: { initial: { position, target, fov } } };
         viewer.selectAnnotation(0);
         annotations.length = 0;
         state.selectedAnnotation = null;
-        showMatte(isPhoto);
+        limits = limitsThere;
     };
 
     const presentView = () => {
@@ -82,7 +105,8 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         const ahead = camera.entity.forward;
         const distance = (subject[0] - x) * ahead.x + (subject[1] - y) * ahead.y + (subject[2] - z) * ahead.z;
         const far = Math.max(distance, 0.1 * radius);
-        return [x, y, z, x + far * ahead.x, y + far * ahead.y, z + far * ahead.z, fov];
+        const shown = (Math.atan(zoom * Math.tan((fov * Math.PI) / 360)) * 360) / Math.PI;
+        return [x, y, z, x + far * ahead.x, y + far * ahead.y, z + far * ahead.z, shown];
     };
 
     /** The subject from the present direction, whole and large. */
@@ -97,16 +121,17 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         // In orbit; the viewer itself would begin in its animation.
         viewer.resetCamera();
         hiding.set(linkedHiding() ?? scene.hiding.start);
-        showMatte(!linkedView());
         // The list of controls would cover the scene; a button opens it.
         if (canvas.clientWidth < NARROW) document.querySelector('.sse-controlsHintClose')?.click();
         // These follow the viewer's own handlers.
         events.on('inputEvent', (name) => {
             if (name === 'frame') flyTo(subjectView());
-            if (name === 'reset' && state.cameraMode === 'orbit') flyTo(start, true);
+            if (name === 'reset' && state.cameraMode === 'orbit') flyTo(start, seen[first]);
         });
-        events.on('cameraMode:changed', (mode) => showMatte(mode === 'anim'));
-        for (const name of ['pointerdown', 'wheel']) canvas.addEventListener(name, () => showMatte(false));
+        // The film passes all photos.
+        events.on('cameraMode:changed', (mode) => {
+            if (mode === 'anim' && seen.length) limits = [0, 1].map((i) => Math.min(...seen.map((each) => each[i])));
+        });
         window.addEventListener('hashchange', () => {
             const view = linkedView();
             if (view) flyTo(view);
@@ -151,7 +176,7 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         stop.onclick = () => {
             strip.querySelector('[aria-current]')?.removeAttribute('aria-current');
             stop.ariaCurrent = 'true';
-            flyTo(view, true);
+            flyTo(view, seen[i]);
         };
         strip.append(stop);
     });

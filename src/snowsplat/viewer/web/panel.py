@@ -7,7 +7,6 @@ scripts are `panel.css`, `hiding.js` and `panel.js`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.viewer.web.hiding import Hiding
+from snowsplat.viewer.web.stops import Stops
 
 _FOLDER = Path(__file__).parent
 
@@ -52,8 +52,7 @@ def panel_settings(
     about: Description,
     gaussians: int,
     start: InitialView,
-    subject: tuple[Sequence[float], float],
-    stops: Sequence[InitialView],
+    stops: Stops,
     pictures: str,
     hiding: Hiding,
 ) -> dict[str, Any]:
@@ -62,19 +61,19 @@ def panel_settings(
     Args:
         gaussians: their number.
         start: the initial view of the page.
-        subject: middle and radius of what Frame shows.
-        stops: the views of the stops.
+        stops: the stops, and the subject, which Frame shows.
         pictures: the address of the image with the pictures of the stops.
         hiding: the ranges of the sliders.
     """
-    (x, y, z), radius = subject
+    x, y, z = stops.middle.tolist()
     return {
         "title": about.title,
         "facts": about.facts(gaussians),
         "aspect": start.aspect,
         "start": view_numbers(start, start.aspect),
-        "subject": [-x, -y, z, radius],
-        "stops": [view_numbers(stop, start.aspect) for stop in stops],
+        "subject": [-x, -y, z, stops.radius],
+        "stops": [view_numbers(stop, start.aspect) for stop in stops.views],
+        "seen": [[round(share, 2) for share in seen] for seen in stops.seen],
         "pictures": pictures,
         "hiding": hiding.settings(),
     }

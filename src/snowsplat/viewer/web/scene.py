@@ -126,15 +126,11 @@ class ReadyScene(NamedTuple):
             pictures: the address of the pictures of the stops.
             count: the number of Gaussians, if those here are only a coarse level.
         """
-        subject = self.stops.middle.tolist(), self.stops.radius
         count = count or len(self.gaussians)
-        stops = self.stops.views
         return {
             "settings": settings(self.start, self.background, self.film),
             "antialiased": self.gaussians.antialiased,
-            "panel": panel_settings(
-                about, count, self.start, subject, stops, pictures, self.hiding
-            ),
+            "panel": panel_settings(about, count, self.start, self.stops, pictures, self.hiding),
         }
 
 

@@ -1,5 +1,8 @@
 """The stops of a scene: the views of some of its photos, small pictures of them, and the subject.
 
+A window of another shape than a photo shows what is beside the photo. How much of it other photos
+show is measured, too, so that a page shows nothing that no photo shows.
+
 The pictures are renders, because the photos may be elsewhere. All of them are in one image, from
 left to right.
 """
@@ -8,6 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -29,6 +33,10 @@ HEIGHT = 128
 # share of what the middle parts of the photos show, of this size relative to a photo.
 _MIDDLE = 0.6
 _SHARE = 0.9
+# Beside a photo, so many widths or heights of it are looked at, in a picture of this height.
+_WIDEST, _BESIDE_HEIGHT = 3.0, 24
+# This share of what is shown beside a photo must be in other photos. At most so many are compared.
+_SEEN_SHARE, _COMPARED = 0.85, 100
 
 
 class Stops(NamedTuple):
@@ -38,6 +46,9 @@ class Stops(NamedTuple):
     pictures: bytes  # a WebP file with the pictures of all stops; empty if there are none
     middle: Tensor  # (3,) float64: the focus of the cameras
     radius: float  # the distance from the middle that contains most of it
+    # For each stop, the largest width and height, relative to those of its view, of which photos
+    # show most of what is beside the view; 1 to 3.
+    seen: list[tuple[float, float]]
 
 
 def stops_of(
@@ -52,7 +63,7 @@ def stops_of(
         background: red, green, blue in 0..1.
     """
     if not cameras:
-        return Stops([], b"", *bound(gaussians))
+        return Stops([], b"", *bound(gaussians), [])
     numbers = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST)).round().long().tolist()
     views = [view_of_camera(cameras[i], depth) for i in numbers]
     width = max(1, round(HEIGHT * views[0].aspect))
@@ -61,7 +72,10 @@ def stops_of(
     distances = (torch.cat([points for _, points in looks]) - middle).norm(dim=1)
     distances = distances[distances < (positions_of(cameras) - middle).norm(dim=1).median()]
     radius = float(distances.quantile(_SHARE)) if len(distances) else depth
-    return Stops(views, _side_by_side([picture for picture, _ in looks]), middle, max(radius, 1e-6))
+    others = cameras[:: -(-len(cameras) // _COMPARED)]
+    seen = [_seen(gaussians, view.with_aspect(views[0].aspect), depth, others) for view in views]
+    pictures = _side_by_side([picture for picture, _ in looks])
+    return Stops(views, pictures, middle, max(radius, 1e-6), seen)
 
 
 def _look(
@@ -83,6 +97,49 @@ def _look(
     return Image.fromarray(pixels), transform_points(
         camera.world_from_cam, points[middle & (alpha > 0.5)]
     )
+
+
+def _seen(
+    gaussians: Gaussians, view: InitialView, depth: float, others: Sequence[Camera]
+) -> tuple[float, float]:
+    """See `Stops.seen`. What is hidden from another photo counts as seen by it.
+
+    Args:
+        depth: where there is no surface, that of the place that must be in other photos.
+    """
+    height = _BESIDE_HEIGHT
+    width = max(1, round(height * view.aspect))
+    wide, high = round(_WIDEST * width), round(_WIDEST * height)
+    camera = view.camera(width, height)
+    camera = replace(camera, width=wide, height=high, cx=wide / 2, cy=high / 2)
+    with torch.no_grad():
+        output = render(gaussians.detach(), camera, with_depth=True)
+    assert output.depth is not None
+    alpha = output.alpha.double()
+    z = torch.where(alpha > 0.5, output.depth.double() / alpha.clamp_min(0.5), depth)
+    across = (torch.arange(wide, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
+    down = (torch.arange(high, dtype=torch.float64) + 0.5 - camera.cy)[:, None] / camera.fy
+    points = torch.stack([across * z, down * z, z], -1)
+    points = transform_points(camera.world_from_cam, points.reshape(-1, 3))
+    poses = torch.stack([other.cam_from_world for other in others])
+    x, y, ahead = (points @ poses[:, :, :3].mT + poses[:, None, :, 3]).unbind(2)  # (V, P) each
+    lenses = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height, c.near) for c in others]
+    fx, fy, cx, cy, right, bottom, near = torch.tensor(lenses, dtype=torch.float64).T[:, :, None]
+    x, y = fx * x / ahead + cx, fy * y / ahead + cy
+    inside = (x >= 0) & (x <= right) & (y >= 0) & (y <= bottom) & (ahead > near)
+    share = inside.any(0).reshape(high, wide).double()
+    top, left = (high - height) // 2, (wide - width) // 2
+    across_photo, down_photo = share[top : top + height], share[:, left : left + width]
+    return _extent(across_photo.mean(0), width), _extent(down_photo.mean(1), height)
+
+
+def _extent(seen: Tensor, size: int) -> float:
+    """How many times ``size`` lines around the middle are seen, of all lines with these shares."""
+    pairs = torch.minimum(seen, seen.flip(0))[: len(seen) // 2].flip(0)  # from the middle on
+    beside = pairs[size // 2 :]
+    count = torch.arange(1, len(beside) + 1)
+    enough = (beside.cumsum(0) >= _SEEN_SHARE * count).nonzero()
+    return 1.0 + 2.0 * (int(enough[-1]) + 1 if len(enough) else 0) / size
 
 
 def _side_by_side(pictures: Sequence[Image.Image]) -> bytes:

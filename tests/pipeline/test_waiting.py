@@ -1,0 +1,74 @@
+"""The parts of a job that take long with a large scene are told to the observer."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.extras.globe.make_globe import make_globe
+from snowsplat.formats import write_gaussians
+from snowsplat.pipeline.clean import clean
+from snowsplat.pipeline.convert import Edits, convert
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.publish import publish
+from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.view import viewed_scene
+from snowsplat.scene.gaussians import Gaussians
+
+
+class Waits(Observer):
+    """Records the stages, and the counts of each."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.open = False
+        self.counts: dict[str, list[tuple[int, int]]] = {}
+
+    def begin(self, stage):
+        self.stages.append(stage)
+        self.open = True
+        return lambda done, total, what="", left=None: self.counts.setdefault(what, []).append(
+            (done, total)
+        )
+
+    def leave(self) -> None:
+        self.open = False
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    gaussians = Gaussians.random_in_bounds(box, 300, torch.Generator().manual_seed(0), 1)
+    write_gaussians(tmp_path / "box.ply", gaussians)
+    return tmp_path / "box.ply"
+
+
+def test_stages_of_commands_for_scenes(scene, tmp_path):
+    def look(observer: Observer) -> None:
+        with viewed_scene(scene, observer=observer):
+            pass
+
+    small, half = tmp_path / "small.spz", Edits(decimate="50%")
+    for job, stages in (
+        (lambda seen: convert(scene, small, half, observer=seen), "reading merging writing"),
+        (lambda seen: publish(scene, tmp_path / "site", observer=seen), "reading writing"),
+        (look, "reading preparing"),
+        (lambda seen: make_globe(scene, tmp_path / "globe.html", observer=seen), "reading arrang"),
+    ):
+        seen = Waits()
+        job(seen)
+        assert " ".join(seen.stages).startswith(stages)
+        assert not seen.open
+
+
+def test_clean_counts_views_and_floaters(dataset, tmp_path):
+    options = TrainOptions(hold_out=8, settings={"iterations": 20, "initial_points": 300})
+    train(dataset, tmp_path / "out", options)
+    seen = Waits()
+    clean(tmp_path / "out", tmp_path / "clean.ply", observer=seen)
+    assert seen.stages == ["reading", "cleaning"]
+    assert not seen.open
+    views = seen.counts["views"]
+    assert [done for done, _ in views] == list(range(views[0][1]))
+    for done, total in seen.counts.get("floaters", []):
+        assert 0 <= done < total
