@@ -11,9 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from snowsplat.evaluation.metrics import evaluate_views
+from snowsplat.formats import read_gaussians
+from snowsplat.pipeline import all_photos, make_plan
 from snowsplat.pipeline import make as make_module
-from snowsplat.pipeline import make_plan
+from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.make import RECORD, STAGES
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_paths import scene_file, scene_name
+from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm import cost
 from snowsplat.sfm.ingest import sources
@@ -87,7 +93,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     before = state(out)
     again = run(*command)
     assert again.code == 0, again.err
-    assert again.out.count("done before") == 6
+    assert again.out.count("done before") == 7
     assert state(out) == before
     assert f"PSNR {metrics['psnr']:.2f} dB" in again.out
 
@@ -128,8 +134,58 @@ def test_a_folder_of_version_0_1_is_continued(run, photos, tmp_path, monkeypatch
     (out / "capture/sfm.json").rename(out / "capture/capture.json")
     again = run(*command, out)
     assert again.code == 0, again.err
-    assert again.out.count("done before") == 6
+    assert again.out.count("done before") == 7
     assert not (out / "dataset").exists()
+
+
+def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
+    run, refused, dataset, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=40))
+    out = tmp_path / "out"
+    command = ("make", dataset, "-o", out, "--quality", "draft", "--threads", 1)
+    monkeypatch.setattr(all_photos, "SHARE", 0.01)  # less than a step for each photo
+    assert "no last part with the held-out photos: it would have less" in run(*command).out
+    before = (out / f"{dataset.name}.ply").read_bytes()
+    evaluated = OutputFolder(out / "scene").scene_path(40)
+    assert before == evaluated.read_bytes()
+
+    monkeypatch.setattr(all_photos, "SHARE", 1.0)
+    (out / f"{dataset.name}.ply").unlink()  # both stages that write it are repeated
+    result = run(*command, "--title", "A <title>")
+    assert result.code == 0, result.err
+    views = len(list((dataset / "images").iterdir()))
+    assert f"40 more steps with all {views} photos" in result.out
+    assert f"before the last part, which has used all {views} photos" in result.out
+    metrics = json.loads((out / "scene/metrics.json").read_text())
+    assert f"PSNR {metrics['psnr']:.2f} dB" in result.out
+    scene = scene_file(out)
+    assert scene == out / f"{dataset.name}.ply"
+    assert evaluated.read_bytes() == before != scene.read_bytes()
+    assert load_viewable(out).file == scene
+    assert len(load_viewable(scene).cameras) == views
+    # The scene before is judged by photos that it has not seen; the other one reproduces them.
+    held_out = load_trained(out)
+    assert evaluate(held_out).psnr == pytest.approx(metrics["psnr"], abs=1e-4)
+    ours = evaluate_views(read_gaussians(scene), held_out.dataset.test, background=[0.0, 0.0, 0.0])
+    assert ours.psnr > metrics["psnr"] + 0.1
+    assert scene_name(out) == scene_name(out / "scene") == "A <title>"
+    assert "<h1>A &lt;title&gt;</h1>" in (out / "scene/report.html").read_text("utf-8")
+    assert run(*command).out.count("done before") == 3
+
+
+def test_no_photos_are_held_out_on_request(run, refused, dataset, tmp_path, monkeypatch):
+    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=10))
+    out = tmp_path / "out"
+    command = ("make", dataset, "-o", out, "--quality", "draft", "--threads", 1, "--hold-out")
+    for wrong in ("1", "some"):
+        assert "--hold-out" in refused(*command, wrong)
+    result = run(*command, "none")
+    assert result.code == 0, result.err
+    assert "PSNR" not in result.out
+    assert (out / f"{dataset.name}.ply").is_file()
+    assert "0 held out" in (out / "scene/report.html").read_text("utf-8")
+    assert run(*command, "none").out.count("done before") == 1
 
 
 def test_a_dataset_is_trained_with_its_poses(run, refused, dataset, tmp_path, monkeypatch):
@@ -146,7 +202,7 @@ def test_a_dataset_is_trained_with_its_poses(run, refused, dataset, tmp_path, mo
 
     again = run(*command)
     assert again.code == 0, again.err
-    assert again.out.count("done before") == 2
+    assert again.out.count("done before") == 3
 
     assert "--overwrite" in refused("make", dataset / "images", "-o", out)
     points = root / "sparse/0/points3D.bin"
@@ -220,7 +276,7 @@ def test_a_short_time_for_many_photos_uses_fewer(run, tmp_path, monkeypatch):
     assert (tmp_path / "out/many.ply").is_file()
     again = run(*command)
     assert again.code == 0, again.err
-    assert again.out.count("done before") == 6
+    assert again.out.count("done before") == 7
     assert "of 12 photos" not in again.out
 
 

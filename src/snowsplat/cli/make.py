@@ -18,6 +18,7 @@ from snowsplat.cli.page_flags import AllowHost, PageFlags
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
+from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.make import MakeResult
@@ -28,6 +29,7 @@ _RESUMED_FLAGS = (
     "output",
     "quality",
     "minutes",
+    "hold_out",
     "title",
     "exposure",
     "threads",
@@ -74,6 +76,9 @@ class Make(Reports):
     """Finish within this time. If there are too many photos for this time, some of them are used,
     evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
     counted, and its training resumes with the time that remained."""
+    hold_out: Annotated[str | None, flag("{none,N}", default="8")] = None
+    """Hold out every N-th photo until the scene is evaluated. Then the scene is trained on all
+    photos for a moment; the printed PSNR is that of the scene before."""
     title: Annotated[str | None, flag("TEXT", default="the name of the input")] = None
     """The name of the scene in its report and on its pages."""
     exposure: Annotated[
@@ -109,6 +114,7 @@ class Make(Reports):
             quality=self.quality,
             minutes=self.minutes,
             memory=self.memory,
+            hold_out=_hold_out(self.hold_out),
             title=self.title,
             exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
@@ -139,19 +145,22 @@ class Make(Reports):
         words = ["snowsplat", "make", *map(str, self.inputs)]
         for name in _RESUMED_FLAGS:
             value = getattr(self, name)
-            words += [] if value is None else [f"--{name}", str(value)]
+            words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
         words += ["--view"] if self.view else []
         print(f"resume with: {shlex.join(words)}")
         return 130
 
     def _show(self, made: MakeResult, page: LivePage) -> None:
         """Show the scene until Ctrl-C, on the page of the training if there was one."""
-        if page.has_trained:
-            with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
-                print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
-                page.show_result()
-            return
+        from snowsplat.formats import read_gaussians
         from snowsplat.pipeline.compute import Compute
+
+        if page.has_trained:
+            with suppress(KeyboardInterrupt):  # Ctrl-C may arrive before the scene is shown
+                gaussians = read_gaussians(made.scene)
+                print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
+                page.show_result(gaussians.to(Compute(self.device, self.threads).apply()))
+            return
         from snowsplat.pipeline.watch import watch
 
         with WatchObserver() as observer:
@@ -163,22 +172,48 @@ class Make(Reports):
             )
 
 
+def _hold_out(text: str | None) -> int | None:
+    """Raises UserError: the text is neither a number from 2 on nor "none"."""
+    if text is None:
+        return 8
+    if text == "none":
+        return None
+    if not text.isdecimal() or int(text) < 2:
+        raise UserError(f"--hold-out: {text!r} is not valid; use 2 or more, or none")
+    return int(text)
+
+
 def print_summary(made: MakeResult) -> None:
     """Print the files of a finished scene, its quality, and the verdict."""
-    aligned = f"colour-aligned PSNR {made.psnr_aligned:.2f} dB"
-    figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
-    if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
-        figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
     poses = made.dataset_report or f"those of {made.dataset} are used"
     print(
         f"\nThe scene, for any viewer:  {made.scene} ({format_bytes(made.scene.stat().st_size)})\n"
         f"{'Report on camera poses:' if made.dataset_report else 'Camera poses:':27} {poses}\n"
         f"Report on the training:     {made.folder.report}\n"
-        f"Rendered test views:        {made.renders}\n"
-        f" and held-out photos:       {made.photos}\n"
-        f"Quality of these views:     {figures} ({made.views} photos of {made.size})\n"
+        f"{_quality(made)}"
         f"Time:                       {duration(made.seconds)}"
     )
     if made.verdict is not None:
         print("\n" + "\n".join(made.verdict.lines("The scene")))
     sys.stdout.flush()
+
+
+def _quality(made: MakeResult) -> str:
+    """The lines about the held-out photos; "" if there are none."""
+    if made.psnr is None:
+        return ""
+    aligned = f"colour-aligned PSNR {made.psnr_aligned:.2f} dB"
+    figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
+    if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
+        figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
+    lines = [
+        f"Rendered test views:        {made.renders}",
+        f" and held-out photos:       {made.photos}",
+        f"Quality of these views:     {figures} ({made.views} photos of {made.size})",
+    ]
+    if made.all_photos:
+        lines.append(
+            f"                            before the last part, which has used all "
+            f"{made.all_photos} photos"
+        )
+    return "\n".join(lines) + "\n"

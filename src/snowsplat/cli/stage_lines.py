@@ -65,11 +65,21 @@ def _report(written: dict[str, Any]) -> list[str]:
 
 def _scene(trained: dict[str, Any]) -> list[str]:
     size = f" at {trained['size']}" if "size" in trained else ""  # earlier versions did not say it
-    return [f"{trained['iteration']} steps, PSNR {trained['psnr']:.2f} dB{size}"]
+    quality = f", PSNR {trained['psnr']:.2f} dB{size}" if "psnr" in trained else ""
+    return [f"{trained['iteration']} steps{quality}"]
 
 
 def _pictures(rendered: dict[str, Any]) -> list[str]:
     return ["test views rendered"]
+
+
+def _all(trained: dict[str, Any]) -> list[str]:
+    if not trained["steps"]:
+        return [f"no last part with the held-out photos: {trained['why_not']}"]
+    return [
+        f"{trained['steps']} more steps with all {trained['photos']} photos; the PSNR is that of "
+        "the scene before"
+    ]
 
 
 def _video(written: dict[str, Any]) -> list[str]:
@@ -96,6 +106,7 @@ _LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {
     "report": _report,
     "scene": _scene,
     "pictures": _pictures,
+    "all": _all,
     "video": _video,
     "levels": _levels,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,7 +17,7 @@ from snowsplat.evaluation.metrics import compare, evaluate_views, size_text
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
-from snowsplat.pipeline.output.scene_paths import folder_around
+from snowsplat.pipeline.output.scene_paths import folder_around, has_seen_all_photos
 from snowsplat.pipeline.output.scene_source import Color, load_viewable
 from snowsplat.pipeline.refine import photos_of
 from snowsplat.scene.camera import Camera
@@ -169,7 +169,10 @@ def _photos(scene: Path, dataset: Path | None) -> Dataset | None:
         dataset = Path(folder.settings()[0].path)
         if not dataset.is_dir():
             return None
-    return photos_of(scene, dataset)[0]
+    photos = photos_of(scene, dataset)[0]
+    if has_seen_all_photos(scene):
+        return replace(photos, train=[*photos.train, *photos.test], test=[])
+    return photos
 
 
 def _evenly(items: Sequence[_Item]) -> Sequence[_Item]:

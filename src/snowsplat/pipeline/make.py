@@ -1,4 +1,4 @@
-"""`make`: make a scene from photos or a video: camera poses, training, rendered test views.
+"""`make`: make a scene from photos or a video: camera poses, training, test views, all photos.
 
 If the input is a dataset, its camera poses are used, unless they are impossible.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,7 @@ from typing import Any
 from snowsplat import ops
 from snowsplat.data import Dataset
 from snowsplat.evaluation.verdict import Verdict
+from snowsplat.pipeline.all_photos import SHARE, train_on_all
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
@@ -29,6 +31,7 @@ from snowsplat.pipeline.output.output_folder import (
     DatasetSettings,
     OutputFolder,
 )
+from snowsplat.pipeline.output.scene_files import write_gaussians
 from snowsplat.pipeline.output.scene_paths import RECORD
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
@@ -47,7 +50,7 @@ from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
 from snowsplat.training.settings.config import AutoOnOff, TrainConfig
-from snowsplat.training.settings.declare import Settings, same
+from snowsplat.training.settings.declare import Settings, same, setting
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -55,10 +58,7 @@ from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.stages import Outcome, Stages
 
-STAGES = ("scene", "pictures")  # `make_dataset` records its own stages
-# Every 8th photo is held out, from the fifth on. The first photo of a walk is at its end: it shows
-# places that no other photo shows, so it says little about the scene.
-HOLD_OUT, FIRST_HELD_OUT = 8, 4
+STAGES = ("scene", "pictures", "all")  # `make_dataset` records its own stages
 # The fields of a preset that affect the training.
 _TRAINING_FIELDS = (
     "side",
@@ -92,6 +92,7 @@ class MakeOptions(Settings):
             Stages that an earlier run has finished are not counted. A resumed training run has the
             time that was left at its interruption.
         memory: memory limit of the training; see `TrainOptions`.
+        hold_out: hold out every N-th photo until the scene is evaluated; None: none.
         title: the name of the scene in reports and on pages; None: the name of its photos.
         exposure: whether to learn a gain for each photo and channel; see ``TrainConfig.exposure``.
         compute: device and threads.
@@ -103,6 +104,9 @@ class MakeOptions(Settings):
     quality: Quality | None = None
     minutes: float | None = option.minutes()
     memory: int | str | None = option.memory()
+    hold_out: int | None = setting(
+        8, "Hold out every N-th photo.", least=2, allowed="2 or more, or none"
+    )
     title: str | None = None
     exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
     compute: Compute = field(default_factory=Compute)
@@ -118,8 +122,11 @@ class MakeResult:
         dataset: the folder of the dataset that the scene is trained from.
         dataset_report: the HTML page about the camera poses; None if the input has poses.
         renders, photos: folders with the rendered test views and the held-out photos.
-        psnr, ssim, psnr_aligned: means over the held-out photos; PSNR in dB. If gains of exposure
-            are learnt, the colour-aligned PSNR tells the quality.
+        all_photos: the number of photos of the last part of the training, which follows the
+            evaluation and uses the held-out photos, too; 0 if there was none.
+        psnr, ssim, psnr_aligned: means over the held-out photos, before the last part; PSNR in
+            dB. If gains of exposure are learnt, the colour-aligned PSNR tells the quality. None if
+            no photos were held out.
         size: of the images of which these are the means, in pixels, as text.
         views: number of held-out photos.
         exposures: whether gains of exposure are learnt.
@@ -134,9 +141,10 @@ class MakeResult:
     dataset_report: Path | None
     renders: Path
     photos: Path
-    psnr: float
-    ssim: float
-    psnr_aligned: float
+    all_photos: int
+    psnr: float | None
+    ssim: float | None
+    psnr_aligned: float | None
     size: str
     views: int
     exposures: bool
@@ -335,17 +343,16 @@ class _Job:
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
         else:
             settings |= {"minutes": self.options.minutes}
-        settings |= {
-            "hold_out": HOLD_OUT,
-            "first_held_out": FIRST_HELD_OUT,
-            "exposure": self.options.exposure,
-        }
+        settings |= {**self._split, "exposure": self.options.exposure}
         folder = OutputFolder(self.out / SCENE)
         outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
         scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
         shutil.rmtree(folder.checkpoints, ignore_errors=True)  # no longer needed
         target = folder.path / "test" / f"ours_{scene['iteration']}"
-        self._stage("pictures", {}, [target], self._render)
+        whole: dict[str, Any] = {"steps": 0, "photos": 0}
+        if scene["views"]:
+            self._stage("pictures", {}, [target], self._render)
+            whole = self._stage("all", {}, [self.file], lambda: self._train_on_all(scene)).result
         return MakeResult(
             scene=self.file,
             folder=folder,
@@ -353,9 +360,10 @@ class _Job:
             dataset_report=None if self.given is not None else self.dataset / REPORT,
             renders=target / "renders",
             photos=target / "gt",
-            psnr=scene["psnr"],
-            ssim=scene["ssim"],
-            psnr_aligned=scene["psnr_aligned"],
+            all_photos=whole["photos"],
+            psnr=scene.get("psnr"),
+            ssim=scene.get("ssim"),
+            psnr_aligned=scene.get("psnr_aligned"),
             size=scene.get("size", "an unknown size"),
             views=scene["views"],
             exposures=scene["exposures"],
@@ -413,14 +421,15 @@ class _Job:
             self.stages.save()
             new = self._new_training(options)
             trained = train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
-        metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
         with atomic_path(self.file) as temporary:
-            shutil.copyfile(folder.scene_path(metrics["iteration"]), temporary)
-        result = {
-            key: metrics[key] for key in ("iteration", "psnr", "ssim", "psnr_aligned", "size")
-        }
+            shutil.copyfile(trained.scene, temporary)
+        self.stages.about["file"] = self.file.name
+        result: dict[str, Any] = {"iteration": trained.step, "views": 0}
+        if trained.evaluation is not None:
+            metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
+            result |= {key: metrics[key] for key in ("psnr", "ssim", "psnr_aligned", "size")}
+            result["views"] = len(metrics["views"])
         return result | {
-            "views": len(metrics["views"]),
             "exposures": (folder.path / "exposure.json").is_file(),
             "verdict": trained.verdict and trained.verdict.as_json(),
         }
@@ -430,7 +439,7 @@ class _Job:
             "leave_out_after": _LEAVE_OUT_AFTER,
             "exposure": self.options.exposure,
         }
-        options = replace(options, hold_out=HOLD_OUT, first_held_out=FIRST_HELD_OUT)
+        options = replace(options, **self._split)
         if self.options.minutes is not None:
             minutes = self._minutes_left(60.0 * self.options.minutes)
             return replace(options, minutes=minutes, settings=settings)
@@ -442,7 +451,27 @@ class _Job:
         return replace(options, resolution=_width(dataset, preset), settings=settings)
 
     def _dataset_settings(self, dataset: Path) -> DatasetSettings:
-        return DatasetSettings(str(dataset), hold_out=HOLD_OUT, first_held_out=FIRST_HELD_OUT)
+        return DatasetSettings(str(dataset), **self._split)
+
+    @property
+    def _split(self) -> dict[str, Any]:
+        """Every N-th photo is held out, from the middle of the first N on: the first photo of a
+        walk is at its end, and shows places that no other photo shows, so it says little."""
+        every = self.options.hold_out
+        return {"hold_out": every, "first_held_out": (every or 0) // 2}
+
+    def _train_on_all(self, scene: dict[str, Any]) -> dict[str, Any]:
+        """The last part; it replaces the scene file, but not the scene in the folder of the
+        training, to which the metrics belong."""
+        seconds = math.inf
+        if self.options.minutes is not None:
+            seconds = 60.0 * self.options.minutes - self._elapsed()
+        folder = OutputFolder(self.out / SCENE)
+        compute = self.options.compute
+        last = train_on_all(folder, scene["iteration"], seconds, compute, self.observer)
+        if last.gaussians is not None:
+            write_gaussians(self.file, last.gaussians)
+        return {"steps": last.steps, "photos": last.photos, "why_not": last.why_not}
 
     def _minutes_left(self, given: float) -> float:
         """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""
@@ -450,7 +479,10 @@ class _Job:
             photos = len(self.given.train) + len(self.given.test)
         else:
             photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
-        left = given - self._elapsed() - _RENDER_SECONDS * -(-photos // HOLD_OUT)
+        left = given - self._elapsed()
+        if self.options.hold_out is not None:
+            left -= _RENDER_SECONDS * -(-photos // self.options.hold_out)
+            left *= 1.0 - SHARE  # for the last part
         shortest = max(_MIN_SECONDS, _MIN_SHARE * given)
         if left < shortest:
             self.observer.note(

@@ -252,6 +252,21 @@ class OutputFolder:
         """Write `exposure.json`: the exposure of each training photo in EV, for each channel."""
         write_json(self.path / "exposure.json", {"unit": "EV", "photos": exposures})
 
+    def exposures(self) -> dict[str, list[float]]:
+        """What `write_exposure` has written; empty if no gains were learnt.
+
+        Raises:
+            UserError: the file is damaged.
+        """
+        file = self.path / "exposure.json"
+        if not file.is_file():
+            return {}
+        try:
+            photos = read_json(file)["photos"]
+            return {str(name): [float(ev) for ev in channels] for name, channels in photos.items()}
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise UserError(f"{file}: damaged; train again") from None
+
     def discard(self) -> None:
         """Remove what `begin` wrote, if there is neither a scene nor a checkpoint."""
         if self.scenes() or self.checkpoints.exists():

@@ -14,7 +14,7 @@ from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import read_json
 
-#: The record of `make` in its folder. "title": the name of the scene for people.
+#: The record of `make` in its folder. "title": the name of the scene for people; "file": its file.
 RECORD = "make.json"
 _HEAD_BYTES = 16_384
 
@@ -49,7 +49,7 @@ def scene_file(path: Path) -> Path:
     """``path`` itself if it is a file, or the scene in the folder ``path``.
 
     That is its levels of detail if it has a `lod-meta.json`, its SOG scene if it has a `meta.json`,
-    else the last scene of the training.
+    the scene of `make`, else the last scene of the training.
 
     Raises:
         UserError: a folder without a scene.
@@ -58,6 +58,8 @@ def scene_file(path: Path) -> Path:
         return path
     if index := index_in(path):
         return index
+    if made := file_of_make(path):
+        return made
     folder = training_folder(path)
     scenes = folder.scenes()
     if not scenes:
@@ -76,9 +78,26 @@ def folder_around(scene: Path) -> OutputFolder:
     made, trained = OutputFolder(scene.parent / SCENE), OutputFolder(scene.parent.parent.parent)
     if scene in map(trained.scene_path, trained.scenes()):
         return trained
+    if scene == file_of_make(scene.parent):
+        return made
     if any(filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]):
         return made
     return OutputFolder(scene)
+
+
+def file_of_make(folder: Path) -> Path | None:
+    """The scene in a folder of `make`, with its last part; None if there is none."""
+    name = _recorded(folder / RECORD, "file")
+    file = folder / Path(name).name if name else None
+    return file if file is not None and file.is_file() else None
+
+
+def has_seen_all_photos(scene: Path) -> bool:
+    """Whether a scene file is that of `make` after its last part: no photo can judge it."""
+    made = OutputFolder(scene.parent / SCENE)
+    return scene == file_of_make(scene.parent) and not any(
+        filecmp.cmp(scene, made.scene_path(i), shallow=False) for i in made.scenes()[-1:]
+    )
 
 
 def folder_of_make(path: Path) -> Path:
@@ -91,14 +110,13 @@ def scene_name(scene: Path) -> str:
     """The name of a scene: the title that `make` has recorded; else the name of the folder, or of
     the file without suffixes."""
     scene = scene.resolve()
-    record = folder_of_make(scene) / RECORD
-    title = _recorded_title(record) if record.is_file() else None
+    title = _recorded(folder_of_make(scene) / RECORD, "title")
     return title or scene.name.split(".")[0] or scene.name
 
 
-def _recorded_title(record: Path) -> str | None:
+def _recorded(record: Path, key: str) -> str | None:
     try:
-        title = read_json(record).get("title")
+        value = read_json(record).get(key) if record.is_file() else None
     except (OSError, ValueError, AttributeError):
         return None
-    return title if isinstance(title, str) else None
+    return value if isinstance(value, str) else None

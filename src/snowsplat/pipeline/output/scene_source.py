@@ -11,6 +11,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_paths import (
     existing_folder,
+    file_of_make,
     folder_around,
     index_in,
     training_folder,
@@ -127,6 +128,8 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
     if not path.exists():
         raise UserError(f"{path}: no such file or folder")
     path = index_in(path) or path
+    if iteration is None and path.is_dir():
+        path = file_of_make(path) or path
     if path.is_dir():
         folder = training_folder(path)
         found, gaussians = folder.read_scene(iteration)

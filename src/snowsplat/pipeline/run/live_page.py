@@ -127,12 +127,13 @@ class LivePage:
         """Whether the page shows a training run."""
         return self._training is not None
 
-    def show_result(self) -> None:
-        """Show the scene of the finished training run until Ctrl-C."""
+    def show_result(self, gaussians: Gaussians | None = None) -> None:
+        """Show a scene until Ctrl-C: by default, that of the finished training run."""
         assert self._training is not None
         assert self._trainer is not None
         with suppress(KeyboardInterrupt):
-            self._training.show(self._trainer.step, self._trainer.gaussians)
+            shown = self._trainer.gaussians if gaussians is None else gaussians
+            self._training.show(self._trainer.step, shown)
 
     def show(self, scene: Callable[[], Scene]) -> None:
         """Show the newest scene until Ctrl-C. ``scene`` returns it, and is called repeatedly."""

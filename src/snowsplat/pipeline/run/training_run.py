@@ -383,6 +383,7 @@ class TrainingRun:
                     "training": config_to_json(self.config),
                 },
                 peak_bytes=peak_bytes(),
+                of_make=folder != out,
             ),
         )
         return self.out.report

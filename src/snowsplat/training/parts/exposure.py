@@ -86,7 +86,21 @@ class Exposure(Part):
         self._mean = torch.zeros_like(self.log_gains)  # the moments of Adam
         self._square = torch.zeros_like(self.log_gains)
         self._updates = torch.zeros(len(views), dtype=torch.int64)
+        self._middle = torch.zeros_like(self.log_gains[0])  # the mean of the gains
         run.photos = NeutralPhotos(run.images, views, self.start)
+
+    def continue_with(self, ev: Tensor) -> None:
+        """Set the exposures of the first photos: the scene has been trained with these.
+
+        The gains of the others keep their difference to those of the first photos.
+
+        Args:
+            ev: (N, 3) in EV, see `ev`.
+        """
+        known = (math.log(2.0) / GAMMA * ev).to(self.log_gains)
+        self.log_gains += (known - self.log_gains[: len(known)]).mean(0)
+        self.log_gains[: len(known)] = known
+        self._middle = self.log_gains.mean(0)
 
     @property
     def ev(self) -> Tensor:
@@ -126,7 +140,7 @@ class Exposure(Part):
         rate = _RATE * (_LAST_RATE / _RATE) ** (step / run.schedule.iterations)
         for position, view in enumerate(batch):  # in each round, process r has view r
             self._update(view.index, table[position % size, position // size], rate)
-        self.log_gains -= self.log_gains.mean(0)
+        self.log_gains -= self.log_gains.mean(0) - self._middle
 
     def _update(self, i: int, gradient: Tensor, rate: float) -> None:
         gain, (b1, b2) = self.log_gains[i], _BETAS

@@ -71,6 +71,7 @@ class Trained:
     doubts: tuple[str, ...] = ()
     verdict: Verdict | None = None  # the verdict on the scene; None if no photos were held out
     peak_bytes: int = 0  # peak memory; 0 if unknown
+    of_make: bool = False  # whether `make` trains the scene
 
 
 def write_training_report(path: Path, trained: Trained) -> None:
@@ -117,6 +118,11 @@ def _headline(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
     photos = f"{count} photo" if count == 1 else f"{count} photos"
     if held_out:
         how = f"Evaluated on {photos} of {evaluation.size} that were not used for training."
+        if trained.of_make:
+            how += (
+                " If there is time, make ends with a short training on all photos; all figures are "
+                "those of the scene before."
+            )
     else:
         how = (
             f"No photos were held out: these are the metrics of {photos} of {evaluation.size} used "

@@ -1,0 +1,165 @@
+"""The last part of `make`: after the evaluation, the scene is trained on the held-out photos, too.
+
+It continues the training for a moment with fixed Gaussians, at the learning rates of its end and
+somewhat above. The metrics remain those of the scene before: afterwards, no photo can judge it. See
+docs/measurements/2026-11-26-all-photos.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+
+from snowsplat.data import ImageLoader
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_source import load_trained
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.training.core.history import History
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.unexplained import unexplained_views
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.rates import DecayRates
+from snowsplat.training.settings.stored import config_from_json
+from snowsplat.util.safe_json import read_json
+
+#: The steps, relative to those of the training.
+SHARE = 0.12
+# The learning rates decrease from so many times those of the end of the training to these.
+_FASTER = 6.0
+# The speed of the last so many stretches of the history is that of the last part.
+_LAST_STRETCHES = 10
+
+
+@dataclass(frozen=True)
+class LastPart:
+    """The result of `train_on_all`.
+
+    Attributes:
+        gaussians: the scene; None if there was no last part.
+        steps, photos: numbers of steps and of photos.
+        why_not: why there was no last part; "" if there was one.
+    """
+
+    gaussians: Gaussians | None
+    steps: int
+    photos: int
+    why_not: str = ""
+
+
+def train_on_all(
+    folder: OutputFolder, iteration: int, seconds: float, compute: Compute, observer: Observer
+) -> LastPart:
+    """Continue a finished training with all photos; writes nothing.
+
+    Photos that the training has left out remain so, and so do held-out photos that the scene does
+    not explain. There is no last part if something moves in the photos, because it is not known in
+    the held-out ones, or if there is no time for one step for each photo.
+
+    Args:
+        folder: of the training run.
+        iteration: of the scene to begin with.
+        seconds: the time that is left; infinite if there is no limit.
+
+    Raises:
+        UserError: scene, settings, dataset or a photo are missing or damaged.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    if (folder.path / "masks").is_dir():
+        return LastPart(None, 0, 0, "something moves in the photos")
+    scene = load_trained(folder.path, iteration=iteration, compute=compute)
+    left_out = set(read_json(folder.path / "metrics.json").get("left_out", []))
+    used = [view for view in scene.dataset.train if view.name not in left_out]
+    views = [*used, *scene.dataset.test]
+    background = torch.tensor(scene.background, device=scene.gaussians.means.device)
+    with ImageLoader(views, device=background.device) as images:
+        wrong = unexplained_views(
+            scene.gaussians,
+            views,
+            images,
+            background=background,
+            sh_degree=scene.gaussians.sh_degree,
+        )
+    views = [view for i, view in enumerate(views) if i < len(used) or i not in wrong]
+    steps = round(SHARE * iteration)
+    if math.isfinite(seconds):
+        last = History.read(folder.history, iteration).stretches[-_LAST_STRETCHES:]
+        pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
+        steps = min(steps, int(seconds / pace)) if pace > 0 else 0
+    if steps < len(views):
+        return LastPart(None, 0, 0, "it would have less than one step for each photo")
+    exposures = folder.exposures()
+    config = _last_config(
+        config_from_json(read_json(folder.path / "config.json")["training"]),
+        scene.gaussians,
+        (iteration, steps),
+        (scene.dataset.extent, len(scene.dataset.train)),
+        exposures=bool(exposures),
+    )
+    trainer = Trainer(
+        replace(scene.dataset, train=views, test=[]),
+        config,
+        device=background.device,
+        initial=scene.gaussians.clone(),
+    )
+    exposure = trainer.part(Exposure)
+    if exposure is not None:
+        exposure.continue_with(torch.tensor([exposures[view.name] for view in used]))
+    observer.steps_begin(0, steps)
+    try:
+        trainer.run(observer.step)
+    finally:
+        observer.steps_end()
+    return LastPart(trainer.gaussians.detach(), steps, len(views))
+
+
+def _last_config(
+    config: TrainConfig,
+    gaussians: Gaussians,
+    steps: tuple[int, int],
+    scene: tuple[float, int],
+    *,
+    exposures: bool,
+) -> TrainConfig:
+    """The configuration of the last part.
+
+    Args:
+        config: that of the training.
+        steps: those of the training, and those of the last part.
+        scene: the extent, and the number of training photos.
+        exposures: whether gains of exposure are learnt.
+    """
+    iterations, last = steps
+    extent, views = scene
+    ends = config.learning_rates.at(iterations, Schedule(iterations), extent, views)
+    ends["means"] /= extent
+    rates = replace(
+        config.learning_rates,
+        **{name: _FASTER * rate for name, rate in ends.items()},
+        means_final=ends["means"],
+        means_steps=1.0,
+        sh_rest_passes=0.0,
+        anneal=1.0 / _FASTER,
+        anneal_from=0.0,
+    )
+    return replace(
+        config,
+        iterations=last,
+        learning_rates=rates,
+        density=replace(config.density, densify_until=0, max_gaussians=max(1, len(gaussians))),
+        gaussians_per_pixel=0.0,
+        decay=DecayRates(),
+        exposure="on" if exposures else "off",
+        sh_interval=0,
+        coarse_to_fine=(0, 0),
+        test_iterations=(),
+        leave_out_after=0,
+        transients="off",
+        stop_overfitting=False,
+        sky=False,
+    )

@@ -1,0 +1,97 @@
+"""The last part of `make`: its learning rates, the gains of exposure, and when there is none."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from snowsplat.data import load_dataset
+from snowsplat.pipeline import all_photos
+from snowsplat.pipeline.all_photos import train_on_all
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.observer import SILENT
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.core.history import History
+from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.settings.recipes import recipe
+
+CONFIG = recipe("default", iterations=100, init="points", max_gaussians=300, exposure="on")
+
+
+@pytest.fixture
+def trained(tmp_path) -> OutputFolder:
+    """A folder as after 100 steps, with the points of the dataset as its scene."""
+    root = write_toy_dataset(tmp_path / "data", "colmap-bin", 9, 48, 36, n_points=300)
+    dataset = load_dataset(root, hold_out=4)
+    folder = OutputFolder(tmp_path / "out")
+    folder.begin(dataset, DatasetSettings(str(root), hold_out=4), CONFIG)
+    folder.write_scene(100, Gaussians.from_points(dataset.points))
+    left_out = {"left_out": [dataset.train[0].name]}
+    (folder.path / "metrics.json").write_text(json.dumps(left_out), encoding="utf-8")
+    history = History()
+    for step in range(1, 101):
+        history.step_ends(step, 0.1, 300)
+    history.write(folder.history)
+    names = [view.name for view in dataset.train]
+    folder.write_exposure({name: [0.1 * i, 0.0, -0.1] for i, name in enumerate(names)})
+    return folder
+
+
+def test_it_continues_where_the_training_has_ended(trained, monkeypatch):
+    """Rates fall to those of the end, no Gaussian is added, photos left out remain so, and known
+    exposures are kept."""
+    trainers = []
+
+    def remember(*arguments, **options):
+        trainers.append(Trainer(*arguments, **options))
+        trainers[-1].before = trainers[-1].part(Exposure).ev.clone()
+        trainers[-1].run = lambda on_progress: None
+        return trainers[-1]
+
+    ended = Trainer(load_dataset(trained.settings()[0].path, hold_out=4), CONFIG)
+    monkeypatch.setattr(all_photos, "Trainer", remember)
+    part = train_on_all(trained, 100, math.inf, Compute("cpu", 1), SILENT)
+    (trainer,) = trainers
+    assert (part.steps, part.photos, part.why_not) == (12, 8, "")
+    names = [view.name for view in trainer.dataset.train]
+    assert sorted(names) == sorted(
+        view.name for view in (*ended.dataset.train[1:], *ended.dataset.test)
+    )
+    end, last = ended.optimizer.rates_at(100), trainer.optimizer.rates_at(12)
+    assert last == pytest.approx(end)
+    first = trainer.optimizer.rates.at(0, Schedule(12), trainer.dataset.extent)
+    assert first == pytest.approx({name: 6.0 * rate for name, rate in end.items()})
+    known = trained.exposures()
+    exposure = trainer.part(Exposure)
+    for i, name in enumerate(names):
+        if name in known:
+            assert exposure.ev[i].tolist() == pytest.approx(known[name], abs=1e-5)
+    others = [i for i, name in enumerate(names) if name not in known]
+    moved = exposure.ev - trainer.before
+    kept = [i for i in range(len(names)) if i not in others]
+    assert torch.allclose(moved[others], moved[kept].mean(0).expand(len(others), 3), atol=1e-5)
+
+
+def test_the_mean_of_the_exposures_stays_where_it_is(trained):
+    dataset = load_dataset(trained.settings()[0].path)
+    trainer = Trainer(dataset, replace(CONFIG, iterations=3))
+    exposure = trainer.part(Exposure)
+    exposure.continue_with(torch.full((6, 3), 0.5))
+    before = exposure.ev.mean(0)
+    assert before.abs().min() > 0.1
+    trainer.run()
+    assert torch.allclose(exposure.ev.mean(0), before, atol=1e-5)
+
+
+def test_when_there_is_no_last_part(trained):
+    compute = Compute("cpu", 1)
+    assert "less than one step" in train_on_all(trained, 100, 1e-9, compute, SILENT).why_not
+    Path(trained.path / "masks").mkdir()
+    assert "moves" in train_on_all(trained, 100, math.inf, compute, SILENT).why_not
