@@ -144,8 +144,8 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=40))
     out = tmp_path / "out"
     command = ("make", dataset, "-o", out, "--quality", "draft", "--threads", 1)
-    monkeypatch.setattr(all_photos, "SHARE", 0.01)  # less than a step for each photo
-    assert "no last part with the held-out photos: it would have less" in run(*command).out
+    monkeypatch.setattr(all_photos, "SHARE", 0.01)  # fewer than two steps for each photo
+    assert "no last part with the held-out photos: it would use each" in run(*command).out
     before = (out / f"{dataset.name}.ply").read_bytes()
     evaluated = OutputFolder(out / "scene").scene_path(40)
     assert before == evaluated.read_bytes()

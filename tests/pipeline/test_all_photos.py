@@ -92,6 +92,6 @@ def test_the_mean_of_the_exposures_stays_where_it_is(trained):
 
 def test_when_there_is_no_last_part(trained):
     compute = Compute("cpu", 1)
-    assert "less than one step" in train_on_all(trained, 100, 1e-9, compute, SILENT).why_not
+    assert "less than twice" in train_on_all(trained, 100, 1e-9, compute, SILENT).why_not
     Path(trained.path / "masks").mkdir()
     assert "moves" in train_on_all(trained, 100, math.inf, compute, SILENT).why_not
