@@ -22,21 +22,21 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.settings.recipes import recipe
 
-CONFIG = recipe("default", iterations=100, init="points", max_gaussians=300, exposure="on")
+CONFIG = recipe("default", iterations=200, init="points", max_gaussians=300, exposure="on")
 
 
 @pytest.fixture
 def trained(tmp_path) -> OutputFolder:
-    """A folder as after 100 steps, with the points of the dataset as its scene."""
+    """A folder as after 200 steps, with the points of the dataset as its scene."""
     root = write_toy_dataset(tmp_path / "data", "colmap-bin", 9, 48, 36, n_points=300)
     dataset = load_dataset(root, hold_out=4)
     folder = OutputFolder(tmp_path / "out")
     folder.begin(dataset, DatasetSettings(str(root), hold_out=4), CONFIG)
-    folder.write_scene(100, Gaussians.from_points(dataset.points))
+    folder.write_scene(200, Gaussians.from_points(dataset.points))
     left_out = {"left_out": [dataset.train[0].name]}
     (folder.path / "metrics.json").write_text(json.dumps(left_out), encoding="utf-8")
     history = History()
-    for step in range(1, 101):
+    for step in range(1, 201):
         history.step_ends(step, 0.1, 300)
     history.write(folder.history)
     names = [view.name for view in dataset.train]
@@ -57,16 +57,16 @@ def test_it_continues_where_the_training_has_ended(trained, monkeypatch):
 
     ended = Trainer(load_dataset(trained.settings()[0].path, hold_out=4), CONFIG)
     monkeypatch.setattr(all_photos, "Trainer", remember)
-    part = train_on_all(trained, 100, math.inf, Compute("cpu", 1), SILENT)
+    part = train_on_all(trained, 200, math.inf, Compute("cpu", 1), SILENT)
     (trainer,) = trainers
-    assert (part.steps, part.photos, part.why_not) == (12, 8, "")
+    assert (part.steps, part.photos, part.why_not) == (24, 8, "")
     names = [view.name for view in trainer.dataset.train]
     assert sorted(names) == sorted(
         view.name for view in (*ended.dataset.train[1:], *ended.dataset.test)
     )
-    end, last = ended.optimizer.rates_at(100), trainer.optimizer.rates_at(12)
+    end, last = ended.optimizer.rates_at(200), trainer.optimizer.rates_at(24)
     assert last == pytest.approx(end)
-    first = trainer.optimizer.rates.at(0, Schedule(12), trainer.dataset.extent)
+    first = trainer.optimizer.rates.at(0, Schedule(24), trainer.dataset.extent)
     assert first == pytest.approx({name: 6.0 * rate for name, rate in end.items()})
     known = trained.exposures()
     exposure = trainer.part(Exposure)
@@ -92,6 +92,6 @@ def test_the_mean_of_the_exposures_stays_where_it_is(trained):
 
 def test_when_there_is_no_last_part(trained):
     compute = Compute("cpu", 1)
-    assert "less than one step" in train_on_all(trained, 100, 1e-9, compute, SILENT).why_not
+    assert "less than twice" in train_on_all(trained, 200, 1e-9, compute, SILENT).why_not
     Path(trained.path / "masks").mkdir()
-    assert "moves" in train_on_all(trained, 100, math.inf, compute, SILENT).why_not
+    assert "moves" in train_on_all(trained, 200, math.inf, compute, SILENT).why_not

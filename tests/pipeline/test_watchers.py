@@ -69,6 +69,8 @@ class Watcher(Observer):
 class Watched(Observer):
     """Starts a watcher after step 5, and waits a little in each step until it has left."""
 
+    kind: type[Watcher] = Watcher
+
     def __init__(self, out: Path) -> None:
         self.out, self.steps = out, [0]
         self.watcher: Watcher | None = None
@@ -79,7 +81,7 @@ class Watched(Observer):
             folder = self.out / FOLDER
             self.mode = stat.S_IMODE(folder.stat().st_mode)
             assert stat.S_ISSOCK((folder / "socket").stat().st_mode)
-            self.watcher = Watcher(self.out, self.steps)
+            self.watcher = self.kind(self.out, self.steps)
         if self.watcher is not None:
             self.watcher.done.wait(2.0 if progress.step < 20 else 0.0)
 
@@ -103,6 +105,28 @@ def test_a_watcher_steers_a_training_without_a_page(dataset, tmp_path):
     train(dataset, plain, OPTIONS)
     name = "point_cloud/iteration_30/point_cloud.ply"
     assert (out / name).read_bytes() == (plain / name).read_bytes()
+
+
+class Looks(Watcher):
+    """Leaves at once, without steering."""
+
+    def page_opened(self, page) -> None:
+        self.url = page.url
+        raise KeyboardInterrupt
+
+
+def test_a_training_with_a_page_shows_it_and_keeps_it(dataset, tmp_path):
+    class Starts(Watched):
+        kind = Looks
+
+    seen = Starts(tmp_path / "out")
+    with LivePage() as page:
+        train(dataset, tmp_path / "out", OPTIONS, observer=seen, page=page)
+        assert seen.watcher is not None
+        assert seen.watcher.done.wait(30)
+        assert seen.watcher.failure is None
+        assert seen.watcher.url == page.url
+        assert status_of(page.url) == 200
 
 
 class Shown(Exception):

@@ -421,6 +421,23 @@ def test_the_limit_follows_the_size_of_the_photos():
     assert explicit.capped(1000, 400).density.max_gaussians == 200_000
     assert recipe("paper").capped(1000, 40).density.max_gaussians == 0
     assert recipe("default").capped(1, 40).density.max_gaussians == 1
+
+
+def test_few_passes_have_more_steps_with_small_images():
+    config = recipe("default")
+    assert config.lengthened(50) == config
+    assert config.staged(50) == replace(config, few_passes=0.0)
+    many = config.lengthened(250)
+    assert many.iterations == 2500
+    staged = many.staged(250)
+    assert staged.coarse_to_fine == pytest.approx((0.2, 0.5))
+    assert staged.staged(1000) == staged  # it is final
+    assert config.coarse_to_fine < config.capped(10**6, 130).coarse_to_fine < (0.2, 0.5)
+    given = recipe("default", coarse_to_fine=(0.3, 100))
+    assert given.lengthened(250).staged(250) == given
+    assert recipe("classic").lengthened(250) == recipe("classic")
+    of_steps = recipe("default", coarse_to_fine=(10, 0.5), few_passes=20.0)
+    assert of_steps.staged(250).coarse_to_fine == pytest.approx((10, 0.6))
     per_pixel = replace(recipe("paper"), gaussians_per_pixel=0.5)
     assert per_pixel.capped(99, 400).density.max_gaussians == 50
 

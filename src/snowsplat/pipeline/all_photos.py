@@ -30,6 +30,8 @@ from snowsplat.util.safe_json import read_json
 
 #: The steps, relative to those of the training.
 SHARE = 0.12
+#: The fewest steps for each photo.
+_LOOKS = 2
 # The learning rates decrease from so many times those of the end of the training to these.
 _FASTER = 6.0
 # The speed of the last so many stretches of the history is that of the last part.
@@ -59,7 +61,8 @@ def train_on_all(
 
     Photos that the training has left out remain so, and so do held-out photos that the scene does
     not explain. There is no last part if something moves in the photos, because it is not known in
-    the held-out ones, or if there is no time for one step for each photo.
+    the held-out ones, or if there are fewer than `_LOOKS` steps for each photo: with many photos,
+    or little time, the last part would change little.
 
     Args:
         folder: of the training run.
@@ -81,8 +84,8 @@ def train_on_all(
         last = History.read(folder.history, iteration).stretches[-_LAST_STRETCHES:]
         pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
         steps = min(steps, int(seconds / pace)) if pace > 0 else 0
-    if steps < len(views):
-        return LastPart(None, 0, 0, "it would have less than one step for each photo")
+    if steps < _LOOKS * len(views):
+        return LastPart(None, 0, 0, "it would use each photo less than twice")
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
     with ImageLoader(views, device=background.device) as images:
         wrong = unexplained_views(

@@ -51,6 +51,7 @@ from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
 from snowsplat.training.settings.config import AutoOnOff, TrainConfig
 from snowsplat.training.settings.declare import Settings, same, setting
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
@@ -445,6 +446,8 @@ class _Job:
         preset = PRESETS[self.plan.quality]
         settings |= {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
         dataset = self.given or self._dataset_settings(self.dataset).load()
+        config = recipe(options.recipe or "default", **settings).lengthened(len(dataset.train))
+        settings["iterations"] = config.iterations
         return replace(options, resolution=_width(dataset, preset), settings=settings)
 
     def _dataset_settings(self, dataset: Path) -> DatasetSettings:

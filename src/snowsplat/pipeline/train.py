@@ -273,6 +273,8 @@ class _Job:
         self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
         check_test_photos(dataset.test)
         plan = None
+        if budget is None and options.iterations is None:
+            config = config.lengthened(len(dataset.train))
         if budget is not None:
             plan = budget.plan(
                 dataset,

@@ -141,6 +141,18 @@ def test_a_right_lens_is_kept_as_it_is(tmp_path):
     assert found.model is model
 
 
+def test_a_panorama_is_kept_as_it_is(tmp_path):
+    """It has no focal length; COLMAP ends the process if it is asked for one."""
+    walk = walks.sideways()
+    (model,), _ = mapped(tmp_path, walk, None, Lens())
+    camera = model.cameras[1]
+    camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
+    camera.params = [camera.width, camera.height]
+    found = settled(model, walk.photos(None), Lens(), refine=None)
+    assert found.model is model
+    assert (found.held, found.notes) == (False, [])
+
+
 def test_an_impossible_lens_is_replaced(tmp_path):
     """Pixels that are not square, and a distortion that no lens has."""
     walk = walks.forward()

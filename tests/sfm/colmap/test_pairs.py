@@ -1,8 +1,11 @@
 """The pairs that are matched, for each kind of input."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from snowsplat.sfm.colmap.database import Pair
 from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.colmap.pairs import choose_pairs
 from snowsplat.sfm.ingest.photo import Photo
@@ -81,18 +84,45 @@ def test_photos_at_a_stored_position_need_similar_photos():
     places = [(52.0, 4.0 + 1e-4 * max(0, i - 100), 0.0) for i in range(200)]
     photos = [photo(i, location=place) for i, place in enumerate(places)]
     similar = ring(200, 200)
-    chosen = set(choose_pairs(photos, EFFORT, lambda: similar).pairs)
+    chosen = set(choose_pairs(photos, EFFORT, lambda: similar).whole().pairs)
     assert all((i, i + step) in chosen for i in range(80) for step in range(1, 11))
 
 
 def test_many_photos_are_matched_with_similar_ones():
     count = 200
     choice = choose_pairs([photo(i) for i in range(count)], EFFORT, lambda: ring(count, count))
-    partners = {j for i, j in choice.pairs if i == 50} | {i for i, j in choice.pairs if j == 50}
-    assert partners >= set(range(40, 61)) - {50}
-    assert len(choice.pairs) < 20 * count
+    assert set(range(47, 54)) - {50} <= partners(choice.pairs, 50)  # the most similar ones
+    assert max(partners(choice.pairs, 50)) >= 59  # and some at a distance
+    assert len(choice.pairs) < 12 * count
     assert choice.pairs == sorted(set(choice.pairs))
     assert "similar" in choice.description
+    assert f"{len(choice.pairs)} pairs" in choice.description
+    every = choice.whole()
+    assert partners(every.pairs, 50) >= set(range(40, 61)) - {50}
+    assert len(every.pairs) == len(choice.pairs) + len(choice.reserve)
+    assert not every.reserve
+
+
+def partners(pairs, photo):
+    return {j for i, j in pairs if i == photo} | {i for i, j in pairs if j == photo}
+
+
+def test_the_reserve_is_for_photos_with_few_matches():
+    photos = [photo(i) for i in range(200)]
+    choice = choose_pairs(photos, EFFORT, lambda: ring(200, 200))
+    clear = [Pair(i, j, 200, False) for i, j in choice.pairs]
+    assert choice.completed(clear, 200).pairs == choice.pairs
+    weak = [dataclasses.replace(p, inliers=20) if 50 in (p.first, p.second) else p for p in clear]
+    completed = choice.completed(weak, 200).pairs
+    assert partners(completed, 50) == partners(choice.whole().pairs, 50)
+    assert set(completed) - set(choice.pairs) == {pair for pair in choice.reserve if 50 in pair}
+
+
+def test_the_whole_reserve_is_needed_between_two_groups():
+    photos = [photo(i) for i in range(200)]
+    choice = choose_pairs(photos, EFFORT, lambda: ring(200, 200))
+    within = [Pair(i, j, 200, False) for i, j in choice.pairs if (i < 100) == (j < 100)]
+    assert choice.completed(within, 200).pairs == choice.whole().pairs
 
 
 def test_numbered_photos_are_matched_with_the_next_photos_by_name():

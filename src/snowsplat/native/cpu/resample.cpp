@@ -23,6 +23,7 @@ constexpr int kCapacity = 4096;           // pixels of the buffer; at least the 
 constexpr int kTaps = 4;                  // pixels of a spline, along each axis
 constexpr int kChannels = 4;              // of the buffer
 constexpr int kSpline = kTaps * kChannels;
+constexpr int kLine = 64;     // bytes of the cache
 constexpr int kOverrun = 64;  // numbers behind the buffers that whole vectors may read or write
 
 // For each phase the weights of the pixels −1, 0, 1, 2, each repeated for all channels.
@@ -165,6 +166,9 @@ class Resampler {
     const uint8_t* channel[kChannels];
     for (int c = 0; c < kChannels; c++)
       channel[c] = p_.source + std::min<int64_t>(c, p_.channels - 1) * plane + row * width;
+    // The next tile begins here. Its part of a row is too short for the prefetcher of the processor.
+    for (int c = 0; c < p_.channels; c++)
+      for (int i = 0; i <= kColumns; i += kLine) __builtin_prefetch(channel[c] + left + count + i);
     const auto pixel = [&](int64_t x) {
       return uint32_t(channel[0][x]) | uint32_t(channel[1][x]) << 8 |
              uint32_t(channel[2][x]) << 16 | uint32_t(channel[3][x]) << 24;

@@ -376,8 +376,10 @@ def _with_square_pixels(
     unequal = {}
     for number in _used(model):
         camera = model.cameras[number]
-        ratio = camera.focal_length_x / camera.focal_length_y
-        if lens.model == "auto" and camera.model_name == "OPENCV" and abs(ratio - 1) > _SQUARE:
+        # A panorama has no focal length: to ask for one ends the process.
+        if lens.model != "auto" or camera.model_name != "OPENCV":
+            continue
+        if abs(camera.focal_length_x / camera.focal_length_y - 1) > _SQUARE:
             unequal[number] = _converted(camera, "RADIAL")
     if not unequal:
         return model

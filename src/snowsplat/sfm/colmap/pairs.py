@@ -11,19 +11,26 @@
                          usually taken directly after it
 
 If several rules apply, all of them are used, so that all photos are connected by pairs.
+
+If a photo has many similar ones, most of their pairs connect the same points again. So a photo is
+first matched with about half of them: with the most similar ones, and with others at growing
+distances in the order of similarity, which connect it to other parts of the scene. The other half
+is the reserve, for photos of which few pairs have enough matches (`completed`).
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from snowsplat.sfm.colmap.database import Pair
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.colmap.retrieval import nearest
 from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
@@ -37,15 +44,56 @@ _LOOP_SHARE = 0.4
 _NUMBERED_SHARE = 0.5
 _NUMBERED_NAME = re.compile(r"(.*?)([0-9]+)\.[^./]*")
 
+# Of the similar photos of a photo, this number of the most similar ones is matched first, and then
+# those whose place in the order grows by this factor.
+_MOST_SIMILAR, _STEP = 6, 1.25
+# A pair with at least this number of verified matches connects two photos well. A photo with at
+# least this number of such pairs needs no reserve.
+_CLEAR_MATCHES, _CLEAR_PAIRS = 50, 8
+
 Pairs = set[tuple[int, int]]
 
 
 @dataclass(frozen=True)
 class PairChoice:
-    """Sorted pairs (i < j) of indices in the list of photos, and the rules that chose them."""
+    """Pairs (i < j) of indices in the list of photos, and the rules that chose them, as text.
+
+    Attributes:
+        pairs: sorted, those to match.
+        reserve: sorted, further pairs, which are only needed by photos with few matches.
+    """
 
     pairs: list[tuple[int, int]]
-    description: str
+    rules: str
+    reserve: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def description(self) -> str:
+        """The rules and the number of pairs, as text for users."""
+        return f"{self.rules} ({len(self.pairs)} pairs)"
+
+    def completed(self, verified: Sequence[Pair], count: int) -> PairChoice:
+        """This choice, with those pairs of the reserve that are needed.
+
+        These are all pairs of photos that are not well connected; and all pairs, if there are
+        several groups of photos without a connection: any pair may be the one between them.
+
+        Args:
+            verified: the pairs with verified matches.
+            count: number of photos.
+        """
+        clear = [(p.first, p.second) for p in verified if p.inliers >= _CLEAR_MATCHES]
+        partners = np.bincount(np.array(clear, np.int64).ravel(), minlength=count)
+        weak = partners < _CLEAR_PAIRS
+        if _connected(clear):
+            needed = [(i, j) for i, j in self.reserve if weak[i] or weak[j]]
+        else:
+            needed = self.reserve
+        return PairChoice(sorted({*self.pairs, *needed}), self.rules)
+
+    def whole(self) -> PairChoice:
+        """This choice, with all pairs of the reserve."""
+        return PairChoice(sorted({*self.pairs, *self.reserve}), self.rules)
 
 
 def choose_pairs(
@@ -59,7 +107,7 @@ def choose_pairs(
     count = len(photos)
     if count <= effort.exhaustive:
         every = list(itertools.combinations(range(count), 2))
-        return PairChoice(every, f"all pairs of photos ({len(every)} pairs)")
+        return PairChoice(every, "all pairs of photos")
     pairs: Pairs = set()
     rules = []
     sequences = _sequences(photos)
@@ -78,10 +126,38 @@ def choose_pairs(
         pairs |= near
         rules.append("photos with the nearest photos by GPS")
     covered = located == count or sum(map(len, sequences)) == count
-    share = _LOOP_SHARE if covered else 1.0
-    pairs |= _similar_pairs(photos, similarity(), round(share * effort.neighbours), effort.overlap)
+    alike = _unlike_next_frames(photos, similarity(), effort.overlap)
     rules.append("photos with similar photos")
-    return PairChoice(sorted(pairs), f"{', '.join(rules)} ({len(pairs)} pairs)")
+    if covered:
+        pairs |= nearest(alike, range(round(_LOOP_SHARE * effort.neighbours)))
+        return PairChoice(sorted(pairs), ", ".join(rules))
+    places = range(effort.neighbours)
+    pairs |= nearest(alike, _growing(places))
+    reserve = nearest(alike, places) - pairs
+    return PairChoice(sorted(pairs), ", ".join(rules), sorted(reserve))
+
+
+def _growing(places: range) -> list[int]:
+    """Some places in an order: the first ones, then at growing distances."""
+    chosen = list(places[:_MOST_SIMILAR])
+    while chosen and (place := math.ceil(_STEP * (chosen[-1] + 1)) - 1) in places:
+        chosen.append(place)
+    return chosen
+
+
+def _connected(pairs: Sequence[tuple[int, int]]) -> bool:
+    """Whether the photos of ``pairs`` are one group."""
+    partners: dict[int, set[int]] = {}
+    for i, j in pairs:
+        partners.setdefault(i, set()).add(j)
+        partners.setdefault(j, set()).add(i)
+    left = list(partners)[:1]
+    found = set(left)
+    while left:
+        new = partners[left.pop()] - found
+        found |= new
+        left += new
+    return len(found) == len(partners)
 
 
 def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
@@ -126,9 +202,9 @@ def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
     return following(sequence, steps)
 
 
-def _similar_pairs(
-    photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], count: int, overlap: int
-) -> Pairs:
+def _unlike_next_frames(
+    photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], overlap: int
+) -> NDArray[np.floating[Any]]:
     # A frame is most similar to the frames directly before and after it, which are already paired
     # with it. They are excluded here; otherwise no pair would close a loop.
     similarity = similarity.copy()
@@ -136,7 +212,7 @@ def _similar_pairs(
         for position, i in enumerate(sequence):
             near = sequence[max(0, position - overlap) : position + overlap + 1]
             similarity[i, near] = -np.inf
-    return nearest(similarity, count)
+    return similarity
 
 
 def _near_pairs(photos: Sequence[Photo], neighbours: int) -> tuple[Pairs, int]:

@@ -50,6 +50,7 @@ from snowsplat.sfm.colmap.database import (
     remove_database,
     replace_database,
     set_cameras,
+    verified_pairs,
 )
 from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
@@ -204,14 +205,20 @@ class PoseEstimation:
         ``second`` is the path of the database for the attempts that have more features.
         """
         first, mapper = self.folders.database, self.options.mapper
-        matched = self._match(first, effort, effort)
+        matched = self._match(first, effort, effort, reserve=False)
         self.lens_evidence = lens_evidence(first, self.photos, matched.scale)
         lens = self._first_lens()
         self._verify(matched, lens)
+        completed = matched.choice.completed(verified_pairs(first), len(self.photos))
+        reserve, matched = matched.choice.whole(), self._with_pairs(matched, completed, lens)
         evidence = self._evidence(matched)
         if evidence.flat:
             mapper = "incremental"  # the global mapper returns a wrong depth for flat scenes
         self._try("as configured", matched, mapper, lens)
+        if not self._good(evidence) and len(reserve.pairs) > len(matched.choice.pairs):
+            matched = self._with_pairs(matched, reserve, lens)
+            evidence = self._evidence(matched)
+            self._try("with more pairs", matched, mapper, lens)
         if not self._found and evidence.flat and exif_focals(self.photos):
             lens = dataclasses.replace(lens, exif=False)
             forget_verification(first)
@@ -309,12 +316,18 @@ class PoseEstimation:
         """Whether an attempt has found poses."""
         return any(attempt.models for attempt in self.attempts)
 
-    def _match(self, database: Path, effort: Effort, pairing: Effort) -> Matched:
-        """Detect the features of ``effort``, and match the pairs of the effort ``pairing``."""
+    def _match(
+        self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
+    ) -> Matched:
+        """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
+
+        ``reserve``: whether the pairs of the reserve are matched, too.
+        """
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
         choice = choose_pairs(self.photos, pairing, self._similarity(database))
+        choice = choice.whole() if reserve else choice
         scales = [
             max(photo.width, photo.height) / detection_size(effort.image_size, photo.panorama)
             for photo in self.photos
@@ -322,6 +335,13 @@ class PoseEstimation:
         scale = max(1.0, float(np.median(scales)))
         match_pairs(database, choice.pairs, self.threads, self.progress)
         return Matched(database, effort, choice, scale)
+
+    def _with_pairs(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
+        """Match and verify those pairs of ``choice`` that are not matched yet."""
+        match_pairs(matched.database, choice.pairs, self.threads, self.progress)
+        more = dataclasses.replace(matched, choice=choice)
+        self._verify(more, lens)
+        return more
 
     def _verify(self, matched: Matched, lens: Lens) -> None:
         """Verify those matches of ``matched`` that are not verified yet.

@@ -9,7 +9,7 @@ only on the features.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,12 +46,17 @@ def similarity(descriptors: Sequence[Floats]) -> Floats:
     return alike
 
 
-def nearest(alike: Floats, count: int) -> set[tuple[int, int]]:
-    """Pairs (i < j) of each photo with the ``count`` most similar ones; ``alike`` (N, N)."""
+def nearest(alike: Floats, places: Iterable[int]) -> set[tuple[int, int]]:
+    """Pairs (i < j) of each photo with the similar ones at these places in the order of similarity.
+
+    Args:
+        alike: (N, N) similarity.
+        places: 0 is the most similar photo.
+    """
     pairs = set()
     for i, row in enumerate(alike):
-        order = np.argsort(-row, kind="stable")
-        for j in [int(j) for j in order if j != i][:count]:
+        order = [int(j) for j in np.argsort(-row, kind="stable") if j != i]
+        for j in [order[place] for place in places if place < len(order)]:
             pairs.add((min(i, j), max(i, j)))
     return pairs
 

@@ -23,6 +23,9 @@ _AVERAGING_SHARE = 0.2
 _MIN_AVERAGING_SECONDS = 3.0
 #: Minimum number of seconds between two estimates, because an estimate takes some time.
 _MIN_INTERVAL = 0.1
+#: No training run has fewer steps, even if its preparation took all of the time: they take a few
+#: seconds, and a scene after one step would be of no use.
+FEWEST_STEPS = 100
 #: The number of steps of the rest of the schedule is divided by at most this number, even if no
 #: time is left.
 _MAX_SHORTENING = 10.0
@@ -71,7 +74,7 @@ class Pace:
         self._last_estimate = now
         steps = round(self._seconds_left(now, gaussians) / self._mean(schedule, step, gaussians))
         fewest = math.ceil((1.0 - schedule.share(step)) * step / _MAX_SHORTENING)
-        return step + max(steps, fewest, 1)
+        return step + max(steps, fewest, FEWEST_STEPS - step, 1)
 
     def postpone(self, seconds: float) -> None:
         """Postpone the deadline by a pause of ``seconds`` since the last step."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from snowsplat.data.dataset import Dataset, Points, View
+from snowsplat.training.budgets.pace import FEWEST_STEPS
 from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
@@ -133,6 +134,9 @@ def make_plan(
         left = seconds - _SETUP_SECONDS - per_pixel * maps
         work = Work(sized, width * height, len(dataset.test))
         initial = initial_count(dataset, sized)
+        steps, mean = _steps(work, left, time_ratio, initial)
+        sized = replace(sized, iterations=steps).staged(len(dataset.train))
+        work = replace(work, config=sized)
         steps, mean = _steps(work, left, time_ratio, initial)
         if more_often:
             sized = _densified_in(sized, steps)
@@ -277,7 +281,8 @@ def _densified_in(config: TrainConfig, steps: int) -> TrainConfig:
 
 
 def _steps(work: Work, seconds: float, time_ratio: float, gaussians: int) -> tuple[int, float]:
-    """The number of steps that fit into ``seconds``, and the mean seconds of a step."""
+    """The number of steps that fit into ``seconds`` (at least `FEWEST_STEPS`), and the mean seconds
+    of a step."""
     steps = work.config.iterations
     mean = 0.0
     for _ in range(5):  # fixed-point iteration: the mean depends on the number of steps
@@ -286,7 +291,7 @@ def _steps(work: Work, seconds: float, time_ratio: float, gaussians: int) -> tup
         left = seconds - work.seconds_after(
             time_ratio * work.seconds(1, parts[-1][1]), parts[-1][1]
         )
-        steps = max(1, round(left / mean))
+        steps = max(FEWEST_STEPS, round(left / mean))
     return steps, mean
 
 

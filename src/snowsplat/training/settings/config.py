@@ -22,6 +22,10 @@ AutoOnOff = Literal["auto", "on", "off"]
 #: The generators are seeded with four times the seed, which has to fit into 64 bits.
 _SEED_LIMIT = 2**61
 
+#: What is added to the two moments of `TrainConfig.coarse_to_fine` if each photo is used a few
+#: times only, and the share of further steps.
+_COARSER, _LONGER = (0.05, 0.1), 0.25
+
 
 @dataclass(frozen=True)
 class TrainConfig(Settings):
@@ -233,6 +237,14 @@ class TrainConfig(Settings):
         "half of it; 0: never.",
         least=0,
     )
+    few_passes: float = setting(
+        0.0,
+        "With fewer passes over the photos than this, images are reduced for longer, and a recipe "
+        "has more steps, which take about the same time; with half as many or fewer, by 0.05 and "
+        "0.1 of all steps, and a quarter more steps. If `coarse_to_fine` is set, this is 0 unless "
+        "it is set, too; 0: never.",
+        least=0.0,
+    )
     image_memory: int = setting(
         0,
         "Bytes for decoded images, in each process; 0: half of the available memory, for all "
@@ -282,15 +294,45 @@ class TrainConfig(Settings):
             pixels: number of pixels of a photo.
             views: number of training views.
         """
+        config = self.staged(views)
         if self.gaussians_per_pixel <= 0:
-            return self
+            return config
         cap = self.gaussians_per_pixel * pixels
         if self.density.max_gaussians > 0:
             cap = min(cap, self.density.max_gaussians)
         if self.limit_views > 0:
             cap *= max(1.0, math.sqrt(views / self.limit_views))
         density = replace(self.density, max_gaussians=max(1, round(cap)))
-        return replace(self, density=density, gaussians_per_pixel=0.0)
+        return replace(config, density=density, gaussians_per_pixel=0.0)
+
+    def lengthened(self, views: int) -> TrainConfig:
+        """This configuration of a recipe, with more steps if ``views`` are used in few passes.
+
+        Early steps with small images are cheap looks at many photos, so they are extended, too; see
+        docs/measurements/2026-11-26-fewer-pairs.md.
+        """
+        more = 1.0 + _LONGER * self._few(views)
+        return replace(self, iterations=round(more * self.iterations))
+
+    def staged(self, views: int) -> TrainConfig:
+        """This configuration with the moments of ``coarse_to_fine`` for this number of views.
+
+        The result has no ``few_passes``, so another call does not change it. With 0 views, the
+        result is unchanged.
+        """
+        if self.few_passes <= 0.0 or views == 0:
+            return self
+        few = self._few(views)
+        quarter, half = (
+            when + few * later if isinstance(when, float) else when
+            for when, later in zip(self.coarse_to_fine, _COARSER, strict=True)
+        )
+        return replace(self, coarse_to_fine=(quarter, half), few_passes=0.0)
+
+    def _few(self, views: int) -> float:
+        """0 with ``few_passes`` over the photos or more, 1 with half as many or fewer."""
+        ratio = self.few_passes * views / self.iterations
+        return min(max(0.0, math.log2(ratio)), 1.0) if ratio > 0.0 else 0.0
 
     def downscale_at(self, step: int, schedule: Schedule) -> int:
         """The factor by which images are reduced at this step: 1, 2 or 4."""

@@ -12,6 +12,12 @@ from snowsplat.util.errors import SettingError
 
 #: The fields of `TrainConfig` whose value has settings itself.
 PARTS = ("density", "learning_rates", "decay")
+#: Settings, and the rule for the dataset that a given value disables.
+_RULES = {
+    "max_gaussians": "gaussians_per_pixel",
+    "lr_sh_rest": "lr_sh_rest_passes",
+    "coarse_to_fine": "few_passes",
+}
 
 
 def setting_names(config: TrainConfig) -> dict[str, tuple[str | None, str]]:
@@ -31,8 +37,8 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
         settings: fields of `TrainConfig`; fields of its density control (``grad_threshold=4e-4``);
             fields of `LearningRates` with the prefix ``lr_`` (``lr_means=1e-4``), and of
             `DecayRates` with the prefix ``decay_``. None leaves a setting unchanged.
-            ``max_gaussians`` also disables ``gaussians_per_pixel``, and ``lr_sh_rest`` disables
-            ``lr_sh_rest_passes``.
+            ``max_gaussians`` also disables ``gaussians_per_pixel``, ``lr_sh_rest`` disables
+            ``lr_sh_rest_passes``, and ``coarse_to_fine`` disables ``few_passes``.
 
     Raises:
         SettingError: the configuration has no such setting, or a value is invalid.
@@ -41,10 +47,9 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
     whole = {name: given.pop(name) for name in PARTS if name in given}
     if whole:  # the other names may be those of the new density control
         config = replace(config, **whole)
-    if "max_gaussians" in given:
-        given.setdefault("gaussians_per_pixel", 0.0)
-    if "lr_sh_rest" in given:
-        given.setdefault("lr_sh_rest_passes", 0.0)
+    for name, rule in _RULES.items():
+        if name in given:
+            given.setdefault(rule, 0.0)
     known = setting_names(config)
     direct: dict[str, Any] = {}
     of_parts: dict[str, dict[str, Any]] = {}

@@ -25,11 +25,11 @@ def default() -> TrainConfig:
     points on the surfaces, which are found by plane sweep, and in the sky; in the last part of the
     training, all learning rates decrease; opacities and scales decay, so that Gaussians which no
     photo needs become transparent; with few passes over the photos, view-dependent colours change
-    faster; Gaussians with an opacity below 0.1 are removed, and their places are used again; no
-    Gaussian is much nearer to a camera than the points that it sees; densification lasts longer,
-    uses absolute gradients, and always reaches the maximum number; more Gaussians and fewer steps
-    take the same time; objects that move between the photos are masked; and the scene is
-    antialiased.
+    faster, and there are more steps, with small images for longer; Gaussians with an opacity below
+    0.1 are removed, and their places are used again; no Gaussian is much nearer to a camera than
+    the points that it sees; densification lasts longer, uses absolute gradients, and always reaches
+    the maximum number; more Gaussians and fewer steps take the same time; objects that move between
+    the photos are masked; and the scene is antialiased.
     """
     config = classic()
     return replace(
@@ -58,6 +58,7 @@ def default() -> TrainConfig:
         ),
         gaussians_per_pixel=0.6,
         limit_views=50,
+        few_passes=20.0,
     )
 
 
