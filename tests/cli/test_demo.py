@@ -53,7 +53,7 @@ def test_from_nothing_to_a_scene(run, small, tmp_path, monkeypatch):
     monkeypatch.setattr(view.View, "run", lambda self: shown.append(self.path) or 0)
     again = run("demo", "--open")
     assert again.code == 0, again.err
-    assert again.out.count("done before") == 7
+    assert again.out.count("done before") == 8
     assert shown == [out / "made"]
 
     monkeypatch.setattr(demo, "MAX_DEGREES", 1e-9)

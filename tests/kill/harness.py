@@ -531,10 +531,10 @@ def make_jobs(photos: Path) -> list[Job]:
             raise Defect(f"files differ: {sorted(names_in(output) ^ names_in(whole))}")
         _check_dataset(output / "dataset", whole / "dataset")
         record = json.loads((output / "make.json").read_text())
-        if list(record["stages"]) != ["scene", "pictures"]:
+        if list(record["stages"]) != ["scene", "pictures", "all"]:
             raise Defect("stages are not finished")
         scene = output / f"{photos.name}.ply"
-        last = output / "scene/point_cloud/iteration_60/point_cloud.ply"
+        (last,) = output.glob("scene/point_cloud/*/point_cloud.ply")
         if digest(scene) != digest(last):
             raise Defect("the scene is not that of the training")
 

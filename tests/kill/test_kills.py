@@ -133,7 +133,8 @@ def test_make_keeps_checkpoints_until_the_scene_is_recorded(killer, zygote, phot
     (out / "make.json").write_text(json.dumps(record))
     command = job.command(out, True)
     checkpoints = out / "scene/checkpoints"
-    last = out / "scene/point_cloud/iteration_60/point_cloud.ply"
+    (scene,) = (whole / job.output).glob("scene/point_cloud/*/point_cloud.ply")
+    last = out / scene.relative_to(whole / job.output)
 
     def kill_when_gone(pid: int) -> None:
         process = Path(f"/proc/{pid}")

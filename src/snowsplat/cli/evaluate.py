@@ -31,9 +31,8 @@ class Evaluate(SceneFlags, Reports):
       the render were fitted to the photo, so that exposure and white balance of the
       photo do not count. The photos have the size of the training, which
       a time limit may have reduced; -r 1: their own size.
-
-    The weights of LPIPS are those of the package lpips (pip install lpips), which
-    downloads a network once. For a computer without it, this writes a file:
+      The weights of LPIPS are those of the package lpips (pip install lpips), which
+      downloads a network once. For a computer without it, this writes a file:
       python -m snowsplat.evaluation.lpips vgg lpips_vgg.safetensors
     """
 

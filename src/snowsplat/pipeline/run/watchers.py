@@ -104,6 +104,8 @@ class Watchers:
         self._listener: socket.socket | None = None
         # The page needs one process; Python has no such sockets on Windows, some file systems, too.
         if count() == 1 and sys.platform != "win32":
+            # The folder may be moved while the training runs.
+            self._place = os.open(self._output, os.O_RDONLY | os.O_DIRECTORY)
             listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             try:
                 with socket_in(self._output, create=True) as path:
@@ -113,7 +115,7 @@ class Watchers:
                 self._listener = listener
             except OSError:
                 listener.close()
-                self._remove_folder()
+                self._remove_socket()
         if self._listener is not None:
             self._stop, self._stopped = socket.socketpair()
             self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -128,13 +130,14 @@ class Watchers:
         self._close_page()
         for end in (self._listener, self._stopped):
             end.close()
-        self._remove_folder()
+        self._remove_socket()
 
-    def _remove_folder(self) -> None:
-        with suppress(OSError):  # the output folder was moved or removed
-            with socket_in(self._output) as path:
-                Path(path).unlink(missing_ok=True)
-            (self._output / FOLDER).rmdir()
+    def _remove_socket(self) -> None:
+        with suppress(OSError):  # the output folder was removed
+            os.unlink(f"{FOLDER}/{_SOCKET}", dir_fd=self._place)
+        with suppress(OSError):
+            os.rmdir(FOLDER, dir_fd=self._place)
+        os.close(self._place)
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
         """Update the page after a step; returns the seconds for which the training waited.
