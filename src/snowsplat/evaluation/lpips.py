@@ -106,8 +106,7 @@ class Lpips:
                 another shape; `lpips` is not installed, or cannot download its network.
         """
         path = Path(path)
-        packaged = str(path) in NAMES and not path.exists()
-        state = _packaged_state(str(path)) if packaged else _read_state(path)
+        state = _packaged_state(str(path)) if is_packaged(path) else _read_state(path)
         backbone: dict[tuple[int, str], Tensor] = {}
         heads: dict[int, Tensor] = {}
         for name, value in state.items():
@@ -180,6 +179,11 @@ class Lpips:
 
 def _unit(features: Tensor) -> Tensor:
     return features / (features.square().sum(0, keepdim=True).sqrt() + 1e-10)
+
+
+def is_packaged(path: Path) -> bool:
+    """Whether ``path`` is the name of a network of the package `lpips`, and no file."""
+    return str(path) in NAMES and not path.exists()
 
 
 def _packaged_state(name: str) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from snowsplat.data.transforms_json import find_transforms
-from snowsplat.evaluation.lpips import NAMES, Lpips
+from snowsplat.evaluation.lpips import Lpips, is_packaged
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
@@ -198,5 +198,4 @@ def _devices(options: BenchmarkOptions) -> list[str | None]:
 
 def _lpips(weights: Path) -> str:
     """The name of a network, or the absolute path of a file."""
-    packaged = str(weights) in NAMES and not weights.exists()
-    return str(weights if packaged else weights.absolute())
+    return str(weights if is_packaged(weights) else weights.absolute())

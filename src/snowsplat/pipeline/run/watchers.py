@@ -94,6 +94,7 @@ class Watchers:
         """
         self._output, self._trainer = output, trainer
         self._page, self._given = page, page is not None
+        self._listener: socket.socket | None = None
         # What follows is shared with the thread.
         self._lock = threading.Lock()
         self._asking: list[tuple[socket.socket, PageRequest]] = []
@@ -101,21 +102,10 @@ class Watchers:
         self._deserted = False  # the last watcher has left the page
 
     def __enter__(self) -> Watchers:
-        self._listener: socket.socket | None = None
         # The page needs one process; Python has no such sockets on Windows, some file systems, too.
         if count() == 1 and sys.platform != "win32":
-            # The folder may be moved while the training runs.
-            self._place = os.open(self._output, os.O_RDONLY | os.O_DIRECTORY)
-            listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            try:
-                with socket_in(self._output, create=True) as path:
-                    Path(path).unlink(missing_ok=True)
-                    listener.bind(path)
-                    listener.listen()
-                self._listener = listener
-            except OSError:
-                listener.close()
-                self._remove_socket()
+            with suppress(OSError):  # then nobody can watch
+                self._listen()
         if self._listener is not None:
             self._stop, self._stopped = socket.socketpair()
             self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -131,6 +121,22 @@ class Watchers:
         for end in (self._listener, self._stopped):
             end.close()
         self._remove_socket()
+
+    def _listen(self) -> None:
+        """Raises OSError: there is no folder, or the file system has no sockets."""
+        # The folder may be moved while the training runs.
+        self._place = os.open(self._output, os.O_RDONLY | os.O_DIRECTORY)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            with socket_in(self._output, create=True) as path:
+                Path(path).unlink(missing_ok=True)
+                listener.bind(path)
+                listener.listen()
+        except OSError:
+            listener.close()
+            self._remove_socket()
+            raise
+        self._listener = listener
 
     def _remove_socket(self) -> None:
         with suppress(OSError):  # the output folder was removed

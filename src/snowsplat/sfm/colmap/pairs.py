@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from snowsplat.sfm.colmap.database import Pair
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.colmap.retrieval import nearest
+from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
 
@@ -83,17 +84,19 @@ class PairChoice:
             count: number of photos.
         """
         clear = [(p.first, p.second) for p in verified if p.inliers >= _CLEAR_MATCHES]
-        partners = np.bincount(np.array(clear, np.int64).ravel(), minlength=count)
-        weak = partners < _CLEAR_PAIRS
-        if _connected(clear):
-            needed = [(i, j) for i, j in self.reserve if weak[i] or weak[j]]
-        else:
-            needed = self.reserve
-        return PairChoice(sorted({*self.pairs, *needed}), self.rules)
+        first, second = np.array(clear, np.int64).reshape(-1, 2).T
+        partners = np.bincount(np.concatenate([first, second]), minlength=count)
+        groups = np.unique(components(first, second, count)[partners > 0])
+        weak = (partners < _CLEAR_PAIRS) | (len(groups) > 1)
+        return self._with({(i, j) for i, j in self.reserve if weak[i] or weak[j]})
 
     def whole(self) -> PairChoice:
         """This choice, with all pairs of the reserve."""
-        return PairChoice(sorted({*self.pairs, *self.reserve}), self.rules)
+        return self._with(set(self.reserve))
+
+    def _with(self, needed: Pairs) -> PairChoice:
+        rest = [pair for pair in self.reserve if pair not in needed]
+        return PairChoice(sorted({*self.pairs, *needed}), self.rules, rest)
 
 
 def choose_pairs(
@@ -143,21 +146,6 @@ def _growing(places: range) -> list[int]:
     while chosen and (place := math.ceil(_STEP * (chosen[-1] + 1)) - 1) in places:
         chosen.append(place)
     return chosen
-
-
-def _connected(pairs: Sequence[tuple[int, int]]) -> bool:
-    """Whether the photos of ``pairs`` are one group."""
-    partners: dict[int, set[int]] = {}
-    for i, j in pairs:
-        partners.setdefault(i, set()).add(j)
-        partners.setdefault(j, set()).add(i)
-    left = list(partners)[:1]
-    found = set(left)
-    while left:
-        new = partners[left.pop()] - found
-        found |= new
-        left += new
-    return len(found) == len(partners)
 
 
 def numbered_series(names: Mapping[int, str]) -> list[list[int]]:

@@ -11,6 +11,9 @@ With further matches:
     7  these, with a held focal length
     8  these, with the other mapper
 
+If pairs of similar photos were held in reserve (`pairs`), and the first attempt is not good, it is
+repeated with them.
+
 After the first four, bundle adjustment shows whether one focal length fits all photos of a camera.
 If not, the attempt is made with several, which remain for the others (`camera_groups`).
 
@@ -210,13 +213,13 @@ class PoseEstimation:
         lens = self._first_lens()
         self._verify(matched, lens)
         completed = matched.choice.completed(verified_pairs(first), len(self.photos))
-        reserve, matched = matched.choice.whole(), self._with_pairs(matched, completed, lens)
+        matched = self._with_pairs(matched, completed, lens)
         evidence = self._evidence(matched)
         if evidence.flat:
             mapper = "incremental"  # the global mapper returns a wrong depth for flat scenes
         self._try("as configured", matched, mapper, lens)
-        if not self._good(evidence) and len(reserve.pairs) > len(matched.choice.pairs):
-            matched = self._with_pairs(matched, reserve, lens)
+        if not self._good(evidence) and matched.choice.reserve:
+            matched = self._with_pairs(matched, matched.choice.whole(), lens)
             evidence = self._evidence(matched)
             self._try("with more pairs", matched, mapper, lens)
         if not self._found and evidence.flat and exif_focals(self.photos):
@@ -338,6 +341,8 @@ class PoseEstimation:
 
     def _with_pairs(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
         """Match and verify those pairs of ``choice`` that are not matched yet."""
+        if choice.pairs == matched.choice.pairs:
+            return matched
         match_pairs(matched.database, choice.pairs, self.threads, self.progress)
         more = dataclasses.replace(matched, choice=choice)
         self._verify(more, lens)

@@ -48,7 +48,7 @@ def of_long_tracks(
     pair = np.repeat(np.arange(len(matches)), sizes)
     first = np.concatenate([rows[:, 0] + start[i] for i, _, rows in matches]).astype(np.int64)
     second = np.concatenate([rows[:, 1] + start[j] for _, j, rows in matches]).astype(np.int64)
-    track = _components(first, second, total)
+    track = components(first, second, total)
     of_match = track[first]
     length = _lengths(track, photo)[of_match]
     order = np.lexsort((first, -length, pair))  # the first features of a photo are the largest
@@ -60,7 +60,7 @@ def of_long_tracks(
     return np.split(chosen[of_match], np.cumsum(sizes)[:-1])
 
 
-def _components(first: Ints, second: Ints, count: int) -> Ints:
+def components(first: Ints, second: Ints, count: int) -> Ints:
     """(count,) the smallest node in the component of each node; ``first``, ``second``: edges."""
     label = np.arange(count)
     while True:
