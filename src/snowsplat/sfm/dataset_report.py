@@ -108,11 +108,9 @@ def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto
 def _headline(name: str, facts: dict[str, Any]) -> str:
     sfm = facts["sfm"]
     registered, unregistered = len(sfm["registered"]), len(sfm["unregistered"])
-    if not unregistered:
-        summary = f"The poses of all {registered} photos were found."
-    else:
-        total = registered + unregistered
-        summary = f"The poses of {registered} of {total} photos were found."
+    total = registered + unregistered
+    which = f"{registered} of {total}" if unregistered else f"all {total}"
+    summary = f"The poses of {which} photos were found."
     lines = [f"<h1>{text(name)}</h1>", f"<p>{summary}</p>"]
     if len(sfm["sub_models"]) > 1:
         sizes = ", ".join(map(str, sfm["sub_models"]))
@@ -144,17 +142,14 @@ def _cards(facts: dict[str, Any]) -> str:
 
 def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], more: Advice) -> str:
     """What was wrong, and what to do better, for the person who took the photos."""
-    lines = []
-    bad = facts["problems"]
+    lines = ["<p>No photo is blurred, too dark or too bright.</p>"]
     without = len(facts["sfm"]["unregistered"]) + len(facts["gathered"]["skipped"])
-    if not bad:
-        lines.append("<p>No photo is blurred, too dark or too bright.</p>")
-    if bad:
+    if bad := facts["problems"]:
         count = f"{len(bad)} of {len(names)} photos"
-        lines.append(
+        lines = [
             f"<p>{count} may be better. Take them again, or leave them out if others show the same."
             f"</p>\n{_bad_photos(dataset, bad)}"
-        )
+        ]
     if without:
         lines.append(f"<p>{without} photos were not used; the reasons are below.</p>")
     lines += [
@@ -290,9 +285,8 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     sizes = ", ".join(f"{w} × {h}" for w, h, *_ in undistorted["sizes"])
     how = "undistorted" if undistorted["resampled"] else "copied, as there is no distortion"
     lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
-    zooms = sfm.get("zooms", "")
     said = ""
-    if zooms:
+    if zooms := sfm.get("zooms", ""):
         said = f"<p>The photos have {text(zooms)}, so each group of them has its own lens.</p>\n"
     if sfm.get("fisheye"):
         said += f"<p>{text(sfm['fisheye'][0].upper() + sfm['fisheye'][1:])}.</p>\n"

@@ -2,26 +2,23 @@
 
 docs/cameras.md describes the method, docs/measurements/2026-11-23-checking-poses.md an example.
 
-The mapper registers a photo if some of its matches agree with the points of the model. If two
-places look alike, it may register a photo, and then all following photos, at the wrong place. The
-reprojection error remains small, because the mapper drops the matches that disagree with the poses.
-Two photos that were taken one after the other may then have thousands of verified matches, but no
-point in common. A pair of photos whose verified matches contradict the model is a *tear*.
+If two places look alike, the mapper may register a photo, and then all following photos, at the
+wrong place. The reprojection error remains small, because the matches that disagree are dropped. A
+pair of photos whose verified matches contradict the model is a *tear*. Correct models have tears,
+too: places that look alike have verified matches that are false. So a photo is judged by all of its
+matches.
 
-Correct models have tears, too: places that look alike have verified matches that are false. So a
-photo is judged by all of its matches. The photos are the nodes of a graph, and each pair with
-verified matches is an edge. The *demand* of an edge is the squared number of its matches. Photos
-taken side by side have many matches. Because of the square, a few such pairs have more demand than
-many pairs with few matches, whose matches may be false. Matches of photos that follow each other
-count more (`CheckedPair.weight`). The *support* of a pair is the share of its matches that the
-model confirms. The *supported demand* of an edge is its demand multiplied by the support of its
-pair.
+The photos are the nodes of a graph, the pairs with verified matches its edges. The *demand* of an
+edge is the squared number of its matches: photos taken side by side have many, and false matches
+are few. Matches of photos that follow each other count more (`CheckedPair.weight`). The *support*
+of a pair is the share of its matches that the model confirms. The *supported demand* of an edge is
+its demand multiplied by the support of its pair.
 
-The photos of a model are divided into two parts. If only a small share of the demand between the
-parts is supported, the parts contradict each other (`find_parts`). The best division is the
-sparsest cut of the graph: the cut with the least ratio of supported demand to demand. This problem
-is relaxed to a generalised eigenvalue problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple
-and scalable constrained clustering: a generalized spectral method", AISTATS 2016).
+Two parts of the photos contradict each other if only a small share of the demand between them is
+supported (`find_parts`). The best division is the sparsest cut of the graph: the cut with the least
+ratio of supported demand to demand. This problem is relaxed to a generalised eigenvalue problem
+(Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
+generalized spectral method", AISTATS 2016).
 """
 
 from __future__ import annotations
@@ -41,6 +38,7 @@ from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.lens import is_fisheye, lens_of, pixels_per_radian
+from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
@@ -143,10 +141,8 @@ def agreement_of(pairs: Sequence[CheckedPair], possible: Callable[[CheckedPair],
             return 1.0
         return min(1.0, pair.agreeing / max(1e-9, min(possible(pair), 1 - pair.miss_share)))
 
-    shares = [(share(pair), pair) for pair in chosen]
-    worst = sorted(shares, key=lambda entry: entry[0])[
-        : max(_MIN_WORST, round(_WORST * len(shares)))
-    ]
+    shares = sorted(((share(pair), pair) for pair in chosen), key=lambda entry: entry[0])
+    worst = shares[: max(_MIN_WORST, round(_WORST * len(shares)))]
     total = sum(pair.matches for _, pair in worst)
     return sum(share * pair.matches for share, pair in worst) / total if total else 0.0
 
@@ -210,8 +206,6 @@ def check_pairs(
             rows = source.read_two_view_geometry(first, second).inlier_matches
             of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
             is_hit = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
-            follows = (first, second) in follow
-            pair = CheckedPair(first, second, len(rows), int(is_hit.sum()), follows=follows)
             images = model.image(first), model.image(second)
             focal = np.mean([pixels_per_radian(model.camera(i.camera_id)) for i in images])
             pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
@@ -220,12 +214,14 @@ def check_pairs(
             sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
             missed = _misses(positions, sides[0], sides[1], _MIN_MISS_DISTANCE * error)
             missed |= _misses(positions, sides[1], sides[0], _MIN_MISS_DISTANCE * error)
-            pair = replace(
-                pair,
-                agreeing=agreement(pose, *both, error),
-                miss_share=float(np.mean(missed & ~is_hit)),
+            checked.append(
+                CheckedPair(
+                    *(first, second, len(rows), int(is_hit.sum())),
+                    follows=(first, second) in follow,
+                    agreeing=agreement(pose, *both, error),
+                    miss_share=float(np.mean(missed & ~is_hit)),
+                )
             )
-            checked.append(pair)
     return _without_bridged_tears(checked, following_pairs(names, max_step=1))
 
 
@@ -450,20 +446,13 @@ def _nth_largest(values: Floats, n: int) -> float:
 
 
 def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
-    """The connected components of a graph with N nodes, as sorted lists of nodes.
+    """The connected components of a graph of N nodes, as sorted lists of nodes.
 
     ``linked``: (N, N) symmetric, whether two nodes have an edge.
     """
-    left = set(range(len(linked)))
-    components = []
-    while left:
-        found, new = set(), {min(left)}
-        while new:
-            found |= new
-            new = set(np.flatnonzero(linked[sorted(new)].any(0)).tolist()) - found
-        components.append(sorted(found))
-        left -= found
-    return components
+    first, second = np.nonzero(linked)
+    label = components(first, second, len(linked))
+    return [np.flatnonzero(label == node).tolist() for node in np.unique(label)]
 
 
 def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:

@@ -216,8 +216,8 @@ def findings_of(camera: pycolmap.Camera, exif: float | None) -> list[Finding]:
     if is_fisheye(camera.model_name):
         found = [finding for finding in found if finding.about != "field of view"]
         reason = _implausible_fisheye(camera)
-        return [*found, Finding("distortion", reason, True)] if reason else found
-    reason = _implausible_distortion(camera)
+    else:
+        reason = _implausible_distortion(camera)
     if reason:
         return [*found, Finding("distortion", reason, True)]
     barrel = _barrel(camera)

@@ -172,18 +172,10 @@ class PoseEstimation:
             best.mapping.add_points(model)
             model.extract_colors_for_all_images(self.folders.images, self.threads)
         write_models(best.models, self.folders.sparse)
-        reasons = explain(
-            self.photos,
-            self._evidence(best.matched),
-            [names_in(model) for model in best.models],
-            best.left_out,
-        )
+        names = [names_in(model) for model in best.models]
+        reasons = explain(self.photos, self._evidence(best.matched), names, best.left_out)
         result = result_of(
-            best.models,
-            self.photos,
-            reasons,
-            best.matched.choice.description,
-            self.log,
+            *(best.models, self.photos, reasons, best.matched.choice.description, self.log),
             exif=best.lens.exif,
             held=best.mapping.held,
         )

@@ -80,20 +80,19 @@ def find_copies(root: Path, names: Sequence[str]) -> list[Copy]:
                 kinds = _stem_and_kind(one)[1], _stem_and_kind(other)[1]
                 pairs.setdefault(kinds, []).append((one, other))
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="copies") as pool:
+
+        def compared(some: Sequence[tuple[str, str]]) -> dict[tuple[str, str], bool]:
+            return dict(zip(some, pool.map(lambda p: _show_same(root, *p), some), strict=True))
+
         for of_kind in pairs.values():
             chosen = np.unique(np.linspace(0, len(of_kind) - 1, min(len(of_kind), _SAMPLE)))
-            sample = [of_kind[round(i)] for i in chosen]
-            is_same = dict(
-                zip(sample, pool.map(lambda p: _show_same(root, *p), sample), strict=True)
-            )
-            if all(is_same.values()) and len(sample) == _SAMPLE:
+            is_same = compared([of_kind[round(i)] for i in chosen])
+            if all(is_same.values()) and len(is_same) == _SAMPLE:
                 is_same = dict.fromkeys(of_kind, True)
             elif any(is_same.values()):
-                rest = [pair for pair in of_kind if pair not in is_same]
-                is_same |= zip(rest, pool.map(lambda p: _show_same(root, *p), rest), strict=True)
-            for pair, value in is_same.items():
-                if value:
-                    same.join(*pair)
+                is_same |= compared([pair for pair in of_kind if pair not in is_same])
+            for pair in (pair for pair, value in is_same.items() if value):
+                same.join(*pair)
     used = {
         name: best for group in same.groups() for best in [_best(root, group)] for name in group
     }

@@ -14,22 +14,15 @@ from snowsplat.sfm.ingest.photo import Attitude
 
 # EXIF tags.
 ORIENTATION = 0x0112
-_MAKE = 0x010F
-_MODEL = 0x0110
-_EXIF_IFD = 0x8769
-_GPS_IFD = 0x8825
-_FOCAL_LENGTH = 0x920A  # mm
-_FOCAL_35MM = 0xA405  # equivalent focal length on 35 mm film, mm
-_PLANE_X = 0xA20E  # FocalPlaneXResolution: pixels of the sensor per `_PLANE_UNIT`
-_PLANE_Y = 0xA20F
-_PLANE_UNIT = 0xA210
-_MAKER_NOTE = 0x927C
-_USER_COMMENT = 0x9286
+_MAKE, _MODEL = 0x010F, 0x0110
+_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+_FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405  # mm; the latter: equivalent on 35 mm film
+# FocalPlaneXResolution, …: pixels of the sensor per `_PLANE_UNIT`.
+_PLANE_X, _PLANE_Y, _PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
+_MAKER_NOTE, _USER_COMMENT = 0x927C, 0x9286
 _GPS_ERROR = 31  # GPSHPositioningError, m
-_PIXEL_WIDTH = 0xA002
-_PIXEL_HEIGHT = 0xA003
-_COLOUR_SPACE = 0xA001
-_SRGB = 1
+_PIXEL_WIDTH, _PIXEL_HEIGHT = 0xA002, 0xA003
+_COLOUR_SPACE, _SRGB = 0xA001, 1
 _INTEROPERABILITY = 0xA005
 
 _PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}

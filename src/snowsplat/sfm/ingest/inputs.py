@@ -170,19 +170,16 @@ def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
         UserError: they show all directions, but not as one equirectangular picture.
     """
     found = spherical_video(clip.path)
+    around = found is not None or options.panoramas
     problem = found.problem if found else ""
-    if (
-        not problem
-        and (found or options.panoramas)
-        and not is_twice_as_wide(clip.width, clip.height)
-    ):
+    if around and not problem and not is_twice_as_wide(clip.width, clip.height):
         problem = f"has frames of {clip.width}x{clip.height} pixels"
     if problem:
         raise UserError(
             f"{shown(clip.path)}: is a 360° video that {problem}; export it with one "
             "equirectangular picture of all directions, which is twice as wide as high"
         )
-    return found is not None or options.panoramas
+    return around
 
 
 def _refuse_changes(

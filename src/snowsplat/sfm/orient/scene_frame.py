@@ -80,7 +80,8 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
         ValueError: the model has no cameras.
     """
     cameras = read_cameras(model)
-    known = _known(cameras, photos)
+    by_name = {photo.name: photo for photo in photos}
+    known = [by_name.get(name) for name in cameras.names]
     cameras = _upright(cameras, known)
     up, doubts = _up(cameras, known)
     gps, more = _gps(cameras, known, up)
@@ -121,12 +122,6 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
     return Oriented(
         Similarity(scale, torch.from_numpy(rotation), torch.from_numpy(shift)), placement
     )
-
-
-def _known(cameras: Cameras, photos: Sequence[Photo]) -> list[Photo | None]:
-    """The photo of each camera, or None."""
-    by_name = {photo.name: photo for photo in photos}
-    return [by_name.get(name) for name in cameras.names]
 
 
 def _upright(cameras: Cameras, photos: Sequence[Photo | None]) -> Cameras:
