@@ -177,15 +177,8 @@ def read_files(
         raise UserError(f"{root}: has two images named {repeated}; remove one")
     _warn_of_cropped(posed)
     found = list(zip(posed, headers, sizes, strict=True))
-    return DatasetFiles(
-        root,
-        found,
-        _circles(found),
-        points,
-        description,
-        _test_names(posed, hold_out, first_held_out, test_list),
-        origin,
-    )
+    names = _test_names(posed, hold_out, first_held_out, test_list)
+    return DatasetFiles(root, found, _circles(found), points, description, names, origin)
 
 
 @dataclass(frozen=True)
@@ -208,9 +201,8 @@ def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
     models = find_models(root / "sparse")
     if deep and not transforms:
         models = models or find_models(root) or find_models(root / "colmap" / "sparse")
-    if (
-        deep and not transforms and not (models and (root / images).is_dir())
-    ):  # dense/0/sparse, sfm …
+    # dense/0/sparse, sfm …
+    if deep and not transforms and not (models and (root / images).is_dir()):
         models = find_models_below(root, images) or models
     if models:
         return _Poses(models, [], None)

@@ -33,13 +33,14 @@ from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.data.files.photos import find_photos
+from snowsplat.data.imports.values import load_json
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.transforms_lens import is_panorama, lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import inside, is_file, quoted, read_json
+from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
 
@@ -48,6 +49,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 # Parts of a path of another computer that are tried.
 _MOST_PARTS = 16
+# Memory for JSON values per byte of the text.
+_JSON_RATIO = 2
 # Two statements of a focal length differ by less than this factor, or contradict each other.
 _SAME_LENS = 1.05
 
@@ -194,14 +197,7 @@ def _posed_image(
 
 
 def _read_json(path: Path) -> _Json:
-    try:
-        scene = read_json(path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValueError as error:  # not JSON, or not even text
-        raise UserError(
-            f"{path}: not a complete JSON file ({str(error)[:80]}); copy it again"
-        ) from None
+    scene = load_json(path, _JSON_RATIO)
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
         raise UserError(f"{path}: has no list of frames, so it does not describe a dataset")
     return scene

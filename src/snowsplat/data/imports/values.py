@@ -31,14 +31,17 @@ def damaged(where: object, problem: str) -> UserError:
     return UserError(f"{where}: {problem}; export the file again")
 
 
-def load_json(path: Path) -> Any:
+def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
     """The value in a JSON file.
+
+    Args:
+        ratio: see `parse_json`.
 
     Raises:
         UserError: the file cannot be read, or is not JSON.
     """
     try:
-        return read_json(path, _JSON_RATIO)
+        return read_json(path, ratio)
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     except ValueError as error:  # not JSON, or not even text

@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 
 from snowsplat.data import image_file
 from snowsplat.data.colour_profile import is_transparent
-from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of
+from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
 from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import STITCHED, Panorama, panorama_in_xmp
@@ -93,14 +93,6 @@ class Header:
 
     def _new_format(self) -> str:
         return "JPEG" if self.format in _LOSSY and not self.transparent else "PNG"
-
-
-def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    """The size with its longest side at most ``longest``; never enlarged."""
-    if longest is None or max(width, height) <= longest:
-        return width, height
-    scale = longest / max(width, height)
-    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def read_header(path: Path) -> Header:

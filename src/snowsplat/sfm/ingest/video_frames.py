@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from snowsplat.data.image_file import scaled_size
 from snowsplat.sfm.ingest.clip import (
     Clip,
     decoded_frames,
@@ -39,7 +40,7 @@ from snowsplat.sfm.ingest.interlace import field_order, whole_frames
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
 from snowsplat.sfm.ingest.panorama import shows_all_around
-from snowsplat.sfm.ingest.photo_files import resized, save, scaled_size
+from snowsplat.sfm.ingest.photo_files import resized, save
 from snowsplat.sfm.ingest.sharpness import (
     CONTENT_SIDE,
     SHARPNESS_SIDE,
