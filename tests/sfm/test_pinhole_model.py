@@ -5,9 +5,8 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import pinhole_of
-from snowsplat.data.lens.project import directions, project
+from snowsplat.data.lens.project import LensModel, directions, project
 from snowsplat.data.lens.views import lens_views
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageCms
 
+from snowsplat.data.bit_depth import eight_bits
+
 logger = logging.getLogger(__name__)
 
 _TRANSPARENT = ("RGBA", "RGBa", "LA", "La", "PA")
@@ -39,6 +41,20 @@ _lock = threading.Lock()
 def is_transparent(image: Image.Image) -> bool:
     """Whether an image has an alpha channel or a transparent colour."""
     return image.mode in _TRANSPARENT or "transparency" in image.info
+
+
+def plain_pixels(image: Image.Image, path: Path) -> Image.Image:
+    """An image of 8 bits per channel in sRGB: mode L, RGB, or RGBA if pixels may be transparent.
+
+    Args:
+        image: opened, not decoded.
+        path: its file.
+
+    Raises:
+        ValueError: floating-point pixels.
+        Exception: anything that Pillow raises for a damaged file.
+    """
+    return to_srgb(eight_bits(image, path), path)
 
 
 def to_srgb(image: Image.Image, path: Path) -> Image.Image:

@@ -18,7 +18,7 @@ from snowsplat.data.files.photos import photos_below
 from snowsplat.data.imports import Export, find_export, read_export
 from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.mask_lookup import with_masks
 from snowsplat.data.near import near_of

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 

@@ -15,6 +15,11 @@ _DIRECTORY_LIMIT = 1 << 20
 _BLOCK = 1 << 16
 # Maximum size of an unpacked member: a factor times its packed size, plus this many bytes.
 _INFLATION_FREE = 1 << 20
+# What `zipfile` raises for damaged files. OverflowError: an offset larger than that of any file.
+_ERRORS = (
+    *(OSError, ValueError, RuntimeError, OverflowError, EOFError),
+    *(struct.error, zlib.error, zipfile.BadZipFile),
+)
 
 
 class Damaged(Exception):
@@ -34,14 +39,7 @@ class ZipMembers:
             raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
         try:
             self._zip = zipfile.ZipFile(self._file)
-        except (
-            ValueError,
-            EOFError,
-            OSError,
-            struct.error,
-            NotImplementedError,
-            zipfile.BadZipFile,
-        ):
+        except _ERRORS:
             raise Damaged("not a readable zip file") from None
 
     def __enter__(self) -> ZipMembers:
@@ -77,17 +75,7 @@ class ZipMembers:
                 while block := member.read(min(_BLOCK, info.file_size - len(content))):
                     content += block
             return bytes(content)
-        except (
-            OSError,
-            ValueError,
-            RuntimeError,
-            OverflowError,  # an offset larger than that of any file
-            EOFError,
-            struct.error,
-            NotImplementedError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ):
+        except _ERRORS:
             raise Damaged(f"its {quoted(name)} is damaged") from None
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import pinhole_of
-from snowsplat.data.lens.project import BROWN, project, unproject
+from snowsplat.data.lens.project import BROWN, LensModel, project, unproject
 
 INTRINSICS = 900.0, 905.0, 655.0, 470.0
 

@@ -4,9 +4,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
+from snowsplat.data.lens.project import LensModel
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),

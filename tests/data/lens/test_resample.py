@@ -7,11 +7,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
 from snowsplat.data.lens.positions import Positions
-from snowsplat.data.lens.project import project
+from snowsplat.data.lens.project import LensModel, project
 from snowsplat.data.lens.resample import resampled, undistort_image, undistort_mask
 
 LENSES = {

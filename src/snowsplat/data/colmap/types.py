@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 
 #: Name and number of parameters of each camera model; the index is its number in binary files.

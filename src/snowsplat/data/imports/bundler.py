@@ -13,8 +13,7 @@ import numpy as np
 
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.imports.lenses import centred, perspective
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import head_of, load_text, numbers, rigid
 from snowsplat.util.errors import UserError
 

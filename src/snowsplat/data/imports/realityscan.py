@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.imports.lenses import perspective
-from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.points import points_beside
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import damaged, from_opengl, head_of, load_text, number
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import BROWN, project
+from snowsplat.data.lens.project import BROWN, LensModel, project
 
 _SAMPLES = 400  # radii at which a lens is fitted
 _GRID = 33  # pixels of the photo along each side, at which the error is measured

@@ -12,9 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.positions import Positions, node_grid
-from snowsplat.data.lens.project import BROWN, intrinsics, project, unproject
+from snowsplat.data.lens.project import BROWN, LensModel, intrinsics, project, unproject
 
 _CROPPED = 0.95  # of width and height; without blank borders, an image shows more of the photo
 _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle

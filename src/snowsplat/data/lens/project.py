@@ -1,4 +1,4 @@
-"""From directions in the frame of a camera to pixels of its photo, for COLMAP's camera models.
+"""Lenses: from directions in the frame of a camera to pixels of its photo, and back.
 
 https://colmap.github.io/cameras.html describes the models. A model whose equation is a polynomial
 may fold: beyond some angle the pixels return to the centre. `field` finds this angle.
@@ -7,10 +7,9 @@ may fold: beyond some angle the pixels return to the centre. `field` finds this 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
-
-from snowsplat.data.lens.model import LensModel
 
 # Models with one focal length; the others, except EQUIRECTANGULAR, start with fx, fy.
 _ONE_FOCAL_LENGTH = frozenset(
@@ -24,6 +23,19 @@ _ONE_FOCAL_LENGTH = frozenset(
 BROWN = "BROWN"
 _TINY = 1e-12
 _NEWTON_STEPS = 30
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """The intrinsics of a distorted photo: one of COLMAP's camera models and its parameters.
+
+    https://colmap.github.io/cameras.html lists the models and the order of their parameters.
+    """
+
+    model: str  # the name of a camera model of COLMAP, e.g. "OPENCV_FISHEYE"; or `BROWN`
+    width: int  # pixels, of the photos that ``params`` are for
+    height: int
+    params: tuple[float, ...]  # focal lengths and principal point in pixels, then coefficients
 
 
 def intrinsics(lens: LensModel) -> tuple[float, float, float, float, tuple[float, ...]]:

@@ -18,10 +18,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.pinhole import pinhole_of
 from snowsplat.data.lens.positions import Positions, node_grid
-from snowsplat.data.lens.project import intrinsics, project
+from snowsplat.data.lens.project import LensModel, intrinsics, project
 
 # Radians: a pinhole image of a wider field has too many pixels near its border.
 _WIDEST = math.radians(120.0)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
 

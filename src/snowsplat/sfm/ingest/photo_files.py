@@ -16,9 +16,8 @@ from pathlib import Path, PurePosixPath
 from PIL import Image, ImageOps
 
 from snowsplat.data import image_file
-from snowsplat.data.colour_profile import is_transparent
+from snowsplat.data.colour_profile import is_transparent, plain_pixels
 from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
-from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import STITCHED, Panorama, panorama_in_xmp
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from snowsplat.data.plain_pixels import plain_pixels
+from snowsplat.data.colour_profile import plain_pixels
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     FIXED_SIDE,
