@@ -545,9 +545,7 @@ def _taken_together(posed: list[PosedImage]) -> dict[str, tuple[str, ...]]:
 
 
 def _listed(
-    names: list[str],
-    test_list: Path | str | Sequence[str],
-    together: Mapping[str, tuple[str, ...]],
+    names: list[str], test_list: Path | str | Sequence[str], together: Mapping[str, tuple[str, ...]]
 ) -> set[str]:
     """The image names in a test list; folder and suffix may be omitted if the rest is unique.
 

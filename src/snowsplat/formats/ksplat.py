@@ -137,12 +137,7 @@ def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_
 
 
 def _unpack(
-    path: Path,
-    data: bytes,
-    section: _Section,
-    level: int,
-    bounds: tuple[float, float],
-    rest: int,
+    path: Path, data: bytes, section: _Section, level: int, bounds: tuple[float, float], rest: int
 ) -> GaussianArrays:
     rows = np.frombuffer(data, section.row, section.count, section.rows_start)
     means: np.ndarray = rows["means"].astype(np.float32)

@@ -27,14 +27,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.spz_container import (
-    ANTIALIASED,
-    Header,
-    is_spz,
-    pack,
-    read_header,
-    unpack,
-)
+from snowsplat.formats.spz_container import ANTIALIASED, Header, is_spz, pack, read_header, unpack
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path

@@ -184,12 +184,7 @@ def _run(
     fingerprint, former = _fingerprints(sources.paths)
     if stages.settings("photos").get("input") == former:
         fingerprint = former
-    stage(
-        "photos",
-        {"input": fingerprint, **chosen},
-        ["input", "distorted/masks"],
-        gather_photos,
-    )
+    stage("photos", {"input": fingerprint, **chosen}, ["input", "distorted/masks"], gather_photos)
     photos = _photos(folder, outcomes["photos"].result)
     left.gathered(len(photos))
     if options.skip_matching:
@@ -284,11 +279,7 @@ def _undistort(
 
 
 def _check_free(
-    folder: Path,
-    in_place: bool,
-    sources: Sources,
-    options: DatasetOptions,
-    overwrite: bool,
+    folder: Path, in_place: bool, sources: Sources, options: DatasetOptions, overwrite: bool
 ) -> None:
     """Raises UserError if the dataset must not be written to ``folder``."""
     remove_temporaries(folder, (RECORD, REPORT))

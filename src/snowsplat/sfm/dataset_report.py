@@ -201,10 +201,7 @@ def _maps(
     placement: Placement | None,
 ) -> str:
     unit = "m" if placement is not None and placement.is_metric else "units"
-    captions = (
-        "From above. Orange: the cameras; white: the first camera.",
-        "From the side.",
-    )
+    captions = ("From above. Orange: the cameras; white: the first camera.", "From the side.")
     if len(marks):
         captions = (captions[0] + " Numbers: places for more photos.", captions[1])
     if any(photo.sequence is not None for photo in photos):

@@ -177,12 +177,7 @@ class SfmTimeLeft:
     """Adds the time left to the progress of the stages of `dataset_folder.make_dataset`."""
 
     def __init__(
-        self,
-        photos: Photos,
-        size: int | None,
-        effort: EffortName,
-        threads: int,
-        later: Later,
+        self, photos: Photos, size: int | None, effort: EffortName, threads: int, later: Later
     ) -> None:
         """
         Args:

@@ -186,10 +186,7 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
 def _posed(root: Path, shot: Shot) -> PosedImage:
     lens = shot.lens
     camera = Camera(
-        lens.width,
-        lens.height,
-        *intrinsics(lens)[:4],
-        torch.from_numpy(shot.cam_from_world.copy()),
+        lens.width, lens.height, *intrinsics(lens)[:4], torch.from_numpy(shot.cam_from_world.copy())
     )
     first, slash, _ = shot.photo.partition("/")
     folder = root / first if slash else root

@@ -280,9 +280,7 @@ def _of_colours(agreement: Agreement) -> str:
 
 def _mistake(repair: Repair, evidence: str) -> Finding:
     return Finding(
-        repair.about,
-        f"{evidence}; {repair.mistake}; correct the dataset",
-        impossible=True,
+        repair.about, f"{evidence}; {repair.mistake}; correct the dataset", impossible=True
     )
 
 

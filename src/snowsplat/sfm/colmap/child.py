@@ -154,10 +154,7 @@ def _run(
 
 
 def _communicate(
-    child: subprocess.Popen[str],
-    job: dict[str, Any],
-    report: Report,
-    figures: Figures,
+    child: subprocess.Popen[str], job: dict[str, Any], report: Report, figures: Figures
 ) -> dict[str, Any]:
     """Send the job, report progress until the child ends, and return its last line.
 

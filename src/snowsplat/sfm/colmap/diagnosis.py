@@ -6,12 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.sfm.colmap.database import (
-    Pair,
-    displacement_of,
-    feature_counts,
-    verified_pairs,
-)
+from snowsplat.sfm.colmap.database import Pair, displacement_of, feature_counts, verified_pairs
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
 

@@ -327,10 +327,7 @@ Refine = Callable[
 
 
 def settled(
-    model: pycolmap.Reconstruction,
-    photos: Sequence[Photo],
-    lens: Lens,
-    refine: Refine,
+    model: pycolmap.Reconstruction, photos: Sequence[Photo], lens: Lens, refine: Refine
 ) -> Settled:
     """Replace a lens in doubt by a possible one.
 

@@ -84,9 +84,7 @@ class Effort:
     def reduced(self) -> Effort:
         """An effort that needs about a third of the memory, to repeat a run after a crash."""
         return dataclasses.replace(
-            self,
-            image_size=self.image_size * 2 // 3,
-            features=self.features // 2,
+            self, image_size=self.image_size * 2 // 3, features=self.features // 2
         )
 
 

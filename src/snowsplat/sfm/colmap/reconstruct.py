@@ -67,13 +67,7 @@ from snowsplat.sfm.colmap.lens import (
     with_all_parameters,
 )
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
-from snowsplat.sfm.colmap.options import (
-    Effort,
-    Mapper,
-    SfmOptions,
-    SfmResult,
-    detection_size,
-)
+from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult, detection_size
 from snowsplat.sfm.colmap.pair_matching import match_pairs, verify_pairs
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.repair import repair

@@ -17,12 +17,7 @@ from pathlib import Path, PurePosixPath
 
 from snowsplat.data.files.mask_look import doubt_about_masks
 from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
-from snowsplat.sfm.ingest.gather_photos import (
-    Planned,
-    evenly_spread,
-    plan_photos,
-    write_photos,
-)
+from snowsplat.sfm.ingest.gather_photos import Planned, evenly_spread, plan_photos, write_photos
 from snowsplat.sfm.ingest.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside

@@ -22,13 +22,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.image_file import scaled_size
-from snowsplat.sfm.ingest.clip import (
-    Clip,
-    decoded_frames,
-    open_video,
-    undecodable,
-    video_stream,
-)
+from snowsplat.sfm.ingest.clip import Clip, decoded_frames, open_video, undecodable, video_stream
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     Crop,

@@ -109,11 +109,7 @@ def align(
         precision = precision[:, [0, 0, 1]]  # east, north, up
         # (N, 3, 7) derivatives of the positions by the rotation vector, log scale, translation.
         jacobian = np.concatenate(
-            [
-                -_cross(turned),
-                turned[:, :, None],
-                np.broadcast_to(np.eye(3), (len(turned), 3, 3)),
-            ],
+            [-_cross(turned), turned[:, :, None], np.broadcast_to(np.eye(3), (len(turned), 3, 3))],
             axis=2,
         )
         hessian = np.einsum("nij,ni,nik->jk", jacobian, precision, jacobian)

@@ -103,10 +103,7 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
     if north is not None:
         x, y, z = (round(float(v), 12) for v in rotation @ _horizontal(north.direction, direction))
         placement = replace(
-            placement,
-            north=(x, y, z),
-            north_from=north.name,
-            north_error=math.degrees(north.error),
+            placement, north=(x, y, z), north_from=north.name, north_error=math.degrees(north.error)
         )
     if gps is not None:
         scale = gps.alignment.scale
