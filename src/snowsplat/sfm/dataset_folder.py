@@ -131,16 +131,12 @@ def make_dataset(
             paths = [str(path.absolute()) for path in sources.inputs]
             stages.about = {"inputs": paths, "in_place": in_place}
             stages.save()  # from here on the folder is recognised as a dataset
-            left = _time_left(sources, options, later or Later())
+            photos = survey(sources, options.gather)
+            size, effort = options.gather.size, options.sfm.effort
+            threads = thread_count(options.sfm.threads)
+            left = SfmTimeLeft(photos, size, effort, threads, later or Later())
             alone = later is None
             return _run(stages, sources, folder, options, watcher, in_place, left, alone)
-
-
-def _time_left(sources: Sources, options: DatasetOptions, later: Later) -> SfmTimeLeft:
-    photos = survey(sources, options.gather)
-    sfm = options.sfm
-    threads = thread_count(sfm.threads)
-    return SfmTimeLeft(photos, options.gather.size, sfm.effort, threads, later)
 
 
 def _run(

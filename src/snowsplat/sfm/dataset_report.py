@@ -202,10 +202,10 @@ def _maps(
 ) -> str:
     unit = "m" if placement is not None and placement.is_metric else "units"
     captions = ("From above. Orange: the cameras; white: the first camera.", "From the side.")
-    if len(marks):
-        captions = (captions[0] + " Numbers: places for more photos.", captions[1])
-    if any(photo.sequence is not None for photo in photos):
-        captions = (captions[0] + " Blue: the path of the video.", captions[1])
+    above = "From above. Orange: the cameras; white: the first camera."
+    above += " Numbers: places for more photos." if len(marks) else ""
+    above += " Blue: the path of the video." if any(p.sequence is not None for p in photos) else ""
+    captions = (above, "From the side.")
     drawings = draw_scene(photos, xyz, rgb, marks, unit)
     # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
     figures = "\n".join(
@@ -254,10 +254,6 @@ def _reduced(path: Path) -> Image.Image:
     return small
 
 
-def _focal_from(camera: dict[str, Any]) -> str:
-    return _FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))]
-
-
 def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     rows = []
     for camera in sfm["cameras"]:
@@ -271,11 +267,12 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
         fisheye = str(camera["model"]).endswith("FISHEYE")
         angle = math.degrees(2 * (half if fisheye else math.atan(half)))
         parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
+        focal_from = _FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))]
         rows.append(
             [
                 str(camera["images"]),
                 f"{width} × {height}",
-                f"{focal:.0f} px ({angle:.0f}°), {_focal_from(camera)}",
+                f"{focal:.0f} px ({angle:.0f}°), {focal_from}",
                 f"{camera['model']} <span class='soft'>{parameters}</span>",
             ]
         )

@@ -184,14 +184,11 @@ def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[L
     """
     lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     try:
-        views = lens_views(lens, _circle(camera, masks) if _is_fisheye(camera) else None)
+        fisheye = not (camera.is_spherical() or camera.is_perspective_pinhole())
+        views = lens_views(lens, _circle(camera, masks) if fisheye else None)
     except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
         return ()
     return () if views[0].rotation is None else views
-
-
-def _is_fisheye(camera: pycolmap.Camera) -> bool:
-    return not (camera.is_spherical() or camera.is_perspective_pinhole())
 
 
 def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:

@@ -153,11 +153,9 @@ def read_export(
 def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstruction) -> None:
     if not found.shots:
         if not found.missing:
-            of_photos = (
-                f"none of its {found.total} photos is aligned" if found.total else "no photos"
-            )
+            none = f"none of its {found.total} photos is aligned" if found.total else "no photos"
             raise UserError(
-                f"{cameras}: {of_photos}; align them in {program}, "
+                f"{cameras}: {none}; align them in {program}, "
                 "or estimate the poses: snowsplat sfm PHOTOS -o DATASET"
             )
         raise UserError(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+from snowsplat.util.machine import processor_count
 
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
@@ -123,8 +124,4 @@ def photos_with_adjustment(count: int) -> int:
 
 def thread_count(threads: int | None) -> int:
     """Number of threads: ``threads``, or the number of processors that this process may use."""
-    if threads is not None:
-        return max(1, threads)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return processor_count() if threads is None else max(1, threads)

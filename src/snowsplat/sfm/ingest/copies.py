@@ -21,7 +21,7 @@ from PIL import Image, ImageOps
 
 from snowsplat.data.files.listing import folded
 from snowsplat.data.files.mask_pixels import has_shape, looks_like_mask
-from snowsplat.sfm.ingest.photo_files import Header, Unusable, open_image, read_header
+from snowsplat.sfm.ingest.photo_files import Unusable, open_image, read_header
 
 # What programs add to the name of a copy: "IMG (1)", "IMG - Copy (2)", "IMG copy", "IMG-edited".
 _COPY = re.compile(
@@ -197,12 +197,8 @@ def _best(root: Path, names: Sequence[str]) -> str:
             header.transparent,
             header.width * header.height,
             header.exif.focal is not None,
-            _is_jpeg(header),
+            header.format in ("JPEG", "MPO"),  # needs no conversion
             -added,
         )
 
     return max(names, key=value)
-
-
-def _is_jpeg(header: Header) -> bool:
-    return header.format in ("JPEG", "MPO")  # needs no conversion

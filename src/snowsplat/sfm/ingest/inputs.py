@@ -166,7 +166,7 @@ def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
     """
     found = spherical_video(clip.path)
     around = found is not None or options.panoramas
-    problem = found.problem if found else ""
+    problem = found or ""
     if around and not problem and not is_twice_as_wide(clip.width, clip.height):
         problem = f"has frames of {clip.width}x{clip.height} pixels"
     if problem:

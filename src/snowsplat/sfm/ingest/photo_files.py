@@ -85,13 +85,11 @@ class Header:
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
-        target = self.format if self.is_ready(longest) else self._new_format()
+        lossy = self.format in _LOSSY and not self.transparent
+        target = self.format if self.is_ready(longest) else "JPEG" if lossy else "PNG"
         path = PurePosixPath(name)
         fits = path.suffix.lower() in _SUFFIXES[target]
         return name if fits else str(path.with_suffix(_SUFFIXES[target][0]))
-
-    def _new_format(self) -> str:
-        return "JPEG" if self.format in _LOSSY and not self.transparent else "PNG"
 
 
 def read_header(path: Path) -> Header:
