@@ -18,7 +18,6 @@ from snowsplat.data.colmap.types import (
     ColmapCamera,
     ColmapImage,
     PointFile,
-    PointRecords,
     check_count,
     checked_camera,
     damaged,
@@ -233,7 +232,9 @@ def write_model(
     folder: Path,
     cameras: Mapping[int, ColmapCamera],
     images: Sequence[ColmapImage],
-    points: PointRecords,
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    tracks: Sequence[Sequence[tuple[int, int]]],
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin; see `model.write_model` for the arguments."""
     model_numbers = {name: number for number, (name, _) in enumerate(CAMERA_MODELS)}
@@ -249,11 +250,11 @@ def write_model(
         + _COUNT.pack(0)  # no observations
         for number, image in enumerate(images, 1)
     ]
-    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.tracks, strict=True)
+    rows = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
     point_records = [
-        struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.0, len(track))
+        struct.pack("<Q3d3BdQ", number, *position, *color, 0.0, len(track))
         + b"".join(struct.pack("<II", *pair) for pair in track)
-        for number, (xyz, rgb, track) in enumerate(rows, 1)
+        for number, (position, color, track) in enumerate(rows, 1)
     ]
     _write(folder / "cameras.bin", camera_records)
     _write(folder / "images.bin", image_records)

@@ -18,7 +18,6 @@ from snowsplat.data.colmap.types import (
     ColmapImage,
     ColmapModel,
     PointFile,
-    PointRecords,
 )
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.util.errors import UserError
@@ -138,5 +137,5 @@ def write_model(
         text: write .txt files.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    points = PointRecords(xyz, rgb, [()] * len(xyz) if tracks is None else tracks)
-    _FILES[text][0].write_model(folder, cameras, images, points)
+    tracks = [()] * len(xyz) if tracks is None else tracks
+    _FILES[text][0].write_model(folder, cameras, images, xyz, rgb, tracks)

@@ -17,7 +17,6 @@ from snowsplat.data.colmap.types import (
     ColmapCamera,
     ColmapImage,
     PointFile,
-    PointRecords,
     check_count,
     checked_camera,
     damaged,
@@ -264,7 +263,9 @@ def write_model(
     folder: Path,
     cameras: Mapping[int, ColmapCamera],
     images: Sequence[ColmapImage],
-    points: PointRecords,
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    tracks: Sequence[Sequence[tuple[int, int]]],
 ) -> None:
     """Write cameras.txt, images.txt and points3D.txt; see `model.write_model` for the arguments."""
     # repr() of a float is the shortest text that reads back as the same number.
@@ -277,10 +278,10 @@ def write_model(
         + "\n"  # the line of observations, empty
         for number, image in enumerate(images, 1)
     ]
-    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.tracks, strict=True)
+    rows = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
     point_lines = [
-        " ".join(map(str, (number, *xyz, *rgb, 0.0, *sum(track, ()))))
-        for number, (xyz, rgb, track) in enumerate(rows, 1)
+        " ".join(map(str, (number, *position, *color, 0.0, *sum(track, ()))))
+        for number, (position, color, track) in enumerate(rows, 1)
     ]
     _write(folder / "cameras.txt", "cameras", camera_lines)
     _write(folder / "images.txt", "images", image_lines)

@@ -74,15 +74,6 @@ class ColmapModel:
 
 
 @dataclass(frozen=True)
-class PointRecords:
-    """The 3D points of a model, as needed for writing. Point ids are 1, 2, …"""
-
-    xyz: np.ndarray  # (P, 3) float, world frame
-    rgb: np.ndarray  # (P, 3) uint8
-    tracks: Sequence[Sequence[tuple[int, int]]]  # per point: pairs (image id, observation index)
-
-
-@dataclass(frozen=True)
 class PointFile:
     """The 3D points of a file, and the tracks of up to `TRACKS` of them, spread over the file."""
 

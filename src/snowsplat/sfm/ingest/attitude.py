@@ -74,7 +74,8 @@ def read_attitude(
     heading = _compass(gps)
     if gravity is None and heading is None:
         return None
-    facing = None if heading is None else _north_of(heading)
+    # North in the frame of a level camera that looks at this azimuth.
+    facing = None if heading is None else np.array([-math.sin(heading), 0.0, math.cos(heading)])
     return Attitude(_rounded(gravity), _rounded(facing), gimbal=False)
 
 
@@ -157,11 +158,6 @@ def _compass(gps: Mapping[int, Any]) -> float | None:
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
     return math.radians(degrees) if 0 <= degrees <= 360 else None
-
-
-def _north_of(heading: float) -> np.ndarray:
-    """North in the frame of a level camera that looks at this azimuth."""
-    return np.array([-math.sin(heading), 0.0, math.cos(heading)])
 
 
 def _of_gravity(vector: Sequence[float]) -> np.ndarray | None:
