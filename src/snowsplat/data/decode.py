@@ -244,10 +244,8 @@ def _mask_of(levels: np.ndarray | None, source: ImageSource) -> Tensor:
 
 
 def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) -> np.ndarray:
-    """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down.
-
-    A view has several samples per pixel if the photo has more detail than the result.
-    """
+    """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down. A view has
+    several samples per pixel if the photo has more detail than the result."""
     if view is None:
         return resize_area(planes, width, height)
     ratio = view.width * planes.shape[2] / (view.lens.width * width)  # pixels of the photo, per one
@@ -302,9 +300,7 @@ def _planes(image: Image.Image, path: Path) -> np.ndarray:
 
 def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.ndarray:
     """Premultiplied RGBA (4, H, W), or RGB (3, H, W) over the background, from straight RGBA.
-
-    Modifies ``planes``.
-    """
+    Modifies ``planes``."""
     rows = max(1, _BAND_PIXELS // planes.shape[2])
     for top in range(0, planes.shape[1], rows):
         band = planes[:, top : top + rows]

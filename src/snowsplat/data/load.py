@@ -193,9 +193,7 @@ class _Poses:
 
 def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
     """What gives the poses of the images in a folder, or of a file; None if there is nothing.
-
-    ``deep``: also models in other folders than ``sparse``, which may be those of other photos.
-    """
+    ``deep``: also models in other folders than ``sparse``, which may be those of other photos."""
     export = find_export(root) if root.is_file() else None
     transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse")
@@ -256,8 +254,7 @@ def poses_in(root: Path) -> Path | None:
 
 def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
     """The same images, with ``IMG.png`` or ``IMG.jpg.png`` of the folder, or a file of another
-    format, as depth map of ``IMG.jpg``.
-    """
+    format, as depth map of ``IMG.jpg``."""
     if not folder.is_dir():
         return posed
     found = []
@@ -368,9 +365,7 @@ def _circles(
     images: Sequence[tuple[PosedImage, Header, tuple[int, int, bool]]],
 ) -> dict[LensModel, float]:
     """The radius in pixels of the image circle of each wide lens that has one; see `image_circle`.
-
-    Decodes a few photos of each of these lenses.
-    """
+    Decodes a few photos of each of these lenses."""
     # Photos may have a calibration each, of the same lens.
     kinds: dict[tuple[str, int, int], dict[LensModel, list[ImageSource]]] = {}
     for image, _, (width, height, sideways) in images:
@@ -534,10 +529,8 @@ def _test_names(
 
 
 def _taken_together(posed: list[PosedImage]) -> dict[str, tuple[str, ...]]:
-    """For each image name, those of its frame of a rig, sorted: the views of one panorama, …
-
-    They are held out together, as they show the same from the same place.
-    """
+    """For each image name, those of its frame of a rig, sorted: the views of one panorama, … They
+    are held out together, as they show the same from the same place."""
     frames: dict[str | tuple[str], list[str]] = {}
     for image in posed:
         frames.setdefault(image.frame or (image.name,), []).append(image.name)
@@ -548,9 +541,7 @@ def _listed(
     names: list[str], test_list: Path | str | Sequence[str], together: Mapping[str, tuple[str, ...]]
 ) -> set[str]:
     """The image names in a test list; folder and suffix may be omitted if the rest is unique.
-
-    ``together`` is that of `_taken_together`: what is left may also be the name of one frame.
-    """
+    ``together`` is that of `_taken_together`: what is left may also be the name of one frame."""
     if isinstance(test_list, str | Path):
         try:
             if Path(test_list).exists() and not is_file(Path(test_list)):

@@ -328,10 +328,8 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
 
 
 def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
-    """Focal length in pixels along an axis ("x" or "y"), or None.
-
-    It is read from ``fl_x``, ``camera_angle_x`` (radians) or ``x_fov`` (degrees).
-    """
+    """Focal length in pixels along an axis ("x" or "y"), or None. It is read from ``fl_x``,
+    ``camera_angle_x`` (radians) or ``x_fov`` (degrees)."""
     pixels = _number(where, values, f"fl_{axis}")
     angle = _number(where, values, f"camera_angle_{axis}")
     degrees = _number(where, values, f"{axis}_fov")

@@ -124,9 +124,7 @@ def _rational(
     where: str, polynomial: tuple[float, ...], largest: float
 ) -> tuple[float, float, float, float, float, float]:
     """k1 … k6 of OpenCV's rational function that equals 1 + k1·s + k2·s² + k3·s³ + k4·s⁴.
-
-    ``largest``: of s, the squared distance from the optical axis at z = 1.
-    """
+    ``largest``: of s, the squared distance from the optical axis at z = 1."""
     impossible = UserError(
         f"{where}: the lens distortion k4 = {polynomial[3]:g} cannot be undone; undistort the "
         "photos with the program that made the file"

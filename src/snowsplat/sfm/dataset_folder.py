@@ -231,10 +231,8 @@ def _run(
 def _gather(
     sources: Sources, folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
-    """Gather the photos into a temporary folder, then replace `input/` and the masks by them.
-
-    If the photos are in `input/` already (``in_place``), only the masks are written.
-    """
+    """Gather the photos into a temporary folder, then replace `input/` and the masks by them. If
+    the photos are in `input/` already (``in_place``), only the masks are written."""
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)

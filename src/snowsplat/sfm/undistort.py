@@ -227,10 +227,8 @@ def _pinhole(camera: pycolmap.Camera) -> Pinhole:
 
 
 def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
-    """Run jobs in threads; returns their results in any order.
-
-    After the first error or Ctrl-C, running jobs finish and the others are cancelled.
-    """
+    """Run jobs in threads; returns their results in any order. After the first error or Ctrl-C,
+    running jobs finish and the others are cancelled."""
     report(0, len(jobs), "photos")
     # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
     pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))

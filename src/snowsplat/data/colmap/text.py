@@ -244,8 +244,7 @@ def _pairs(track: str) -> np.ndarray:
 
 def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
     """The lines of a points3D.txt without their ends, the tracks; some of these go to ``tracks``,
-    by row.
-    """
+    by row."""
     every = 1
     for row, line in enumerate(filter(None, _lines(path))):
         words = line.split(maxsplit=8)

@@ -224,8 +224,7 @@ def _by_both(
 
 def _focal(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
     """Matches may lie near their epipolar lines with any focal length, if all cameras look at one
-    small object. But they are nearest with the right one.
-    """
+    small object. But they are nearest with the right one."""
     best, best_fit = None, fit
     for repair in zooms(rig):
         if (tried := matches.fit(repair.rig)).median < best_fit.median:

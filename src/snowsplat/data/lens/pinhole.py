@@ -112,10 +112,8 @@ def _without_blank_borders(lens: LensModel) -> Pinhole:
 
 
 def _to_photo(lens: LensModel, pinhole: Pinhole, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels.
-
-    NaN where the lens model is undefined.
-    """
+    """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels. NaN where the
+    lens model is undefined."""
     fx, fy, cx, cy = pinhole.params
     across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
     return project(lens, np.stack([across, down, np.ones_like(across)], -1))

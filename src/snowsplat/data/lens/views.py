@@ -279,10 +279,8 @@ _Turn = tuple[str, float, float]  # name, yaw and pitch in radians
 
 
 def _layout(rays: np.ndarray, across: float, down: float) -> list[_Turn]:
-    """The directions of the fewest views that cover ``rays`` (N, 3).
-
-    ``across``, ``down``: the largest angles in the horizontal and in the vertical direction.
-    """
+    """The directions of the fewest views that cover ``rays`` (N, 3). ``across``, ``down``: the
+    largest angles in the horizontal and in the vertical direction."""
     half = (_VIEW_ANGLE - _OVERLAP) / 2
     best: list[_Turn] = []
     for turns in _layouts(max(half / 2, across - half), max(half / 2, down - half)):

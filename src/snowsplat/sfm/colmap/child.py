@@ -108,10 +108,8 @@ def estimate_poses(
 
 
 def _check_disk(folder: Path) -> None:
-    """Raises OSError if there is no space for a larger file in ``folder``.
-
-    In this case, the full disk is the likely cause of the crash.
-    """
+    """Raises OSError if there is no space for a larger file in ``folder``. In this case, the full
+    disk is the likely cause of the crash."""
     try:
         largest = max(path.stat().st_size for path in folder.iterdir())
         with tempfile.TemporaryFile(dir=folder) as file:

@@ -446,10 +446,8 @@ def _nth_largest(values: Floats, n: int) -> float:
 
 
 def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
-    """The connected components of a graph of N nodes, as sorted lists of nodes.
-
-    ``linked``: (N, N) symmetric, whether two nodes have an edge.
-    """
+    """The connected components of a graph of N nodes, as sorted lists of nodes. ``linked``: (N, N)
+    symmetric, whether two nodes have an edge."""
     first, second = np.nonzero(linked)
     label = components(first, second, len(linked))
     return [np.flatnonzero(label == node).tolist() for node in np.unique(label)]
@@ -457,9 +455,7 @@ def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
 
 def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     """Divide photos into parts, until no part can be divided into two that contradict each other.
-
-    Of all candidates, the division with the smallest supported share of the demand is used.
-    """
+    Of all candidates, the division with the smallest supported share of the demand is used."""
     best = None
     for one in itertools.chain(_grown_groups(graph, photos), _sweep_cuts(graph, photos)):
         inside = set(one)
@@ -542,9 +538,7 @@ def _laplacian(weights: Floats) -> Floats:
 
 def _cut_weights(weights: Floats, order: Ints) -> Floats:
     """(N − 1,) the sum of the weights between the first k photos of ``order`` and the other photos.
-
-    The entries are those for k = 1, …, N − 1.
-    """
+    The entries are those for k = 1, …, N − 1."""
     sorted_weights = weights[np.ix_(order, order)]
     # When photo k joins the first photos, its edges to them are not cut any more, and its edges to
     # the other photos are cut.
@@ -553,10 +547,8 @@ def _cut_weights(weights: Floats, order: Ints) -> Floats:
 
 
 def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
-    """Join parts that have supported demand between them and do not contradict each other.
-
-    The two parts with the largest supported demand between them are joined first.
-    """
+    """Join parts that have supported demand between them and do not contradict each other. The two
+    parts with the largest supported demand between them are joined first."""
     parts = [sorted(part) for part in parts]
     while True:
         best = None

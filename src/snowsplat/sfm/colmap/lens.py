@@ -266,10 +266,8 @@ def _barrel(camera: pycolmap.Camera) -> float:
 
 
 def _implausible_distortion(camera: pycolmap.Camera) -> str:
-    """Why the distortion is not that of a lens, as text; empty: it is plausible.
-
-    Fisheye models and models without distortion are plausible.
-    """
+    """Why the distortion is not that of a lens, as text; empty: it is plausible. Fisheye models and
+    models without distortion are plausible."""
     if not camera.is_perspective_pinhole() or camera.is_undistorted():
         return ""
     ideal = _border(camera)
@@ -366,10 +364,8 @@ def settled(
 def _with_square_pixels(
     model: pycolmap.Reconstruction, lens: Lens, refine: Refine
 ) -> pycolmap.Reconstruction:
-    """``model`` with one focal length in cameras whose two differ, if it agrees equally well.
-
-    A camera model that the user has stated is kept.
-    """
+    """``model`` with one focal length in cameras whose two differ, if it agrees equally well. A
+    camera model that the user has stated is kept."""
     unequal = {}
     for number in _used(model):
         camera = model.cameras[number]

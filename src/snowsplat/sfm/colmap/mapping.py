@@ -304,10 +304,8 @@ class Mapping:
         min_points: int = MIN_POINTS,
         scales: Sequence[float] = _FINAL_LOSS_SCALES,
     ) -> pycolmap.Reconstruction:
-        """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss.
-
-        Changes ``model`` and returns it. ``min_points`` as in `_remove_outliers`.
-        """
+        """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss. Changes
+        ``model`` and returns it. ``min_points`` as in `_remove_outliers`."""
         self._remove_outliers(model, min_points)
         for scale in scales:
             if model.num_reg_images() < MIN_PHOTOS:
@@ -331,10 +329,8 @@ class Mapping:
         pycolmap.bundle_adjustment(model, options)
 
     def _remove_outliers(self, model: pycolmap.Reconstruction, min_points: int) -> None:
-        """Remove observations with a large error, flat points, and cameras with few points.
-
-        A camera remains if it sees at least ``min_points`` points.
-        """
+        """Remove observations with a large error, flat points, and cameras with few points. A
+        camera remains if it sees at least ``min_points`` points."""
         observations = pycolmap.ObservationManager(model)
         observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, self._min_angle)
         for image_id in list(model.reg_image_ids()):

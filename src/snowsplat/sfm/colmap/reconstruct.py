@@ -189,10 +189,8 @@ class PoseEstimation:
         )
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
-        """Make as many attempts as needed; returns the evidence of the last matching.
-
-        ``second`` is the path of the database for the attempts that have more features.
-        """
+        """Make as many attempts as needed; returns the evidence of the last matching. ``second`` is
+        the path of the database for the attempts that have more features."""
         first, mapper = self.folders.database, self.options.mapper
         matched = self._match(first, effort, effort, reserve=False)
         self.lens_evidence = lens_evidence(first, self.photos, matched.scale)
@@ -288,9 +286,7 @@ class PoseEstimation:
 
     def _other_lens(self, best: Attempt) -> list[str]:
         """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
-
-        The model FOV describes fisheye lenses, too.
-        """
+        The model FOV describes fisheye lenses, too."""
         if best.lens.any_fisheye or best.lens.model == "FOV":
             return []
         if not any(evidence.fisheye for evidence in self.lens_evidence.values()):
@@ -309,9 +305,7 @@ class PoseEstimation:
         self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
     ) -> Matched:
         """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
-
-        ``reserve``: whether the pairs of the reserve are matched, too.
-        """
+        ``reserve``: whether the pairs of the reserve are matched, too."""
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
@@ -335,10 +329,8 @@ class PoseEstimation:
         return more
 
     def _verify(self, matched: Matched, lens: Lens) -> None:
-        """Verify those matches of ``matched`` that are not verified yet.
-
-        The cameras of ``lens`` replace those in the database.
-        """
+        """Verify those matches of ``matched`` that are not verified yet. The cameras of ``lens``
+        replace those in the database."""
         set_cameras(matched.database, self.photos, lens)
         error, pairs = _MAX_ERROR * matched.scale, matched.choice.pairs
         verify_pairs(matched.database, pairs, error, self.threads, self.progress)
@@ -394,9 +386,7 @@ class PoseEstimation:
 
     def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> Lens:
         """Make attempts with several focal lengths per camera, if one does not fit all photos.
-
-        Returns the lens of further attempts.
-        """
+        Returns the lens of further attempts."""
         one, best = self.photos, self._best()
         if not camera_groups.may_differ(one):
             return lens

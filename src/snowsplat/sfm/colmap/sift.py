@@ -131,10 +131,8 @@ def read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _as_rows(keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
-    """Keypoints (N, 6), as in `Features`.
-
-    OpenCV measures positions from the centre of the first pixel.
-    """
+    """Keypoints (N, 6), as in `Features`. OpenCV measures positions from the centre of the first
+    pixel."""
     position = np.array([k.pt for k in keypoints]) + 0.5
     scale = np.array([k.size for k in keypoints]) / 2  # OpenCV has the diameter
     angle = np.radians([k.angle for k in keypoints])

@@ -133,10 +133,8 @@ def _apple_up(details: Mapping[int, Any]) -> np.ndarray | None:
 
 
 def _mapillary_up(exif: Image.Exif) -> np.ndarray | None:
-    """Up in the frame of the photo, apart from a quarter turn, from the description.
-
-    The axes are those of the phone; the app has turned the photo, but not the vector.
-    """
+    """Up in the frame of the photo, apart from a quarter turn, from the description. The axes are
+    those of the phone; the app has turned the photo, but not the vector."""
     description = exif.get(_DESCRIPTION)
     if not isinstance(description, str) or "MAPAccelerometerVector" not in description:
         return None

@@ -143,10 +143,8 @@ def _check(options: GatherOptions) -> None:
 
 
 def _with_panoramas(photos: list[Photo]) -> list[Photo]:
-    """The photos; those of a panorama's size are panoramas if most of this size are.
-
-    Not every panorama is recognised by its pixels: there may be an edge at a pole.
-    """
+    """The photos; those of a panorama's size are panoramas if most of this size are. Not every
+    panorama is recognised by its pixels: there may be an edge at a pole."""
     alike = [photo for photo in photos if is_twice_as_wide(photo.width, photo.height)]
     if 2 * sum(photo.panorama for photo in alike) < len(alike):
         return photos

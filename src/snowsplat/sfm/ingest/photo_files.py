@@ -159,10 +159,8 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _bits(path: Path, image: Image.Image) -> int:
-    """Bits per channel in the file.
-
-    The image mode does not show them, because Pillow converts 16-bit colours to 8 bits.
-    """
+    """Bits per channel in the file. The image mode does not show them, because Pillow converts
+    16-bit colours to 8 bits."""
     if image.format == "PNG":
         with open(path, "rb") as file:
             return file.read(25)[24]  # bit depth in the first chunk, IHDR

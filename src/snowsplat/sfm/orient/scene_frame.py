@@ -210,10 +210,8 @@ def _horizontal(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _viewing_direction(cameras: Cameras, up: np.ndarray) -> np.ndarray:
-    """(3,) unit vector: the horizontal part of the mean viewing direction.
-
-    If this part is too short, that of the viewing direction of the first camera.
-    """
+    """(3,) unit vector: the horizontal part of the mean viewing direction. If this part is too
+    short, that of the viewing direction of the first camera."""
     level = np.eye(3) - np.outer(up, up)
     forward = cameras.forward
     # If the first camera looks straight down, use the direction of its upper image edge.
