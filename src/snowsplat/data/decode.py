@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageOps
+from PIL.ExifTags import Base
 from torch import Tensor
 
 from snowsplat.data.bit_depth import eight_bits
@@ -35,7 +36,6 @@ _BAND_PIXELS = 1 << 20
 _SAMPLES = 2
 #: Suffixes that are tried if a dataset names its images without a suffix.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".avif")
-_EXIF_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def read_header(path: Path) -> Header:
     with _opened(path, header_only=True) as image:
         # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
         has_exif = "exif" in image.info or image.format == "TIFF"
-        orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if has_exif else 1
+        orientation = image.getexif().get(Base.Orientation, 1) if has_exif else 1
         return Header(image.width, image.height, sideways=orientation in (5, 6, 7, 8))
 
 

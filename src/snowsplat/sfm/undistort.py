@@ -32,7 +32,7 @@ from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
 from snowsplat.data.lens.project import LensModel
-from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.resample import PixelMap, undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, lens_views
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
@@ -80,7 +80,7 @@ class _Job:
 
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
-    views: Sequence[tuple[str, Pinhole | LensView]]  # the images of the photo, and their names
+    views: Sequence[tuple[str, PixelMap]]  # the images of the photo, and their names
     mask: bool  # whether the photo has a mask
 
     @property
@@ -137,7 +137,7 @@ def undistort(
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
         has_mask = photo is not None and photo.mask
         size = (camera.width, camera.height)
-        views: list[tuple[str, Pinhole | LensView]]
+        views: list[tuple[str, PixelMap]]
         if image.camera_id in wide:
             views = [(view_name(image.name, view), view) for view in wide[image.camera_id]]
         else:

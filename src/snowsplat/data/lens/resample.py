@@ -6,34 +6,16 @@ interpolation. Training uses every pixel, so blur added here would limit its qua
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
-
 import numpy as np
 from PIL import Image
 
 from snowsplat.data.lens.pinhole import Pinhole
-from snowsplat.data.lens.positions import Positions
 from snowsplat.data.lens.views import LensView
 from snowsplat.util import array_kernels
 from snowsplat.util.native_library import ArrayPointer
 
-
-class PixelMap(Protocol):
-    """From the pixels of a view to those of a photo: a `Pinhole` or a `LensView`."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
-
-    @property
-    def wraps(self) -> bool: ...
-
-    def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
-        """See `LensView.positions`."""
-        ...
+#: From the pixels of a view to those of a photo.
+PixelMap = Pinhole | LensView
 
 
 def undistort_image(image: Image.Image, view: PixelMap) -> Image.Image:

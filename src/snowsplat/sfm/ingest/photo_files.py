@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
+from PIL.ExifTags import Base
 
 from snowsplat.data import image_file
 from snowsplat.data.colour_profile import is_transparent, plain_pixels
 from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
-from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
+from snowsplat.sfm.ingest.exif import ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import STITCHED, Panorama, panorama_in_xmp
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
@@ -250,5 +251,5 @@ def link_or_copy(source: Path, target: Path) -> None:
 def made_upright(image: Image.Image, orientation: int) -> Image.Image:
     """Rotate and mirror an image as the EXIF ``orientation`` (1 to 8) says."""
     exif = image.getexif()
-    exif[ORIENTATION] = orientation
+    exif[Base.Orientation] = orientation
     return ImageOps.exif_transpose(image)
