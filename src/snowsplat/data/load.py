@@ -14,13 +14,13 @@ from snowsplat.data.colmap import find_models, find_models_below, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.files.masks import with_masks
 from snowsplat.data.files.photos import photos_below
 from snowsplat.data.imports import Export, find_export, read_export
 from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
-from snowsplat.data.mask_lookup import with_masks
 from snowsplat.data.near import near_of
 from snowsplat.data.place import moved_to_origin
 from snowsplat.data.transforms_json import find_transforms, read_transforms

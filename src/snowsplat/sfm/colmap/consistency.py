@@ -43,6 +43,8 @@ from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, follow
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
+# The points of a model: their ids (P,), ascending, and their positions (P, 3).
+_Points = tuple[NDArray[np.uint64], Floats]
 # One photo of a pair: the image, the id of the point that each matched feature observes, and the
 # positions (M, 2) of these features in the normalised image plane.
 _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
@@ -185,7 +187,8 @@ def check_pairs(
     """
     placed = set(model.reg_image_ids())
     points = {image_id: _point_ids(model.image(image_id)) for image_id in placed}
-    positions = _Positions.from_model(model)
+    ids = np.array(sorted(model.points3D), np.uint64)
+    xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
@@ -212,8 +215,8 @@ def check_pairs(
             both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
             error = max_error / float(focal)
             sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
-            missed = _misses(positions, sides[0], sides[1], _MIN_MISS_DISTANCE * error)
-            missed |= _misses(positions, sides[1], sides[0], _MIN_MISS_DISTANCE * error)
+            missed = _misses((ids, xyz), sides[0], sides[1], _MIN_MISS_DISTANCE * error)
+            missed |= _misses((ids, xyz), sides[1], sides[0], _MIN_MISS_DISTANCE * error)
             checked.append(
                 CheckedPair(
                     *(first, second, len(rows), int(is_hit.sum())),
@@ -285,24 +288,7 @@ def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
     return ids
 
 
-@dataclass(frozen=True)
-class _Positions:
-    """The positions of all points of a model."""
-
-    ids: NDArray[np.uint64]  # (P,) ascending
-    xyz: Floats  # (P, 3)
-
-    @staticmethod
-    def from_model(model: pycolmap.Reconstruction) -> _Positions:
-        ids = np.array(sorted(model.points3D), np.uint64)
-        xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
-        return _Positions(ids, xyz)
-
-    def __getitem__(self, ids: NDArray[np.uint64]) -> Floats:
-        return self.xyz[np.searchsorted(self.ids, ids)]
-
-
-def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
+def _misses(model: _Points, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
     """(M,) whether each match is a miss because of the point that its feature in ``one`` observes.
 
     The point is projected into the photo ``other``. The match is a miss if the distance between the
@@ -315,7 +301,7 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
     missed = np.zeros(len(ids), bool)
     rows = np.flatnonzero(ids != pycolmap.INVALID_POINT3D_ID)
     if len(rows):
-        points = positions[ids[rows]]
+        points = model[1][np.searchsorted(model[0], ids[rows])]
         camera = image.cam_from_world().matrix()
         seen = points @ camera[:, :3].T + camera[:, 3]
         if rays.shape[1] == 3:

@@ -160,7 +160,7 @@ def with_all_parameters(
     are not used where they would be impossible.
     """
     cameras, chosen = camera_ids(photos), []
-    for number in _used(model):
+    for number in used_cameras(model):
         camera, name = model.cameras[number], lens.model
         if name == "auto":
             enough = cameras.count(number) >= _MIN_PHOTOS_FOR_OPENCV
@@ -187,11 +187,16 @@ def _converted(camera: pycolmap.Camera, model: str) -> pycolmap.Camera:
 
 def exif_focals(photos: Sequence[Photo]) -> dict[int, float]:
     """The focal length of each camera in pixels, from EXIF; cameras without are left out."""
-    focals: dict[int, list[float]] = {}
-    for photo, number in zip(photos, camera_ids(photos), strict=True):
-        if photo.focal:
-            focals.setdefault(number, []).append(photo.focal)
-    return {number: float(np.median(values)) for number, values in focals.items()}
+    return focals_by_camera(photos, {i: p.focal for i, p in enumerate(photos, 1) if p.focal})
+
+
+def focals_by_camera(photos: Sequence[Photo], focals: Mapping[int, float]) -> dict[int, float]:
+    """The median focal length of the photos of each camera; ``focals`` by image id."""
+    values: dict[int, list[float]] = {}
+    for image_id, camera in enumerate(camera_ids(photos), 1):
+        if image_id in focals:
+            values.setdefault(camera, []).append(focals[image_id])
+    return {camera: float(np.median(known)) for camera, known in values.items()}
 
 
 def pixels_per_radian(camera: pycolmap.Camera) -> float:
@@ -367,7 +372,7 @@ def _with_square_pixels(
     """``model`` with one focal length in cameras whose two differ, if it agrees equally well. A
     camera model that the user has stated is kept."""
     unequal = {}
-    for number in _used(model):
+    for number in used_cameras(model):
         camera = model.cameras[number]
         # A panorama has no focal length: to ask for one ends the process.
         if lens.model != "auto" or camera.model_name != "OPENCV":
@@ -387,7 +392,7 @@ def _with_square_pixels(
 def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:
     """What is wrong or in doubt about the lenses of a model, as text for users."""
     found = []
-    for number in _used(model):
+    for number in used_cameras(model):
         camera = model.cameras[number]
         found += [finding.text for finding in findings_of(camera, None)]
         exif, focal = known.get(number), camera.mean_focal_length()
@@ -402,12 +407,12 @@ def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[
 def _impossible(model: pycolmap.Reconstruction) -> bool:
     return any(
         finding.impossible
-        for number in _used(model)
+        for number in used_cameras(model)
         for finding in findings_of(model.cameras[number], None)
     )
 
 
-def _used(model: pycolmap.Reconstruction) -> list[int]:
+def used_cameras(model: pycolmap.Reconstruction) -> list[int]:
     """The ids of the cameras of photos that have a pose."""
     return sorted({model.image(image_id).camera_id for image_id in model.reg_image_ids()})
 
@@ -420,3 +425,19 @@ def misfit(model: pycolmap.Reconstruction) -> float:
     """
     count = model.compute_num_observations()
     return model.compute_mean_reprojection_error() / count if count else float("inf")
+
+
+def robust_adjustment(
+    threads: int, tolerance: float, scale: float
+) -> pycolmap.BundleAdjustmentOptions:
+    """Bundle adjustment with a Cauchy loss of this ``scale`` in pixels.
+
+    It ends when an iteration reduces the cost by less than the share ``tolerance``.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.function_tolerance = tolerance
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale
+    return options

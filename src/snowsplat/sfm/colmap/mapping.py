@@ -22,6 +22,7 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.colmap.feature_alignment import align_features
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.incremental import IncrementalMapper
+from snowsplat.sfm.colmap.lens import robust_adjustment
 from snowsplat.sfm.colmap.options import Mapper, photos_with_adjustment
 from snowsplat.sfm.colmap.subset import spread_subset
 from snowsplat.sfm.colmap.view_graph import ViewGraph
@@ -319,13 +320,9 @@ class Mapping:
         self, model: pycolmap.Reconstruction, scale: float, tolerance: float = _FINAL_TOLERANCE
     ) -> None:
         """Run bundle adjustment; ``scale`` of the loss, in units of the mean reprojection error."""
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary = False
+        scale *= model.compute_mean_reprojection_error()
+        options = robust_adjustment(self.threads, tolerance, scale)
         options.refine_focal_length = not self.held
-        options.ceres.solver_options.num_threads = self.threads
-        options.ceres.solver_options.function_tolerance = tolerance
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
         pycolmap.bundle_adjustment(model, options)
 
     def _remove_outliers(self, model: pycolmap.Reconstruction, min_points: int) -> None:

@@ -63,6 +63,7 @@ from snowsplat.sfm.colmap.lens import (
     Refine,
     camera_ids,
     exif_focals,
+    focals_by_camera,
     settled,
     with_all_parameters,
 )
@@ -402,7 +403,7 @@ class PoseEstimation:
             if several is None or camera_ids(several) == camera_ids(before):
                 break
             self.photos = several
-            begin = dataclasses.replace(lens, focals=camera_groups.by_camera(several, focals))
+            begin = dataclasses.replace(lens, focals=focals_by_camera(several, focals))
             self._try("with several focal lengths", matched, mapper, begin)
             made, best = self.attempts.pop(), self._best()
             made_better = bool(made.models) and camera_groups.better(
