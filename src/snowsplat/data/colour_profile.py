@@ -46,13 +46,7 @@ def is_transparent(image: Image.Image) -> bool:
 def plain_pixels(image: Image.Image, path: Path) -> Image.Image:
     """An image of 8 bits per channel in sRGB: mode L, RGB, or RGBA if pixels may be transparent.
 
-    Args:
-        image: opened, not decoded.
-        path: its file.
-
-    Raises:
-        ValueError: floating-point pixels.
-        Exception: anything that Pillow raises for a damaged file.
+    Arguments and errors are those of `eight_bits`.
     """
     return to_srgb(eight_bits(image, path), path)
 

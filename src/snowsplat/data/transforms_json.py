@@ -32,7 +32,7 @@ import torch
 from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
-from snowsplat.data.files.photos import find_photos
+from snowsplat.data.files.photos import find_photos, warn_of_missing
 from snowsplat.data.imports.values import load_json
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.points_ply import read_points as read_points_ply
@@ -106,14 +106,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
         problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"
         hint = f" (the first is {quoted(missing[0])})" if missing else ""
         raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
-    if missing:
-        logger.warning(
-            "%s: %d of %d images are missing (the first is %s); skipped",
-            root / shown,
-            len(missing),
-            len(frames),
-            quoted(missing[0]),
-        )
+    warn_of_missing(root / shown, missing, len(frames))
     return list(posed.values()), _points(root, first_scene), shown
 
 

@@ -87,7 +87,7 @@ class PlyTable:
             else:
                 for _ in range(sum(e.count for e in self._before)):
                     if not file.readline():
-                        raise self._truncated()
+                        raise _truncated(self.path)
                 read = self._read_ascii
             for start in range(0, self.count, chunk):
                 yield start, read(file, dtype, min(chunk, self.count - start))
@@ -95,7 +95,7 @@ class PlyTable:
     def _read_binary(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
         data = file.read(count * dtype.itemsize)
         if len(data) < count * dtype.itemsize:
-            raise self._truncated()
+            raise _truncated(self.path)
         return np.frombuffer(data, dtype) if dtype.itemsize else np.empty(count, dtype)
 
     def _read_ascii(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
@@ -110,7 +110,7 @@ class PlyTable:
                 f"{self.path}: a row of the PLY file is not {len(self.columns)} numbers"
             ) from None
         if len(values) < count:
-            raise self._truncated()
+            raise _truncated(self.path)
         if values.shape[1] != len(self.columns):
             raise UserError(
                 f"{self.path}: the PLY file has {values.shape[1]} numbers per row, but its header "
@@ -127,9 +127,6 @@ class PlyTable:
         if len(line) == limit:
             raise UserError(f"{self.path}: a row of the PLY file is too long; export it again")
         return line
-
-    def _truncated(self) -> UserError:
-        return _truncated(self.path)
 
 
 def _truncated(path: Path) -> UserError:

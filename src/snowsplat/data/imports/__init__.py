@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from snowsplat.data.dataset import Points, PosedImage, safe_name
+from snowsplat.data.files.photos import warn_of_missing
 from snowsplat.data.imports import (
     alicevision,
     bundler,
@@ -163,14 +164,8 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
             f"{quoted(found.missing[0])}) is in {folder.root}; copy them to "
             f"{folder.root / 'images'}"
         )
-    if found.missing:
-        logger.warning(
-            "%s: %d of %d photos are missing (the first is %s); skipped",
-            cameras,
-            len(found.missing),
-            len(found.missing) + len(found.shots),
-            quoted(found.missing[0]),
-        )
+    aligned = len(found.missing) + len(found.shots)
+    warn_of_missing(cameras, found.missing, aligned, "photos")
     if found.points is None:
         with_depth = any(shot.depth is not None for shot in found.shots)
         logger.warning(

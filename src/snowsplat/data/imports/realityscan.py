@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.data.decode import read_header
 from snowsplat.data.imports.lenses import perspective
 from snowsplat.data.imports.points import points_beside
 from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
@@ -62,7 +63,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         found.total += 1
         if (photo := found.photo(photos, values["name"])) is None:
             continue
-        header = photos.header(photo)
+        header = read_header(photos.root / photo)
         width, height = header.width, header.height
         unit = max(width, height)
         focal = number(where, values, "f") * unit / 36.0

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from snowsplat.data.dataset import Points, safe_name
-from snowsplat.data.decode import IMAGE_SUFFIXES, Header, read_header
+from snowsplat.data.decode import IMAGE_SUFFIXES
 from snowsplat.data.files.listing import folded
 from snowsplat.data.files.photos import photos_below
 from snowsplat.data.lens.project import LensModel
@@ -57,14 +57,6 @@ class PhotoFolder:
         last = folded(PurePosixPath(name).name)
         index = self._index()
         return self._nearest(name, index.get(last) or index.get(_stem(last)) or [])
-
-    def header(self, file: str) -> Header:
-        """The header of a photo from `find`.
-
-        Raises:
-            UserError: it is not a readable image.
-        """
-        return read_header(self.root / file)
 
     def sorted_files(self) -> list[str]:
         """The photos of the folder of images, or of the root if there is none, sorted by name."""
