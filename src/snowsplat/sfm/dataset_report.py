@@ -201,7 +201,6 @@ def _maps(
     placement: Placement | None,
 ) -> str:
     unit = "m" if placement is not None and placement.is_metric else "units"
-    captions = ("From above. Orange: the cameras; white: the first camera.", "From the side.")
     above = "From above. Orange: the cameras; white: the first camera."
     above += " Numbers: places for more photos." if len(marks) else ""
     above += " Blue: the path of the video." if any(p.sequence is not None for p in photos) else ""

@@ -109,11 +109,10 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
 
     Hidden files, datasets and output folders are skipped; so are folders of masks, depth maps and
     thumbnails. Of photos of the same picture, one is used. Of a dataset, the photos in ``input`` or
-    ``images`` are used. Videos in a folder
-    with photos are also skipped, because some phones save a video of three seconds with every
-    photo. A zip file is unpacked into a folder beside it. If there is a single input, the files
-    keep their names. If there are several, each input folder and each video gets its own folder in
-    ``input/``, so that equal names do not collide.
+    ``images`` are used. Videos in a folder with photos are also skipped, because some phones save a
+    video of three seconds with every photo. A zip file is unpacked into a folder beside it. If
+    there is a single input, the files keep their names. If there are several, each input folder and
+    each video gets its own folder in ``input/``, so that equal names do not collide.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
