@@ -70,9 +70,7 @@ class Evidence:
     @property
     def more_effort_is_useless(self) -> bool:
         """Whether an attempt with more effort cannot find a model, if no model was found yet."""
-        if self.still or self.flat:
-            return True
-        return self.usable < 3
+        return self.still or self.flat or self.usable < 3
 
 
 def gather_evidence(database: Path, photos: Sequence[Photo], matched: int) -> Evidence:
