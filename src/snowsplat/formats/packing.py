@@ -17,6 +17,7 @@ import numpy as np
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.scene.sh_constants import SH_C0
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 logger = logging.getLogger(__name__)
 
@@ -35,10 +36,8 @@ _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no loga
 
 def read_file(path: Path) -> bytes:
     """The content of the file. Raises: UserError: the file cannot be read."""
-    try:
+    with reading(path):
         return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
 def check_count(path: Path, count: int, file_size: int) -> None:

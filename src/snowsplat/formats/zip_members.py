@@ -6,6 +6,8 @@ import io
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from snowsplat.util.safe_json import is_file, quoted
@@ -26,17 +28,24 @@ class Damaged(Exception):
     """The file is damaged. The caller adds the path to the message."""
 
 
+@contextmanager
+def reading_file(path: Path) -> Iterator[None]:
+    """Context for reading a file: raises `Damaged` if it is no file, or instead of `OSError`."""
+    try:
+        if not is_file(path):  # reading a pipe may never end
+            raise Damaged(f"{quoted(path.name)} is missing or not a file")
+        yield
+    except OSError as error:
+        raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
+
+
 class ZipMembers:
     """The members of a zip file. A context manager."""
 
     def __init__(self, path: Path) -> None:
         """Raises: Damaged: not a zip file, or one with an implausible directory."""
-        try:
-            if not is_file(path):  # reading a pipe may never end
-                raise Damaged(f"{quoted(path.name)} is missing or not a file")
+        with reading_file(path):
             self._file = _InBlocks(path)
-        except OSError as error:
-            raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
         try:
             self._zip = zipfile.ZipFile(self._file)
         except _ERRORS:

@@ -43,7 +43,7 @@ from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import remove_temporaries
+from snowsplat.util.files import new_folder, remove_temporaries
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
@@ -237,18 +237,13 @@ def _gather(
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)
         return asdict(gather(sources, folder, options, report))
-    new = folder / ".new"
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir()
-    try:
+    with new_folder(folder / ".new") as new:
         gathered = gather(sources, new, options, report)
         for part in (Path("input"), masks):
             shutil.rmtree(folder / part, ignore_errors=True)
             if (new / part).exists():
                 (folder / part).parent.mkdir(parents=True, exist_ok=True)
                 (new / part).rename(folder / part)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     return asdict(gathered)
 
 

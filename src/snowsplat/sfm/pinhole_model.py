@@ -17,6 +17,7 @@ from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.project import directions
 from snowsplat.data.lens.views import LensView
 from snowsplat.scene.geometry import Similarity
+from snowsplat.util.files import new_folder
 
 if TYPE_CHECKING:
     import pycolmap
@@ -47,13 +48,12 @@ def write_model(
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = list(pinhole.params)
     # Write to a folder with a temporary name, so that ``sparse`` never contains a part of a model.
-    new = sparse.with_name(f".{sparse.name}.new")
-    shutil.rmtree(new, ignore_errors=True)
-    (new / "0").mkdir(parents=True)
-    model.write(new / "0")
-    model.export_PLY(new / "0" / "points3D.ply")
-    shutil.rmtree(sparse, ignore_errors=True)
-    new.rename(sparse)
+    with new_folder(sparse.with_name(f".{sparse.name}.new")) as new:
+        (new / "0").mkdir()
+        model.write(new / "0")
+        model.export_PLY(new / "0" / "points3D.ply")
+        shutil.rmtree(sparse, ignore_errors=True)
+        new.rename(sparse)
 
 
 def view_name(photo: str, view: LensView) -> str:

@@ -17,6 +17,7 @@ from typing import BinaryIO
 import numpy as np
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 # Largest size of a header in bytes.
 _HEADER_LIMIT = 1 << 20
@@ -148,14 +149,11 @@ def open_table(path: Path | str, element: str = "vertex", data: bytes | None = N
         UserError: the file is missing, truncated, or not a PLY file, or its header is invalid.
     """
     path = Path(path)
-    try:
-        with _open(path, data) as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(0)
-            lines = _header_lines(path, file)
-            data_start = file.tell()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    with reading(path), _open(path, data) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        lines = _header_lines(path, file)
+        data_start = file.tell()
 
     format, elements = _parse_header(path, lines)
     names = [e.name for e in elements]

@@ -22,9 +22,9 @@ from snowsplat.data.colmap.types import (
     checked_camera,
     damaged,
     track_rows,
-    unreadable,
 )
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 _COUNT = struct.Struct("<Q")
 # Id, index into CAMERA_MODELS, width, height. The parameters (doubles) follow.
@@ -50,10 +50,8 @@ class _Cursor:
 
     def __init__(self, path: Path, kind: str, least_bytes: int) -> None:
         self.path = path
-        try:
+        with reading(path):
             self.data = path.read_bytes()
-        except OSError as error:
-            raise unreadable(path, error) from None
         self.offset = 0
         (self.count,) = self.take(_COUNT)
         if self.count * least_bytes > len(self.data) - self.offset:

@@ -21,10 +21,9 @@ from snowsplat.data.colmap.types import (
     checked_camera,
     damaged,
     track_rows,
-    unreadable,
 )
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import shown
+from snowsplat.util.files import reading, shown
 
 logger = logging.getLogger(__name__)
 
@@ -44,13 +43,10 @@ _LONGEST_TRACK = 1 << 16
 
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text file, without comments."""
-    try:
-        with open(path, encoding="utf-8", errors="surrogateescape") as file:
-            for line in file:
-                if not line.startswith("#"):
-                    yield line.strip()
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path), open(path, encoding="utf-8", errors="surrogateescape") as file:
+        for line in file:
+            if not line.startswith("#"):
+                yield line.strip()
 
 
 def _count_words(line: str) -> int:

@@ -99,11 +99,6 @@ def damaged(path: Path, problem: str) -> UserError:
     return UserError(f"{path}: damaged: {problem}; copy the file again or run COLMAP again")
 
 
-def unreadable(path: Path, error: OSError) -> UserError:
-    """The error for a file that the system cannot read."""
-    return UserError(f"{path}: cannot be read ({error.strerror or error})")
-
-
 def check_count(path: Path, kind: str, count: int) -> None:
     """Raise `UserError` if a file has too many cameras or images."""
     if count > _MAX_RECORDS:

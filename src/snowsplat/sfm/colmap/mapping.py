@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -27,6 +27,7 @@ from snowsplat.sfm.colmap.options import Mapper, photos_with_adjustment
 from snowsplat.sfm.colmap.subset import spread_subset
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 from snowsplat.sfm.progress import Report
+from snowsplat.util.files import new_folder
 
 # A camera that sees fewer points has no reliable pose. The alignment of features reduces their
 # errors to a third; then fewer points are sufficient.
@@ -288,16 +289,9 @@ class Mapping:
             models = pycolmap.global_mapping(self.database, self.images, output, options)
         return list(models.values())
 
-    @contextmanager
-    def _output(self) -> Iterator[Path]:
+    def _output(self) -> AbstractContextManager[Path]:
         """A temporary folder, into which COLMAP writes each model as soon as it is complete."""
-        output = self.database.with_suffix(".models")
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir()
-        try:
-            yield output
-        finally:
-            shutil.rmtree(output, ignore_errors=True)
+        return new_folder(self.database.with_suffix(".models"))
 
     def _refine(
         self,
@@ -355,11 +349,10 @@ def usable_models(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Recons
 
 def write_models(models: list[pycolmap.Reconstruction], sparse: Path) -> None:
     """Write the models as ``sparse/0``, ``sparse/1`` …; replaces the whole folder."""
-    temporary = sparse.with_name(f".{sparse.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    for number, model in enumerate(models):
-        folder = temporary / str(number)
-        folder.mkdir(parents=True)
-        model.write(folder)
-    shutil.rmtree(sparse, ignore_errors=True)
-    temporary.rename(sparse)
+    with new_folder(sparse.with_name(f".{sparse.name}.tmp")) as temporary:
+        for number, model in enumerate(models):
+            folder = temporary / str(number)
+            folder.mkdir()
+            model.write(folder)
+        shutil.rmtree(sparse, ignore_errors=True)
+        temporary.rename(sparse)

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import shown
+from snowsplat.util.files import new_folder, shown
 
 # Other archives, by their first bytes. They are named, not unpacked.
 _OTHERS = {b"Rar!": "RAR", b"7z\xbc\xaf": "7z", b"\x1f\x8b": "gzip", b"\xfd7zXZ": "xz"}
@@ -164,15 +164,10 @@ def _extract_all(
             f"disk: about {size / 1e6:,.0f} MB are needed to unpack {shown(folder.name)}.zip and "
             f"{free / 1e6:,.0f} MB are free; free some space"
         )
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    try:
+    with new_folder(folder.with_name(f".{folder.name}.{os.getpid()}.tmp")) as temporary:
         for name, info in entries:
             target = temporary / name
             target.parent.mkdir(parents=True, exist_ok=True)
             with archive.open(info) as packed, open(target, "xb") as file:
                 shutil.copyfileobj(packed, file)
         temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
