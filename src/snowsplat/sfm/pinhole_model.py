@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.project import directions
 from snowsplat.data.lens.views import LensView
 from snowsplat.scene.geometry import Similarity
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
 def write_model(
     model: pycolmap.Reconstruction,
-    pinholes: Mapping[int, Pinhole],
+    pinholes: Mapping[int, LensView],
     scene_from_sfm: Similarity,
     sparse: Path,
 ) -> None:
@@ -176,7 +175,7 @@ def _seen(view: LensView, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels, np.flatnonzero(seen)
 
 
-def _undistort_keypoints(image: pycolmap.Image, camera: pycolmap.Camera, pinhole: Pinhole) -> None:
+def _undistort_keypoints(image: pycolmap.Image, camera: pycolmap.Camera, pinhole: LensView) -> None:
     points = image.points2D
     if not len(points):
         return

@@ -30,10 +30,9 @@ from snowsplat.data.decode import resize_area
 from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.coverage import shown
-from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
 from snowsplat.data.lens.project import LensModel
-from snowsplat.data.lens.resample import PixelMap, undistort_image, undistort_mask
-from snowsplat.data.lens.views import LensView, lens_views
+from snowsplat.data.lens.resample import undistort_image, undistort_mask
+from snowsplat.data.lens.views import LensView, lens_views, pinhole_view
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -80,13 +79,13 @@ class _Job:
 
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
-    views: Sequence[tuple[str, PixelMap]]  # the images of the photo, and their names
+    views: Sequence[tuple[str, LensView]]  # the images of the photo, and their names
     mask: bool  # whether the photo has a mask
 
     @property
     def resampled(self) -> bool:
         """Whether the image differs from the photo."""
-        return not all(isinstance(v, Pinhole) and v.nodes is None for _, v in self.views)
+        return not all(view.is_photo for _, view in self.views)
 
 
 def undistort(
@@ -119,7 +118,7 @@ def undistort(
 
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
     known = {photo.name: photo for photo in photos}
-    wide, pinholes = dict[int, Sequence[LensView]](), dict[int, Pinhole]()
+    wide, pinholes = dict[int, Sequence[LensView]](), dict[int, LensView]()
     for number, camera in model.cameras.items():
         masked = [
             dataset / "distorted" / "masks" / f"{image.name}.png"
@@ -137,7 +136,6 @@ def undistort(
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
         has_mask = photo is not None and photo.mask
         size = (camera.width, camera.height)
-        views: list[tuple[str, PixelMap]]
         if image.camera_id in wide:
             views = [(view_name(image.name, view), view) for view in wide[image.camera_id]]
         else:
@@ -207,23 +205,23 @@ def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
     return reach if 0 < reach < _CIRCLE * radius.max() and is_full else None
 
 
-def _pinhole(camera: pycolmap.Camera) -> Pinhole:
+def _pinhole(camera: pycolmap.Camera) -> LensView:
     lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
     found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
     try:
-        pinhole = pinhole_of(lens)
+        view = pinhole_view(lens)
     except ValueError as error:
         raise UserError(
             f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
             "different positions, or set another camera_model"
         ) from None
-    if pinhole.cropped:
+    if view.cropped:
         logger.warning(
             "the estimated lens distortion (%s) is valid only near the centre of the photos, so "
             "images are cropped; another camera_model may keep more",
             found,
         )
-    return pinhole
+    return view
 
 
 def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
@@ -286,7 +284,7 @@ def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int
     written = 0
     for name, view in job.views:
         made = None if mask is None else undistort_mask(mask, view)
-        if isinstance(view, LensView):
+        if view.rotation is not None:
             made = _with_blank(made, view)
         if made is not None:
             _save(made, dataset / "masks" / f"{name}.png", "PNG")

@@ -18,7 +18,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from snowsplat.data.lens.pinhole import pinhole_of
+from snowsplat.data.lens.pinhole import is_pinhole, pinhole_of
 from snowsplat.data.lens.positions import Positions, node_grid
 from snowsplat.data.lens.project import LensModel, intrinsics, project
 
@@ -65,6 +65,11 @@ class LensView:
     circle: float | None = None
     partial: bool = False
     cropped: bool = False
+
+    @property
+    def is_photo(self) -> bool:
+        """Whether the view is the whole photo, as the lens has no distortion."""
+        return self.rotation is None and is_pinhole(self.lens)
 
     @property
     def wraps(self) -> bool:
@@ -128,6 +133,13 @@ class LensView:
             _, _, cx, cy, _ = intrinsics(self.lens)
             inside &= (x - cx) ** 2 + (y - cy) ** 2 <= self.circle**2
         return inside
+
+
+def pinhole_view(lens: LensModel) -> LensView:
+    """The only view of a lens that is not wide; raises the errors of `pinhole_of`."""
+    pinhole = pinhole_of(lens)
+    size = pinhole.width, pinhole.height
+    return LensView(lens, "", *size, pinhole.params, cropped=pinhole.cropped)
 
 
 def look(yaw: float, pitch: float) -> np.ndarray:
@@ -202,9 +214,7 @@ def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, 
     reach = [float(angle) for angle in field.reach[::quarter]]  # right, down, left, up
     across, down = reach[0] + reach[2], reach[1] + reach[3]
     if max(across, down) <= _WIDEST and circle is None:
-        pinhole = pinhole_of(lens)
-        size = pinhole.width, pinhole.height
-        return (LensView(lens, "", *size, pinhole.params, cropped=pinhole.cropped),)
+        return (pinhole_view(lens),)
     rays = field.rays()
     with np.errstate(divide="ignore"):
         half_angles = np.abs(np.arctan(rays[:, :2] / rays[:, 2:])).max(0)
