@@ -15,7 +15,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -118,29 +118,22 @@ def undistort(
 
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
     known = {photo.name: photo for photo in photos}
-    wide, pinholes = dict[int, Sequence[LensView]](), dict[int, LensView]()
+    views = dict[int, Sequence[LensView]]()
     for number, camera in model.cameras.items():
         masked = [
             dataset / "distorted" / "masks" / f"{image.name}.png"
             for image in (model.images[i] for i in sorted(model.reg_image_ids()))
             if image.camera_id == number and image.name in known and known[image.name].mask
         ]
-        several = _views_of_wide(camera, masked)
-        if several:
-            wide[number] = several
-        else:
-            pinholes[number] = _pinhole(camera)
+        views[number] = _views_of(camera, masked)
     jobs = []
     for number in model.reg_image_ids():
         image = model.images[number]
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
         has_mask = photo is not None and photo.mask
         size = (camera.width, camera.height)
-        if image.camera_id in wide:
-            views = [(view_name(image.name, view), view) for view in wide[image.camera_id]]
-        else:
-            views = [(image.name, pinholes[image.camera_id])]
-        jobs.append(_Job(image.name, size, views, has_mask))
+        named = [(view_name(image.name, view), view) for view in views[image.camera_id]]
+        jobs.append(_Job(image.name, size, named, has_mask))
     jobs.sort(key=lambda job: job.name)
     count = Counter(name for job in jobs for name, _ in job.views)
     for name in (name for name, times in count.items() if times > 1):
@@ -159,6 +152,8 @@ def undistort(
     masks = _run(
         [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
     )
+    wide = {number: some for number, some in views.items() if some[0].rotation is not None}
+    pinholes = {number: some[0] for number, some in views.items() if number not in wide}
     if wide:
         model = in_views(model, wide)
     write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
@@ -172,8 +167,8 @@ def undistort(
     )
 
 
-def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
-    """The pinhole views of a lens with a field of view of more than 120°; empty: it is not wide.
+def _views_of(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
+    """The pinhole views of a lens: several, turned ones if its field of view is more than 120°.
 
     A panorama has six, the sides of a cube with a margin.
 
@@ -181,12 +176,26 @@ def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[L
     show only the circle.
     """
     lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
-    try:
+    found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
+    with suppress(ValueError):  # then `pinhole_view` decides: a part of the photo, or an error
         fisheye = not (camera.is_spherical() or camera.is_perspective_pinhole())
         views = lens_views(lens, _circle(camera, masks) if fisheye else None)
-    except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
-        return ()
-    return () if views[0].rotation is None else views
+        if views[0].rotation is not None:
+            return views
+    try:
+        view = pinhole_view(lens)
+    except ValueError as error:
+        raise UserError(
+            f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
+            "different positions, or set another camera_model"
+        ) from None
+    if view.cropped:
+        logger.warning(
+            "the estimated lens distortion (%s) is valid only near the centre of the photos, so "
+            "images are cropped; another camera_model may keep more",
+            found,
+        )
+    return (view,)
 
 
 def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
@@ -203,25 +212,6 @@ def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
     # The masks of something in the middle of the photos are no image circle: they do not fill it.
     is_full = inside[radius < reach].mean() >= _FULL
     return reach if 0 < reach < _CIRCLE * radius.max() and is_full else None
-
-
-def _pinhole(camera: pycolmap.Camera) -> LensView:
-    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
-    found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
-    try:
-        view = pinhole_view(lens)
-    except ValueError as error:
-        raise UserError(
-            f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
-            "different positions, or set another camera_model"
-        ) from None
-    if view.cropped:
-        logger.warning(
-            "the estimated lens distortion (%s) is valid only near the centre of the photos, so "
-            "images are cropped; another camera_model may keep more",
-            found,
-        )
-    return view
 
 
 def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
