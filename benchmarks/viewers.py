@@ -36,7 +36,7 @@ from torch import Tensor
 
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.formats import GaussianArrays, read_gaussians, write_gaussians
-from snowsplat.formats.axis_conventions import UP_BACK
+from snowsplat.formats.packing import UP_BACK
 from snowsplat.formats.spz import write_spz
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.camera import Camera

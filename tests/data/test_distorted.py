@@ -18,8 +18,7 @@ from snowsplat.data.colmap.types import CAMERA_MODELS
 from snowsplat.data.decode import load_image, load_thumbnail
 from snowsplat.data.depth_file import to_z
 from snowsplat.data.judge.verdict import judge
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import intrinsics, project
+from snowsplat.data.lens.project import LensModel, intrinsics, project
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.util.errors import UserError
 

@@ -13,7 +13,7 @@ from PIL import Image
 from snowsplat.data import ImageLoader, ImageSource, View
 from snowsplat.data.decode import load_image, load_mask, load_views, resize_area
 from snowsplat.data.image_loader import available_memory
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import lens_views
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError

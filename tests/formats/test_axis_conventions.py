@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
+from snowsplat.formats.packing import UP_BACK, flip_axes
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at

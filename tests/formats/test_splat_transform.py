@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
 from snowsplat.formats.gaussian_arrays import GaussianArrays
+from snowsplat.formats.packing import UP_BACK, flip_axes
 from snowsplat.formats.spz import write_spz
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians

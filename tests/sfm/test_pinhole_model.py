@@ -5,10 +5,8 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import pinhole_of
-from snowsplat.data.lens.project import directions, project
-from snowsplat.data.lens.views import lens_views
+from snowsplat.data.lens.project import LensModel, directions, project
+from snowsplat.data.lens.views import lens_views, pinhole_view
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 
@@ -37,7 +35,7 @@ def found(model_of) -> pycolmap.Reconstruction:
 
 def written(model: pycolmap.Reconstruction, folder) -> pycolmap.Reconstruction:
     pinholes = {
-        number: pinhole_of(
+        number: pinhole_view(
             LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
         )
         for number, camera in model.cameras.items()

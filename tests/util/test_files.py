@@ -13,7 +13,13 @@ from pathlib import Path
 import pytest
 
 import snowsplat
-from snowsplat.util.files import atomic_path, remove_temporaries, write_json, write_text
+from snowsplat.util.files import (
+    atomic_path,
+    new_folder,
+    remove_temporaries,
+    write_json,
+    write_text,
+)
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(snowsplat.__file__).parents[1])}
 
@@ -119,3 +125,16 @@ def test_errors_name_the_target_and_not_the_temporary_file(tmp_path):
         other()
     assert caught.value.filename == str(tmp_path / "input.txt")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_new_folder_is_empty_and_removed_unless_it_was_renamed(tmp_path):
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "of a killed process").touch()
+    with new_folder(tmp_path / "new") as folder:
+        assert list(folder.iterdir()) == []
+        (folder / "file").touch()
+    assert list(tmp_path.iterdir()) == []
+    with new_folder(tmp_path / "new") as folder:
+        (folder / "file").touch()
+        folder.rename(tmp_path / "kept")
+    assert [path.name for path in tmp_path.rglob("*")] == ["kept", "file"]

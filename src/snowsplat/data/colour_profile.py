@@ -15,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageCms
+from PIL.ExifTags import IFD, Interop
+
+from snowsplat.data.bit_depth import eight_bits
 
 logger = logging.getLogger(__name__)
 
@@ -28,9 +31,8 @@ _SAME_COLOURS = 2
 _EXACT = {"L": ImageCms.Flags.NOOPTIMIZE}
 # What Pillow knows about the colours of a file; after the conversion, it is no longer true.
 _COLOUR_INFO = ("icc_profile", "transparency")
-# The version of EXIF's interoperability rules for Adobe RGB, and its place in the EXIF data.
+# The version of EXIF's interoperability rules for Adobe RGB.
 _ADOBE_RGB = "R03"
-_INTEROPERABILITY, _INDEX = 0xA005, 1
 
 _told: set[str] = set()  # the lines that were logged: one for all photos of a camera
 _lock = threading.Lock()
@@ -39,6 +41,14 @@ _lock = threading.Lock()
 def is_transparent(image: Image.Image) -> bool:
     """Whether an image has an alpha channel or a transparent colour."""
     return image.mode in _TRANSPARENT or "transparency" in image.info
+
+
+def plain_pixels(image: Image.Image, path: Path) -> Image.Image:
+    """An image of 8 bits per channel in sRGB: mode L, RGB, or RGBA if pixels may be transparent.
+
+    Arguments and errors are those of `eight_bits`.
+    """
+    return to_srgb(eight_bits(image, path), path)
 
 
 def to_srgb(image: Image.Image, path: Path) -> Image.Image:
@@ -138,7 +148,7 @@ def _profile_by_exif(image: Image.Image) -> bytes | None:
     if not isinstance(exif, bytes) or _ADOBE_RGB.encode() + b"\0" not in exif:
         return None  # most photos; the search is much faster than reading EXIF data
     try:
-        index = image.getexif().get_ifd(_INTEROPERABILITY).get(_INDEX)
+        index = image.getexif().get_ifd(IFD.Interop).get(Interop.InteropIndex)
     except Exception:  # as in `_transform`
         return None
     return _adobe_rgb() if str(index).strip("\0 ") == _ADOBE_RGB else None

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from snowsplat.data.bounds import EXTENT_FACTOR, scene_bounds
 from snowsplat.data.decode import ImageSource
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.util.errors import UserError

@@ -6,19 +6,21 @@ on the files beside it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image, ImageOps
+from PIL.ExifTags import Base
 from torch import Tensor
 
 from snowsplat.data.bit_depth import eight_bits
 from snowsplat.data.colour_profile import is_transparent, to_srgb
 from snowsplat.data.files.mask_pixels import mask_levels
-from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of
+from snowsplat.data.image_file import OPTIONAL_FORMATS, open_image, reason_of, scaled_size
 from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.resample import resampled
 from snowsplat.data.lens.views import LensView
@@ -34,7 +36,6 @@ _BAND_PIXELS = 1 << 20
 _SAMPLES = 2
 #: Suffixes that are tried if a dataset names its images without a suffix.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".avif")
-_EXIF_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
@@ -108,14 +109,11 @@ def read_header(path: Path) -> Header:
     Raises:
         UserError: the file is missing or is not a readable image.
     """
-    try:
-        with open_image(path, _FORMATS, header_only=True) as image:
-            # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
-            has_exif = "exif" in image.info or image.format == "TIFF"
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if has_exif else 1
-            return Header(image.width, image.height, sideways=orientation in (5, 6, 7, 8))
-    except Exception as error:  # Pillow raises many kinds of exceptions for damaged files
-        raise _unreadable(path, error) from None
+    with _opened(path, header_only=True) as image:
+        # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
+        has_exif = "exif" in image.info or image.format == "TIFF"
+        orientation = image.getexif().get(Base.Orientation, 1) if has_exif else 1
+        return Header(image.width, image.height, sideways=orientation in (5, 6, 7, 8))
 
 
 def load_image(source: ImageSource, background: Sequence[float] | None = None) -> Tensor:
@@ -163,14 +161,10 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
     Raises:
         UserError: the file is missing, damaged, or not an image.
     """
-    scale = min(1.0, side / max(source.width, source.height))
-    size = max(1, round(source.width * scale)), max(1, round(source.height * scale))
-    try:
-        with open_image(source.path, _FORMATS) as opened:
-            opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
-            planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
-    except Exception as error:  # as above
-        raise _unreadable(source.path, error) from None
+    size = scaled_size(source.width, source.height, side)
+    with _opened(source.path) as opened:
+        opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
+        planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
     if source.view is None:
         pictures = map(Image.fromarray, planes)
         small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in pictures]
@@ -229,21 +223,15 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def _decoded(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:
     """The photo of a source as stored: planes of `load_image` before they are scaled."""
-    try:
-        with open_image(source.path, _FORMATS) as opened:
-            planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
-    except Exception as error:  # as above
-        raise _unreadable(source.path, error) from None
+    with _opened(source.path) as opened:
+        planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
     return _with_alpha(planes, background) if planes.shape[0] == 4 else planes
 
 
 def _decoded_mask(source: ImageSource) -> np.ndarray:
     """(H, W) uint8: the levels of a mask as stored."""
-    try:
-        with open_image(source.path, _FORMATS) as opened:
-            return mask_levels(_upright(opened, source))
-    except Exception as error:  # as above
-        raise _unreadable(source.path, error) from None
+    with _opened(source.path) as opened:
+        return mask_levels(_upright(opened, source))
 
 
 def _mask_of(levels: np.ndarray | None, source: ImageSource) -> Tensor:
@@ -256,10 +244,8 @@ def _mask_of(levels: np.ndarray | None, source: ImageSource) -> Tensor:
 
 
 def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) -> np.ndarray:
-    """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down.
-
-    A view has several samples per pixel if the photo has more detail than the result.
-    """
+    """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down. A view has
+    several samples per pixel if the photo has more detail than the result."""
     if view is None:
         return resize_area(planes, width, height)
     ratio = view.width * planes.shape[2] / (view.lens.width * width)  # pixels of the photo, per one
@@ -314,9 +300,7 @@ def _planes(image: Image.Image, path: Path) -> np.ndarray:
 
 def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.ndarray:
     """Premultiplied RGBA (4, H, W), or RGB (3, H, W) over the background, from straight RGBA.
-
-    Modifies ``planes``.
-    """
+    Modifies ``planes``."""
     rows = max(1, _BAND_PIXELS // planes.shape[2])
     for top in range(0, planes.shape[1], rows):
         band = planes[:, top : top + rows]
@@ -329,11 +313,17 @@ def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.nd
     return planes if background is None else planes[:3].copy()
 
 
-def _unreadable(path: Path, error: Exception) -> UserError:
-    if not is_file(path):
-        return UserError(f"{path}: no such image")
-    if isinstance(error, PermissionError):
-        return UserError(f"{path}: no permission to read it")
-    return UserError(
-        f"{path}: cannot be decoded ({reason_of(error)}); replace the file or remove it"
-    )
+@contextmanager
+def _opened(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
+    """An image file. Raises UserError if it cannot be read, here or in the block."""
+    try:
+        with open_image(path, _FORMATS, header_only=header_only) as image:
+            yield image
+    except Exception as error:  # Pillow raises many kinds of exceptions for damaged files
+        if not is_file(path):
+            raise UserError(f"{path}: no such image") from None
+        if isinstance(error, PermissionError):
+            raise UserError(f"{path}: no permission to read it") from None
+        raise UserError(
+            f"{path}: cannot be decoded ({reason_of(error)}); replace the file or remove it"
+        ) from None

@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
-_EXIF_IFD = 0x8769
-_EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
+_TAGS = (Base.ExposureTime, Base.FNumber, Base.ISOSpeedRatings)
 
 
 def exif_exposure(path: Path) -> float | None:
@@ -25,8 +25,8 @@ def exif_exposure(path: Path) -> float | None:
             # Without EXIF data before the pixels of a PNG, getexif() would decode them.
             if "exif" not in image.info:
                 return None
-            details = image.getexif().get_ifd(_EXIF_IFD)
-        time, stop, iso = (float(details[tag]) for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
+            details = image.getexif().get_ifd(IFD.Exif)
+        time, stop, iso = (float(details[tag]) for tag in _TAGS)
         return math.log2(time * iso / stop**2)
     except Exception:  # Pillow raises many kinds of exceptions for damaged files
         return None

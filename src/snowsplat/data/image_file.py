@@ -82,6 +82,14 @@ def reason_of(error: Exception) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
+def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
+    """The size with its longest side at most ``longest``; never enlarged."""
+    if longest is None or max(width, height) <= longest:
+        return width, height
+    scale = longest / max(width, height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 def _check_header(file: BinaryIO) -> None:
     start = file.read(len(_PNG))
     if start == _PNG:

@@ -199,9 +199,7 @@ class ImageLoader:
 
     def _store(self, key: _Key, image: LoadedImage) -> None:
         """Add an image to the cache and remove others until the budget holds. Needs the lock.
-
-        Images that were decoded ahead and not yet requested are removed last.
-        """
+        Images that were decoded ahead and not yet requested are removed last."""
         if key not in self._cache:
             self._cached_bytes += image.nbytes
         self._cache[key] = image

@@ -14,13 +14,13 @@ from snowsplat.data.colmap import find_models, find_models_below, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
+from snowsplat.data.files.masks import with_masks
 from snowsplat.data.files.photos import photos_below
 from snowsplat.data.imports import Export, find_export, read_export
 from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
-from snowsplat.data.mask_lookup import with_masks
 from snowsplat.data.near import near_of
 from snowsplat.data.place import moved_to_origin
 from snowsplat.data.transforms_json import find_transforms, read_transforms
@@ -177,15 +177,8 @@ def read_files(
         raise UserError(f"{root}: has two images named {repeated}; remove one")
     _warn_of_cropped(posed)
     found = list(zip(posed, headers, sizes, strict=True))
-    return DatasetFiles(
-        root,
-        found,
-        _circles(found),
-        points,
-        description,
-        _test_names(posed, hold_out, first_held_out, test_list),
-        origin,
-    )
+    names = _test_names(posed, hold_out, first_held_out, test_list)
+    return DatasetFiles(root, found, _circles(found), points, description, names, origin)
 
 
 @dataclass(frozen=True)
@@ -200,17 +193,14 @@ class _Poses:
 
 def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
     """What gives the poses of the images in a folder, or of a file; None if there is nothing.
-
-    ``deep``: also models in other folders than ``sparse``, which may be those of other photos.
-    """
+    ``deep``: also models in other folders than ``sparse``, which may be those of other photos."""
     export = find_export(root) if root.is_file() else None
     transforms = [] if export else find_transforms(root)
     models = find_models(root / "sparse")
     if deep and not transforms:
         models = models or find_models(root) or find_models(root / "colmap" / "sparse")
-    if (
-        deep and not transforms and not (models and (root / images).is_dir())
-    ):  # dense/0/sparse, sfm …
+    # dense/0/sparse, sfm …
+    if deep and not transforms and not (models and (root / images).is_dir()):
         models = find_models_below(root, images) or models
     if models:
         return _Poses(models, [], None)
@@ -264,8 +254,7 @@ def poses_in(root: Path) -> Path | None:
 
 def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
     """The same images, with ``IMG.png`` or ``IMG.jpg.png`` of the folder, or a file of another
-    format, as depth map of ``IMG.jpg``.
-    """
+    format, as depth map of ``IMG.jpg``."""
     if not folder.is_dir():
         return posed
     found = []
@@ -376,9 +365,7 @@ def _circles(
     images: Sequence[tuple[PosedImage, Header, tuple[int, int, bool]]],
 ) -> dict[LensModel, float]:
     """The radius in pixels of the image circle of each wide lens that has one; see `image_circle`.
-
-    Decodes a few photos of each of these lenses.
-    """
+    Decodes a few photos of each of these lenses."""
     # Photos may have a calibration each, of the same lens.
     kinds: dict[tuple[str, int, int], dict[LensModel, list[ImageSource]]] = {}
     for image, _, (width, height, sideways) in images:
@@ -542,10 +529,8 @@ def _test_names(
 
 
 def _taken_together(posed: list[PosedImage]) -> dict[str, tuple[str, ...]]:
-    """For each image name, those of its frame of a rig, sorted: the views of one panorama, …
-
-    They are held out together, as they show the same from the same place.
-    """
+    """For each image name, those of its frame of a rig, sorted: the views of one panorama, … They
+    are held out together, as they show the same from the same place."""
     frames: dict[str | tuple[str], list[str]] = {}
     for image in posed:
         frames.setdefault(image.frame or (image.name,), []).append(image.name)
@@ -553,14 +538,10 @@ def _taken_together(posed: list[PosedImage]) -> dict[str, tuple[str, ...]]:
 
 
 def _listed(
-    names: list[str],
-    test_list: Path | str | Sequence[str],
-    together: Mapping[str, tuple[str, ...]],
+    names: list[str], test_list: Path | str | Sequence[str], together: Mapping[str, tuple[str, ...]]
 ) -> set[str]:
     """The image names in a test list; folder and suffix may be omitted if the rest is unique.
-
-    ``together`` is that of `_taken_together`: what is left may also be the name of one frame.
-    """
+    ``together`` is that of `_taken_together`: what is left may also be the name of one frame."""
     if isinstance(test_list, str | Path):
         try:
             if Path(test_list).exists() and not is_file(Path(test_list)):

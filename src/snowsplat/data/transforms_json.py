@@ -32,14 +32,15 @@ import torch
 from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.decode import IMAGE_SUFFIXES, read_header
-from snowsplat.data.files.photos import find_photos
+from snowsplat.data.files.photos import find_photos, warn_of_missing
+from snowsplat.data.imports.values import load_json
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.transforms_lens import is_panorama, lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import inside, is_file, quoted, read_json
+from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
 
@@ -48,6 +49,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 # Parts of a path of another computer that are tried.
 _MOST_PARTS = 16
+# Memory for JSON values per byte of the text.
+_JSON_RATIO = 2
 # Two statements of a focal length differ by less than this factor, or contradict each other.
 _SAME_LENS = 1.05
 
@@ -103,14 +106,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
         problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"
         hint = f" (the first is {quoted(missing[0])})" if missing else ""
         raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
-    if missing:
-        logger.warning(
-            "%s: %d of %d images are missing (the first is %s); skipped",
-            root / shown,
-            len(missing),
-            len(frames),
-            quoted(missing[0]),
-        )
+    warn_of_missing(root / shown, missing, len(frames))
     return list(posed.values()), _points(root, first_scene), shown
 
 
@@ -194,14 +190,7 @@ def _posed_image(
 
 
 def _read_json(path: Path) -> _Json:
-    try:
-        scene = read_json(path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValueError as error:  # not JSON, or not even text
-        raise UserError(
-            f"{path}: not a complete JSON file ({str(error)[:80]}); copy it again"
-        ) from None
+    scene = load_json(path, _JSON_RATIO)
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
         raise UserError(f"{path}: has no list of frames, so it does not describe a dataset")
     return scene
@@ -332,10 +321,8 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
 
 
 def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
-    """Focal length in pixels along an axis ("x" or "y"), or None.
-
-    It is read from ``fl_x``, ``camera_angle_x`` (radians) or ``x_fov`` (degrees).
-    """
+    """Focal length in pixels along an axis ("x" or "y"), or None. It is read from ``fl_x``,
+    ``camera_angle_x`` (radians) or ``x_fov`` (degrees)."""
     pixels = _number(where, values, f"fl_{axis}")
     angle = _number(where, values, f"camera_angle_{axis}")
     degrees = _number(where, values, f"{axis}_fov")

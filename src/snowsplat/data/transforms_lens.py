@@ -12,31 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE = frozenset(
     {
-        "PINHOLE",
-        "SIMPLE_PINHOLE",
-        "PERSPECTIVE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "FULL_OPENCV",
-        "BROWN",
+        *("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"),
+        *("OPENCV", "FULL_OPENCV", "BROWN"),
     }
 )
 _FISHEYE = frozenset(
     {
-        "FISHEYE",
-        "OPENCV_FISHEYE",
-        "SIMPLE_FISHEYE",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-        "THIN_PRISM_FISHEYE",
+        *("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE"),
+        *("RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
     }
 )
 #: Project Aria's model, in nerfstudio's and in COLMAP's name; it has a list of coefficients.
@@ -134,9 +124,7 @@ def _rational(
     where: str, polynomial: tuple[float, ...], largest: float
 ) -> tuple[float, float, float, float, float, float]:
     """k1 … k6 of OpenCV's rational function that equals 1 + k1·s + k2·s² + k3·s³ + k4·s⁴.
-
-    ``largest``: of s, the squared distance from the optical axis at z = 1.
-    """
+    ``largest``: of s, the squared distance from the optical axis at z = 1."""
     impossible = UserError(
         f"{where}: the lens distortion k4 = {polynomial[3]:g} cannot be undone; undistort the "
         "photos with the program that made the file"

@@ -64,10 +64,8 @@ def read_arrays(path: Path | str) -> GaussianArrays:
 
 
 def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:
-    """Warn if the positions in a file are rounded by more than a tenth of a Gaussian.
-
-    float32 is coarse far away from 0; only a program that has the exact positions can mend this.
-    """
+    """Warn if the positions in a file are rounded by more than a tenth of a Gaussian. float32 is
+    coarse far away from 0; only a program that has the exact positions can mend this."""
     sample = scene.select(slice(None, None, len(scene.means) // _SAMPLE + 1))
     sample = sample.select(sample.usable_rows())
     if not len(sample.means):

@@ -26,10 +26,9 @@ def levels_for(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     This is Lloyd's iteration with exact steps: in sorted values, the cell of a level is an
     interval, and its mean is computed from cumulative sums. Initially, the density of levels is
     proportional to the cube root of the density of values, which is optimal for many levels (P.
-    Panter and W. Dite,
-    "Quantization distortion in pulse-count modulation with nonuniform spacing of levels", 1951).
-    Between two quantiles at distance d the density of values is proportional to 1/d, so this
-    interval receives a share of levels proportional to d · d^(-1/3).
+    Panter and W. Dite, "Quantization distortion in pulse-count modulation with nonuniform spacing
+    of levels", 1951). Between two quantiles at distance d the density of values is proportional to
+    1/d, so this interval receives a share of levels proportional to d · d^(-1/3).
     """
     if not values.size:
         return np.zeros(LEVELS, np.float32), np.zeros(values.shape, np.uint8)

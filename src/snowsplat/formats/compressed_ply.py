@@ -139,10 +139,8 @@ def _largest_integers(layout: tuple[tuple[int, int], ...]) -> np.ndarray:
 def _dequantize(
     low: np.ndarray, high: np.ndarray, fields: np.ndarray, steps: np.ndarray | int
 ) -> np.ndarray:
-    """(N, 3) values of ``fields`` (N, 3), 0 … ``steps``, between the bounds of their chunk.
-
-    ``low`` and ``high`` are (chunks, 3).
-    """
+    """(N, 3) values of ``fields`` (N, 3), 0 … ``steps``, between the bounds of their chunk. ``low``
+    and ``high`` are (chunks, 3)."""
     chunk = np.arange(len(fields)) // _CHUNK
     t = fields / np.float32(steps)
     return low[chunk] * (1 - t) + high[chunk] * t

@@ -46,9 +46,7 @@ class GaussianArrays:
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianArrays:
-        """The parameters without their gradients; shares memory where they are float32 on the
-        CPU.
-        """
+        """The parameters without gradients; shares memory where they are float32 on the CPU."""
         tensors = gaussians.parameters().values()
         arrays = (tensor.detach().cpu().float().numpy() for tensor in tensors)
         return cls(*arrays, antialiased=gaussians.antialiased, origin=gaussians.origin)

@@ -19,6 +19,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from snowsplat.formats.zip_members import Damaged
 from snowsplat.util.safe_json import inside, is_file, parse_json, quoted
 
 MAGIC = b"glTF"
@@ -33,10 +34,6 @@ _COMPONENTS = {
     5123: ("<u2", 65535.0),
     5126: ("<f4", 1.0),
 }
-
-
-class Damaged(Exception):
-    """The file is damaged or not supported. The caller adds the path to the message."""
 
 
 class Document:

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats import glb, packing
-from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.glb import Damaged, Document
+from snowsplat.formats.glb import Document
+from snowsplat.formats.zip_members import Damaged
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -91,9 +91,11 @@ def read_gltf(path: Path | str) -> GaussianArrays:
     for note in sorted(notes):
         logger.warning("%s: %s", path, note)
     scene = GaussianArrays.cat(placed)
-    means, quats, sh_rest = flip_axes(scene.means, scene.quats, scene.sh_rest, UP_BACK)
+    means, quats, sh_rest = packing.flip_axes(
+        scene.means, scene.quats, scene.sh_rest, packing.UP_BACK
+    )
     if any(any(part.origin) for part in placed):
-        means = np.concatenate([part.world_means() for part in placed]) * UP_BACK
+        means = np.concatenate([part.world_means() for part in placed]) * packing.UP_BACK
     return decoded(path, means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
 
 
@@ -252,7 +254,7 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     """
     path = Path(path)
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
-    means, quats, sh_rest = flip_axes(means, quats, sh_rest, UP_BACK)
+    means, quats, sh_rest = packing.flip_axes(means, quats, sh_rest, packing.UP_BACK)
     opacity = (1 / (1 + np.exp(-opacity_logits))).astype("<f4")
     cut = packing.Cut(path, "glTF", len(means))
     packing.cut_scales(cut, log_scales, *_LOG_SCALES, step=0)
@@ -291,14 +293,8 @@ def _contents(
     for array in arrays:
         count, width = array.shape
         colors = array.dtype == np.uint8
-        views.append(
-            {
-                "buffer": 0,
-                "byteOffset": offset,
-                "byteLength": array.nbytes,
-                "target": _VERTICES,
-            }
-        )
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES}
+        views.append(view)
         accessors.append(
             {
                 "bufferView": len(accessors),
@@ -311,6 +307,9 @@ def _contents(
         offset += array.nbytes
     # The specification requires the bounds of POSITION, as exact float32 values.
     accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}
+    node: dict[str, Any] = {"mesh": 0, "name": "splats"}
+    if any(translation):
+        node["translation"] = list(translation)
     primitive = {
         "attributes": {name: index for index, name in enumerate(names)},
         "mode": _POINTS,
@@ -319,13 +318,7 @@ def _contents(
     return {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [
-            {
-                "mesh": 0,
-                "name": "splats",
-                **({"translation": list(translation)} if any(translation) else {}),
-            }
-        ],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -41,20 +41,14 @@ _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 @dataclass
 class _Section:
-    """A section: the numbers of its Gaussians and buckets, and their offsets in the file."""
+    """A section of the file."""
 
-    count: int
+    rows: np.ndarray  # (N,) structured: means, scales, quats, rgba, sh
     sh_degree: int
-    row: np.dtype
-    bucket_size: int
-    full_buckets: int
-    partial_buckets: int
-    bucket_count: int
     step: float  # world units of one step of a uint16 position
     offset: int  # the uint16 value of the position 0
-    start: int
-    centers_start: int
-    rows_start: int
+    centers: np.ndarray  # (buckets, 3)
+    ends: np.ndarray  # for each bucket with Gaussians, the index after its last one
 
 
 @np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
@@ -81,7 +75,7 @@ def read_ksplat(path: Path | str) -> GaussianArrays:
     # The first part is empty, so that a file without sections gives an empty scene.
     parts = [GaussianArrays.empty(SH_REST_COUNTS[degree])]
     for section in sections:
-        parts.append(_unpack(path, data, section, level, bounds, SH_REST_COUNTS[degree]))
+        parts.append(_unpack(section, level, bounds, SH_REST_COUNTS[degree]))
     return decoded(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
 
 
@@ -115,46 +109,36 @@ def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_
         end = rows_start + row.itemsize * capacity
         if end > len(data):
             raise _damaged(path)
+        centers, ends = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
+        if level:
+            centers = np.frombuffer(data, "<f4", 3 * bucket_count, centers_start).reshape(-1, 3)
+            # The full buckets come first, then the others.
+            ends = bucket_size * np.arange(1, full + 1, dtype=np.int64)
+            sizes = np.frombuffer(data, "<u4", partial, start)
+            others = bucket_size * full + np.cumsum(sizes, dtype=np.int64)
+            ends = np.concatenate([ends, others])
+            if count > (ends[-1] if len(ends) else 0):
+                raise _damaged(path)
+        rows = np.frombuffer(data, row, count, rows_start)
         span = span or _DEFAULT_RANGE
-        sections.append(
-            _Section(
-                count=count,
-                sh_degree=sh,
-                row=row,
-                bucket_size=bucket_size,
-                full_buckets=full,
-                partial_buckets=partial,
-                bucket_count=bucket_count,
-                step=block / 2 / span,
-                offset=span,
-                start=start,
-                centers_start=centers_start,
-                rows_start=rows_start,
-            )
-        )
+        sections.append(_Section(rows, sh, block / 2 / span, span, centers, ends))
         start = end
     return sections
 
 
 def _unpack(
-    path: Path,
-    data: bytes,
-    section: _Section,
-    level: int,
-    bounds: tuple[float, float],
-    rest: int,
+    section: _Section, level: int, bounds: tuple[float, float], rest: int
 ) -> GaussianArrays:
-    rows = np.frombuffer(data, section.row, section.count, section.rows_start)
+    rows = section.rows
     means: np.ndarray = rows["means"].astype(np.float32)
     if level:
-        centers = np.frombuffer(data, "<f4", 3 * section.bucket_count, section.centers_start)
-        bucket = _buckets(path, data, section)
-        means = (means - section.offset) * np.float32(section.step) + centers.reshape(-1, 3)[bucket]
+        bucket = np.searchsorted(section.ends, np.arange(len(rows)), side="right")
+        means = (means - section.offset) * np.float32(section.step) + section.centers[bucket]
     harmonics = rows["sh"].astype(np.float32)
     if level == 2:
         low, high = bounds
         harmonics = np.float32(low) + harmonics / 255 * np.float32(high - low)
-    sh_rest = np.zeros((section.count, rest, 3), np.float32)
+    sh_rest = np.zeros((len(rows), rest, 3), np.float32)
     first = 0
     for degree in range(1, section.sh_degree + 1):
         width = 2 * degree + 1
@@ -169,17 +153,6 @@ def _unpack(
         packing.color_sh(rows["rgba"][:, :3]),
         sh_rest,
     )
-
-
-def _buckets(path: Path, data: bytes, section: _Section) -> np.ndarray:
-    """(N,) index of the bucket of each Gaussian: the full buckets come first, then the others."""
-    sizes = np.frombuffer(data, "<u4", section.partial_buckets, section.start)
-    ends = section.bucket_size * np.arange(1, section.full_buckets + 1, dtype=np.int64)
-    filled = section.bucket_size * section.full_buckets
-    ends = np.concatenate([ends, filled + np.cumsum(sizes, dtype=np.int64)])
-    if section.count > (ends[-1] if len(ends) else 0):
-        raise _damaged(path)
-    return np.searchsorted(ends, np.arange(section.count), side="right")
 
 
 def _damaged(path: Path) -> UserError:

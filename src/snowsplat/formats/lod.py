@@ -28,6 +28,7 @@ import numpy as np
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.sog import read_stored, sog_files
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 from snowsplat.util.safe_json import inside, quoted, read_json
 
 #: The name of the index. Viewers recognise the format by it.
@@ -100,9 +101,8 @@ def read_index(path: Path) -> LodIndex:
         UserError: it cannot be read, is damaged, or names a file outside of its folder.
     """
     try:
-        meta = read_json(path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+        with reading(path):
+            meta = read_json(path)
     except ValueError as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
     try:

@@ -18,7 +18,6 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +30,7 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.lod import INDEX, read_index
 from snowsplat.formats.sog import encode_sog
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path, write_text
+from snowsplat.util.files import atomic_path, new_folder, write_text
 
 _FACTOR = 4  # between the numbers of Gaussians of two levels
 _FARTHER = 2.3  # see `simplify`: each level is shown from about three times the distance
@@ -87,7 +86,8 @@ def write_lod(
     leaves = list(tree.leaves())
     path.parent.mkdir(parents=True, exist_ok=True)
     before = _level_folders(path)
-    with _new_folder(path.parent) as (temporary, folder):
+    folder = _free_name(path.parent)
+    with new_folder(path.parent / f".{_FOLDER}.tmp") as temporary:
         writer = _Writer(temporary, sizes.file, levels, report)
         writer.write(packable, leaves)
         temporary.rename(folder)
@@ -124,20 +124,12 @@ def _level_folders(path: Path) -> set[Path]:
     return {path.parent / name for name in names if _FOLDERS.fullmatch(name)}
 
 
-@contextmanager
-def _new_folder(parent: Path) -> Iterator[tuple[Path, Path]]:
-    """A temporary folder, and the free name for it. It is removed if it was not renamed."""
-    temporary = parent / f".{_FOLDER}.tmp"
-    shutil.rmtree(temporary, ignore_errors=True)  # of a process that was killed
-    temporary.mkdir()
+def _free_name(parent: Path) -> Path:
     number, folder = 1, parent / _FOLDER
     while folder.exists():
         number += 1
         folder = parent / f"{_FOLDER}_{number}"
-    try:
-        yield temporary, folder
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    return folder
 
 
 class _Node:

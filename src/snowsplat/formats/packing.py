@@ -17,6 +17,7 @@ import numpy as np
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.scene.sh_constants import SH_C0
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 logger = logging.getLogger(__name__)
 
@@ -26,16 +27,17 @@ ALWAYS_ALLOWED = 1 << 16
 OPAQUE_LOGIT = 30.0
 #: Logarithm of the thickness of a flat Gaussian relative to its other axes.
 FLAT = float(np.log(1e-4))
+#: Signs that convert between x right, y down, z forward (our frame, and that of most scene files)
+#: and x right, y up, z back (OpenGL, three.js, glTF), in both directions.
+UP_BACK = (1, -1, -1)
 _RARE = 0.001  # share of Gaussians, see `Cut`
 _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no logarithm
 
 
 def read_file(path: Path) -> bytes:
     """The content of the file. Raises: UserError: the file cannot be read."""
-    try:
+    with reading(path):
         return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
 def check_count(path: Path, count: int, file_size: int) -> None:
@@ -230,3 +232,23 @@ def from_largest_of_four(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     rest = 1 - (others.astype(np.float32) ** 2).sum(1)
     quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(rest, 0))
     return unit_quats(quats)
+
+
+def flip_axes(
+    means: np.ndarray, quats: np.ndarray, sh_rest: np.ndarray, signs: tuple[int, int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Multiply each axis by its sign, ±1: positions (N, 3), quaternions wxyz (N, 4), SH (N, K, 3).
+
+    A rotation R becomes M R M, where M is the diagonal matrix of the signs. That is a rotation
+    again, even if M is a reflection.
+    """
+    x, y, z = signs
+    quat_signs = (1, y * z, x * z, x * y)
+    # The sign change of each real spherical harmonic: up to even polynomials, they are products of
+    # x, y, z in the order y z x | xy yz 1 xz 1 | y xyz y z x z x.
+    sh_signs = (y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x)
+    return (
+        means * np.array(signs, np.float32),
+        quats * np.array(quat_signs, np.float32),
+        sh_rest * np.array(sh_signs[: sh_rest.shape[1]], np.float32)[:, None],
+    )

@@ -27,6 +27,7 @@ from snowsplat.formats.sog import is_sog, read_sog, sog_version, write_sog
 from snowsplat.formats.splat import read_splat, write_splat
 from snowsplat.formats.spz import is_spz, read_spz, spz_version, write_spz
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 _HEAD_BYTES = 16_384
 
@@ -78,16 +79,7 @@ FORMATS: list[Format] = [
         True,
         stores_origin=True,
     ),
-    Format(
-        "PLY",
-        (".ply",),
-        is_ply,
-        read_ply,
-        write_ply,
-        "nothing",
-        True,
-        stores_origin=True,
-    ),
+    Format("PLY", (".ply",), is_ply, read_ply, write_ply, "nothing", True, stores_origin=True),
     Format(
         "SPZ",
         (".spz",),
@@ -98,15 +90,7 @@ FORMATS: list[Format] = [
         True,
         spz_version,
     ),
-    Format(
-        "gsplat checkpoint",
-        (".pt",),
-        is_checkpoint,
-        read_checkpoint,
-        None,
-        "nothing",
-        False,
-    ),
+    Format("gsplat checkpoint", (".pt",), is_checkpoint, read_checkpoint, None, "nothing", False),
     Format(
         "zip file",
         (".zip", ".ssproj", ".usdz"),
@@ -200,13 +184,11 @@ def format_for_reading(path: Path | str) -> Format:
         UserError: the file cannot be read, or its format is unknown.
     """
     path = Path(path)
-    try:
+    with reading(path):
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise UserError(f"{path}: is a pipe or a device; use a file")
         with open(path, "rb") as file:
             head = file.read(_HEAD_BYTES)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
     for format in FORMATS:
         if format.recognises is not None and format.recognises(head):
             return format

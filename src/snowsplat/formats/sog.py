@@ -283,7 +283,8 @@ def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
     }
     if n and sh_rest.shape[1]:
         sh_rest = np.clip(sh_rest, -_SH_LIMIT, _SH_LIMIT)  # so that squares fit in float32
-        palette, labels = palette_for(sh_rest.reshape(n, -1), _palette_size(n))
+        size = min(_PALETTE_LIMIT, max(64, n // 4))
+        palette, labels = palette_for(sh_rest.reshape(n, -1), size)
         levels, codes = levels_for(palette)
         images["shN_centroids"] = _palette_image(codes, sh_rest.shape[1])
         images["shN_labels"] = _image(np.stack([labels & 255, labels >> 8, 0 * labels], 1))
@@ -295,11 +296,6 @@ def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
         }
     encoded = {f"{name}.webp": _webp(pixels) for name, pixels in images.items()}
     return {"meta.json": json.dumps(meta).encode(), **encoded}
-
-
-def _palette_size(count: int) -> int:
-    """Palette entries for ``count`` Gaussians: one per four, 64 to 65,536."""
-    return min(_PALETTE_LIMIT, max(64, count // 4))
 
 
 def _files_entry(*names: str) -> dict[str, list[str]]:

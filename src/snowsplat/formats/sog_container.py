@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from snowsplat.formats.zip_members import Damaged, ZipMembers
+from snowsplat.formats.zip_members import Damaged, ZipMembers, reading_file
 from snowsplat.util.safe_json import is_file, parse_json, quoted
 
 # WebP images are already compressed, so the zip compression hardly reduces them.
@@ -27,14 +27,10 @@ class Bundle:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._zip: ZipMembers | None = None
-        try:
-            if not is_file(path):  # reading a pipe may never end
-                raise Damaged(f"{quoted(path.name)} is missing or not a file")
+        with reading_file(path):
             with open(path, "rb") as file:
                 zipped = file.read(2) == b"PK"
             self.size = path.stat().st_size
-        except OSError as error:
-            raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
         if zipped:
             self._zip = ZipMembers(path)
 
@@ -92,9 +88,5 @@ class Bundle:
         return self._zip.read(name, _MOST_INFLATION)
 
     def _file(self, path: Path) -> bytes:
-        try:
-            if not is_file(path):  # reading a pipe may never end
-                raise Damaged(f"{quoted(path.name)} is missing or not a file")
+        with reading_file(path):
             return path.read_bytes()
-        except OSError as error:
-            raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None

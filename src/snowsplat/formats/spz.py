@@ -26,16 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.formats.axis_conventions import UP_BACK, flip_axes
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.spz_container import (
-    ANTIALIASED,
-    Header,
-    is_spz,
-    pack,
-    read_header,
-    unpack,
-)
+from snowsplat.formats.spz_container import ANTIALIASED, Header, is_spz, pack, read_header, unpack
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -84,7 +76,7 @@ def read_spz(path: Path | str) -> GaussianArrays:
         for column, width in zip(columns, header.columns(), strict=True)
     )
     sh_rest = sh.reshape(n, sh.shape[1] // 3, 3)[:, : SH_REST_COUNTS[-1]]
-    means, quats, sh_rest = flip_axes(
+    means, quats, sh_rest = packing.flip_axes(
         _unpack_positions(position, header),
         _unpack_rotations(rotation),
         (sh_rest.astype(np.float32) - 128) / 128,
@@ -122,7 +114,7 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
             axes = _FRAMES[number - 1] if number else "RUB"
             return 1 if "R" in axes else -1, 1 if "D" in axes else -1, 1 if "F" in axes else -1
         start += 8 + size
-    return UP_BACK
+    return packing.UP_BACK
 
 
 def _unpack_positions(position: np.ndarray, header: Header) -> np.ndarray:
@@ -165,7 +157,7 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
         raise ValueError(f"version {version} of .spz cannot be written; use 2, 3 or 4")
     path = Path(path)
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
-    means, quats, sh_rest = flip_axes(means, quats, sh_rest, UP_BACK)
+    means, quats, sh_rest = packing.flip_axes(means, quats, sh_rest, packing.UP_BACK)
     bits = _fractional_bits(means)
     cut = packing.Cut(path, "SPZ", len(means))
     columns = [

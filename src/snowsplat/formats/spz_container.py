@@ -10,7 +10,7 @@ The sizes that a file declares are compared with the size of the file before mem
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import zstandard
@@ -166,15 +166,7 @@ def pack(header: Header, columns: Sequence[bytes]) -> bytes:
     """The content of a file."""
     streams = [column for column in columns if column]
     count = len(streams) if header.version > 3 else 0
-    head = _HEAD.pack(
-        _MAGIC,
-        header.version,
-        header.count,
-        header.sh_degree,
-        header.fractional_bits,
-        header.flags,
-        count,
-    )
+    head = _HEAD.pack(_MAGIC, *astuple(header), count)
     if header.version < 4:
         packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, 31)
         return b"".join([packer.compress(part) for part in (head, *streams)]) + packer.flush()

@@ -6,6 +6,8 @@ import io
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from snowsplat.util.safe_json import is_file, quoted
@@ -15,10 +17,26 @@ _DIRECTORY_LIMIT = 1 << 20
 _BLOCK = 1 << 16
 # Maximum size of an unpacked member: a factor times its packed size, plus this many bytes.
 _INFLATION_FREE = 1 << 20
+# What `zipfile` raises for damaged files. OverflowError: an offset larger than that of any file.
+_ERRORS = (
+    *(OSError, ValueError, RuntimeError, OverflowError, EOFError),
+    *(struct.error, zlib.error, zipfile.BadZipFile),
+)
 
 
 class Damaged(Exception):
     """The file is damaged. The caller adds the path to the message."""
+
+
+@contextmanager
+def reading_file(path: Path) -> Iterator[None]:
+    """Context for reading a file: raises `Damaged` if it is no file, or instead of `OSError`."""
+    try:
+        if not is_file(path):  # reading a pipe may never end
+            raise Damaged(f"{quoted(path.name)} is missing or not a file")
+        yield
+    except OSError as error:
+        raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
 
 
 class ZipMembers:
@@ -26,22 +44,11 @@ class ZipMembers:
 
     def __init__(self, path: Path) -> None:
         """Raises: Damaged: not a zip file, or one with an implausible directory."""
-        try:
-            if not is_file(path):  # reading a pipe may never end
-                raise Damaged(f"{quoted(path.name)} is missing or not a file")
+        with reading_file(path):
             self._file = _InBlocks(path)
-        except OSError as error:
-            raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
         try:
             self._zip = zipfile.ZipFile(self._file)
-        except (
-            ValueError,
-            EOFError,
-            OSError,
-            struct.error,
-            NotImplementedError,
-            zipfile.BadZipFile,
-        ):
+        except _ERRORS:
             raise Damaged("not a readable zip file") from None
 
     def __enter__(self) -> ZipMembers:
@@ -77,17 +84,7 @@ class ZipMembers:
                 while block := member.read(min(_BLOCK, info.file_size - len(content))):
                     content += block
             return bytes(content)
-        except (
-            OSError,
-            ValueError,
-            RuntimeError,
-            OverflowError,  # an offset larger than that of any file
-            EOFError,
-            struct.error,
-            NotImplementedError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ):
+        except _ERRORS:
             raise Damaged(f"its {quoted(name)} is damaged") from None
 
 

@@ -90,13 +90,9 @@ def _lost(sfm: Mapping[str, Any]) -> list[Reason]:
         return []
     groups = len(sfm["sub_models"])
     apart = f"; the photos form {groups} groups without common points" if groups > 1 else ""
-    return [
-        Reason(
-            "poor" if share >= _MANY_LOST else "usable",
-            f"{lost} of {lost + placed} photos could not be placed{apart}",
-            "take more photos between those that are placed and those that are not",
-        )
-    ]
+    text = f"{lost} of {lost + placed} photos could not be placed{apart}"
+    advice = "take more photos between those that are placed and those that are not"
+    return [Reason("poor" if share >= _MANY_LOST else "usable", text, advice)]
 
 
 def _distances(coverage: Coverage) -> list[Reason]:
@@ -136,33 +132,25 @@ def _ends(coverage: Coverage) -> list[Reason]:
     """The first and the last photo, by name, of a path."""
     if len(coverage.names) < _TOO_FEW:
         return []
-    ends, typical = coverage.confirmed[[0, -1]], _median(coverage.confirmed)
-    weak = [
-        coverage.names[i] for i, end in zip((0, -1), ends, strict=True) if end < _WEAK_END * typical
-    ]
+    least = _WEAK_END * _median(coverage.confirmed)
+    weak = [coverage.names[i] for i in (0, -1) if coverage.confirmed[i] < least]
     if not weak:
         return []
-    return [
-        Reason(
-            "good",
-            f"most of what {' and '.join(weak)} show{'s' if len(weak) == 1 else ''}, at the end of "
-            "your path, is in only one other photo",
-            "begin earlier and end later than the place that you want to show",
-        )
-    ]
+    text = (
+        f"most of what {' and '.join(weak)} show{'s' if len(weak) == 1 else ''}, at the end of "
+        "your path, is in only one other photo"
+    )
+    advice = "begin earlier and end later than the place that you want to show"
+    return [Reason("good", text, advice)]
 
 
 def _errors(sfm: Mapping[str, Any]) -> list[Reason]:
     error = sfm["reprojection_error"]
     if error is None or error <= _MAX_ERROR:
         return []
-    return [
-        Reason(
-            "usable",
-            f"the reprojection error is high: {error:.1f} pixels",
-            "leave out photos that are blurred or show moving objects, or try another --camera",
-        )
-    ]
+    text = f"the reprojection error is high: {error:.1f} pixels"
+    advice = "leave out photos that are blurred or show moving objects, or try another --camera"
+    return [Reason("usable", text, advice)]
 
 
 def _bad_photos(problems: Mapping[str, str], count: int) -> list[Reason]:

@@ -74,9 +74,7 @@ def _confirmed(seen: np.ndarray) -> np.ndarray:
 
 def _steps(seen: np.ndarray, poses: np.ndarray, around: np.ndarray, xyz: np.ndarray) -> np.ndarray:
     """`Coverage.step`; poses (N, 3, 4) are cam_from_world, points (P, 3) are in the world.
-
-    ``around`` (N,): it is a panorama; the depth of its points is their distance.
-    """
+    ``around`` (N,): it is a panorama; the depth of its points is their distance."""
     centres = -(poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, 3:])[:, :, 0]
     as_floats = seen.astype(np.float32)
     shared = as_floats @ as_floats.T

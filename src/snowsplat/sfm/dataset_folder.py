@@ -43,7 +43,7 @@ from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import remove_temporaries
+from snowsplat.util.files import new_folder, remove_temporaries
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
@@ -131,16 +131,12 @@ def make_dataset(
             paths = [str(path.absolute()) for path in sources.inputs]
             stages.about = {"inputs": paths, "in_place": in_place}
             stages.save()  # from here on the folder is recognised as a dataset
-            left = _time_left(sources, options, later or Later())
+            photos = survey(sources, options.gather)
+            size, effort = options.gather.size, options.sfm.effort
+            threads = thread_count(options.sfm.threads)
+            left = SfmTimeLeft(photos, size, effort, threads, later or Later())
             alone = later is None
             return _run(stages, sources, folder, options, watcher, in_place, left, alone)
-
-
-def _time_left(sources: Sources, options: DatasetOptions, later: Later) -> SfmTimeLeft:
-    photos = survey(sources, options.gather)
-    sfm = options.sfm
-    threads = thread_count(sfm.threads)
-    return SfmTimeLeft(photos, options.gather.size, sfm.effort, threads, later)
 
 
 def _run(
@@ -184,12 +180,7 @@ def _run(
     fingerprint, former = _fingerprints(sources.paths)
     if stages.settings("photos").get("input") == former:
         fingerprint = former
-    stage(
-        "photos",
-        {"input": fingerprint, **chosen},
-        ["input", "distorted/masks"],
-        gather_photos,
-    )
+    stage("photos", {"input": fingerprint, **chosen}, ["input", "distorted/masks"], gather_photos)
     photos = _photos(folder, outcomes["photos"].result)
     left.gathered(len(photos))
     if options.skip_matching:
@@ -240,26 +231,19 @@ def _run(
 def _gather(
     sources: Sources, folder: Path, options: GatherOptions, report: Report, in_place: bool
 ) -> dict[str, Any]:
-    """Gather the photos into a temporary folder, then replace `input/` and the masks by them.
-
-    If the photos are in `input/` already (``in_place``), only the masks are written.
-    """
+    """Gather the photos into a temporary folder, then replace `input/` and the masks by them. If
+    the photos are in `input/` already (``in_place``), only the masks are written."""
     masks = Path("distorted") / "masks"
     if in_place:
         shutil.rmtree(folder / masks, ignore_errors=True)
         return asdict(gather(sources, folder, options, report))
-    new = folder / ".new"
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir()
-    try:
+    with new_folder(folder / ".new") as new:
         gathered = gather(sources, new, options, report)
         for part in (Path("input"), masks):
             shutil.rmtree(folder / part, ignore_errors=True)
             if (new / part).exists():
                 (folder / part).parent.mkdir(parents=True, exist_ok=True)
                 (new / part).rename(folder / part)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     return asdict(gathered)
 
 
@@ -284,11 +268,7 @@ def _undistort(
 
 
 def _check_free(
-    folder: Path,
-    in_place: bool,
-    sources: Sources,
-    options: DatasetOptions,
-    overwrite: bool,
+    folder: Path, in_place: bool, sources: Sources, options: DatasetOptions, overwrite: bool
 ) -> None:
     """Raises UserError if the dataset must not be written to ``folder``."""
     remove_temporaries(folder, (RECORD, REPORT))

@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
+from snowsplat.data.colour_profile import plain_pixels
 from snowsplat.data.placement import Placement, placement_of
-from snowsplat.data.plain_pixels import plain_pixels
 from snowsplat.evaluation import verdict
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.more_photos import Advice, advice
@@ -108,11 +108,9 @@ def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto
 def _headline(name: str, facts: dict[str, Any]) -> str:
     sfm = facts["sfm"]
     registered, unregistered = len(sfm["registered"]), len(sfm["unregistered"])
-    if not unregistered:
-        summary = f"The poses of all {registered} photos were found."
-    else:
-        total = registered + unregistered
-        summary = f"The poses of {registered} of {total} photos were found."
+    total = registered + unregistered
+    which = f"{registered} of {total}" if unregistered else f"all {total}"
+    summary = f"The poses of {which} photos were found."
     lines = [f"<h1>{text(name)}</h1>", f"<p>{summary}</p>"]
     if len(sfm["sub_models"]) > 1:
         sizes = ", ".join(map(str, sfm["sub_models"]))
@@ -144,17 +142,14 @@ def _cards(facts: dict[str, Any]) -> str:
 
 def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], more: Advice) -> str:
     """What was wrong, and what to do better, for the person who took the photos."""
-    lines = []
-    bad = facts["problems"]
+    lines = ["<p>No photo is blurred, too dark or too bright.</p>"]
     without = len(facts["sfm"]["unregistered"]) + len(facts["gathered"]["skipped"])
-    if not bad:
-        lines.append("<p>No photo is blurred, too dark or too bright.</p>")
-    if bad:
+    if bad := facts["problems"]:
         count = f"{len(bad)} of {len(names)} photos"
-        lines.append(
+        lines = [
             f"<p>{count} may be better. Take them again, or leave them out if others show the same."
             f"</p>\n{_bad_photos(dataset, bad)}"
-        )
+        ]
     if without:
         lines.append(f"<p>{without} photos were not used; the reasons are below.</p>")
     lines += [
@@ -206,14 +201,10 @@ def _maps(
     placement: Placement | None,
 ) -> str:
     unit = "m" if placement is not None and placement.is_metric else "units"
-    captions = (
-        "From above. Orange: the cameras; white: the first camera.",
-        "From the side.",
-    )
-    if len(marks):
-        captions = (captions[0] + " Numbers: places for more photos.", captions[1])
-    if any(photo.sequence is not None for photo in photos):
-        captions = (captions[0] + " Blue: the path of the video.", captions[1])
+    above = "From above. Orange: the cameras; white: the first camera."
+    above += " Numbers: places for more photos." if len(marks) else ""
+    above += " Blue: the path of the video." if any(p.sequence is not None for p in photos) else ""
+    captions = (above, "From the side.")
     drawings = draw_scene(photos, xyz, rgb, marks, unit)
     # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
     figures = "\n".join(
@@ -262,10 +253,6 @@ def _reduced(path: Path) -> Image.Image:
     return small
 
 
-def _focal_from(camera: dict[str, Any]) -> str:
-    return _FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))]
-
-
 def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
     rows = []
     for camera in sfm["cameras"]:
@@ -279,20 +266,20 @@ def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
         fisheye = str(camera["model"]).endswith("FISHEYE")
         angle = math.degrees(2 * (half if fisheye else math.atan(half)))
         parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
+        focal_from = _FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))]
         rows.append(
             [
                 str(camera["images"]),
                 f"{width} × {height}",
-                f"{focal:.0f} px ({angle:.0f}°), {_focal_from(camera)}",
+                f"{focal:.0f} px ({angle:.0f}°), {focal_from}",
                 f"{camera['model']} <span class='soft'>{parameters}</span>",
             ]
         )
     sizes = ", ".join(f"{w} × {h}" for w, h, *_ in undistorted["sizes"])
     how = "undistorted" if undistorted["resampled"] else "copied, as there is no distortion"
     lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
-    zooms = sfm.get("zooms", "")
     said = ""
-    if zooms:
+    if zooms := sfm.get("zooms", ""):
         said = f"<p>The photos have {text(zooms)}, so each group of them has its own lens.</p>\n"
     if sfm.get("fisheye"):
         said += f"<p>{text(sfm['fisheye'][0].upper() + sfm['fisheye'][1:])}.</p>\n"

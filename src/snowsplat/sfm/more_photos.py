@@ -85,9 +85,8 @@ def _gaps_around(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarra
             angle = angles[i] + gaps[i] * step / (count + 1)
             place = np.array([radius * math.cos(angle), 0.0, radius * math.sin(angle)]) + subject
             place[1] = height
-            places.append(
-                (place, f"no photo shows the subject from here ({_degrees(gaps[i])} gap)")
-            )
+            gap = f"{math.degrees(gaps[i]):.0f}° gap"
+            places.append((place, f"no photo shows the subject from here ({gap})"))
     return places
 
 
@@ -137,7 +136,3 @@ def _focus(centres: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     total = across.sum(0) + 1e-9 * np.eye(3)
     point: np.ndarray = np.linalg.solve(total, (across @ centres[:, :, None]).sum(0)[:, 0])
     return point
-
-
-def _degrees(angle: float) -> str:
-    return f"{math.degrees(angle):.0f}°"

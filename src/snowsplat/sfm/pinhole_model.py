@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snowsplat.data.lens.pinhole import Pinhole
 from snowsplat.data.lens.project import directions
 from snowsplat.data.lens.views import LensView
 from snowsplat.scene.geometry import Similarity
+from snowsplat.util.files import new_folder
 
 if TYPE_CHECKING:
     import pycolmap
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def write_model(
     model: pycolmap.Reconstruction,
-    pinholes: Mapping[int, Pinhole],
+    pinholes: Mapping[int, LensView],
     scene_from_sfm: Similarity,
     sparse: Path,
 ) -> None:
@@ -47,13 +47,12 @@ def write_model(
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = list(pinhole.params)
     # Write to a folder with a temporary name, so that ``sparse`` never contains a part of a model.
-    new = sparse.with_name(f".{sparse.name}.new")
-    shutil.rmtree(new, ignore_errors=True)
-    (new / "0").mkdir(parents=True)
-    model.write(new / "0")
-    model.export_PLY(new / "0" / "points3D.ply")
-    shutil.rmtree(sparse, ignore_errors=True)
-    new.rename(sparse)
+    with new_folder(sparse.with_name(f".{sparse.name}.new")) as new:
+        (new / "0").mkdir()
+        model.write(new / "0")
+        model.export_PLY(new / "0" / "points3D.ply")
+        shutil.rmtree(sparse, ignore_errors=True)
+        new.rename(sparse)
 
 
 def view_name(photo: str, view: LensView) -> str:
@@ -176,7 +175,7 @@ def _seen(view: LensView, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels, np.flatnonzero(seen)
 
 
-def _undistort_keypoints(image: pycolmap.Image, camera: pycolmap.Camera, pinhole: Pinhole) -> None:
+def _undistort_keypoints(image: pycolmap.Image, camera: pycolmap.Camera, pinhole: LensView) -> None:
     points = image.points2D
     if not len(points):
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 
@@ -22,14 +23,9 @@ def silent(done: int, total: int, what: str = "", left: float | None = None) -> 
     """A `Report` that does nothing."""
 
 
-class Figures(Protocol):
-    """A callback that receives figures about the child process that estimates the poses.
-
-    ``cpu_seconds`` is its processor time so far. ``features`` is the mean number of features of a
-    photo; 0: not known yet.
-    """
-
-    def __call__(self, cpu_seconds: float, features: float) -> None: ...
+#: Receives the processor time in seconds of the child process that estimates the poses, and the
+#: mean number of features of a photo; 0: not known yet.
+Figures = Callable[[float, float], None]
 
 
 def ignored(cpu_seconds: float, features: float) -> None:

@@ -91,19 +91,9 @@ def draw_scene(
     ]
     scale = min(_fit(extent) for extent in extents)
     depth = _frustum_depth(centres, high - low)
+    what = photos, xyz[shown], rgb[shown], marks, (low + high) / 2
     return [
-        _draw(
-            projection,
-            photos,
-            xyz[shown],
-            rgb[shown],
-            marks,
-            (low + high) / 2,
-            extent * scale,
-            scale,
-            depth,
-            unit,
-        )
+        _draw(projection, *what, extent * scale, scale, depth, unit)
         for projection, extent in zip(_PROJECTIONS, extents, strict=True)
     ]
 

@@ -177,12 +177,7 @@ class SfmTimeLeft:
     """Adds the time left to the progress of the stages of `dataset_folder.make_dataset`."""
 
     def __init__(
-        self,
-        photos: Photos,
-        size: int | None,
-        effort: EffortName,
-        threads: int,
-        later: Later,
+        self, photos: Photos, size: int | None, effort: EffortName, threads: int, later: Later
     ) -> None:
         """
         Args:
@@ -191,9 +186,9 @@ class SfmTimeLeft:
             later: the part of the job after structure from motion.
         """
         self._photos, self._size, self._effort = photos, size, effort
-        self._left = TimeLeft(
-            {**_without_start(steps_of(photos, size, effort)), "later": Step(later.work)}, threads
-        )
+        steps = steps_of(photos, size, effort)
+        del steps["start"]  # its time is spread over other steps, so it is not measured
+        self._left = TimeLeft({**steps, "later": Step(later.work)}, threads)
         self._pairs = 0  # number of pairs that are matched; 0: not known yet
         self._features = 0.0  # mean number of features of a photo; 0: not known yet
         self._deadline = later.deadline
@@ -244,8 +239,3 @@ class SfmTimeLeft:
     def finished_before(self, stage: str) -> None:
         """``stage`` takes no time: an earlier run finished it, or it has nothing to do."""
         self._left.expect(dict.fromkeys(_STEPS_OF_STAGE[stage], Step(0.0)))
-
-
-def _without_start(steps: Mapping[str, Step]) -> dict[str, Step]:
-    """The steps except "start". Its time is spread over other steps, so it is not measured."""
-    return {name: step for name, step in steps.items() if name != "start"}

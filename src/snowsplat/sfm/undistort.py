@@ -15,7 +15,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,15 +25,14 @@ import numpy as np
 import torch
 from PIL import Image
 
+from snowsplat.data.colour_profile import plain_pixels
 from snowsplat.data.decode import resize_area
 from snowsplat.data.image_file import open_image, reason_of
 from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.coverage import shown
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import Pinhole, pinhole_of
+from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
-from snowsplat.data.lens.views import LensView, lens_views
-from snowsplat.data.plain_pixels import plain_pixels
+from snowsplat.data.lens.views import LensView, lens_views, pinhole_view
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -80,13 +79,13 @@ class _Job:
 
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
-    views: Sequence[tuple[str, Pinhole | LensView]]  # the images of the photo, and their names
+    views: Sequence[tuple[str, LensView]]  # the images of the photo, and their names
     mask: bool  # whether the photo has a mask
 
     @property
     def resampled(self) -> bool:
         """Whether the image differs from the photo."""
-        return not all(isinstance(v, Pinhole) and v.nodes is None for _, v in self.views)
+        return not all(view.is_photo for _, view in self.views)
 
 
 def undistort(
@@ -119,30 +118,22 @@ def undistort(
 
     model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
     known = {photo.name: photo for photo in photos}
-    wide, pinholes = dict[int, Sequence[LensView]](), dict[int, Pinhole]()
+    views = dict[int, Sequence[LensView]]()
     for number, camera in model.cameras.items():
         masked = [
             dataset / "distorted" / "masks" / f"{image.name}.png"
             for image in (model.images[i] for i in sorted(model.reg_image_ids()))
             if image.camera_id == number and image.name in known and known[image.name].mask
         ]
-        several = _views_of_wide(camera, masked)
-        if several:
-            wide[number] = several
-        else:
-            pinholes[number] = _pinhole(camera)
+        views[number] = _views_of(camera, masked)
     jobs = []
     for number in model.reg_image_ids():
         image = model.images[number]
         photo, camera = known.get(image.name), model.cameras[image.camera_id]
         has_mask = photo is not None and photo.mask
         size = (camera.width, camera.height)
-        views: list[tuple[str, Pinhole | LensView]]
-        if image.camera_id in wide:
-            views = [(view_name(image.name, view), view) for view in wide[image.camera_id]]
-        else:
-            views = [(image.name, pinholes[image.camera_id])]
-        jobs.append(_Job(image.name, size, views, has_mask))
+        named = [(view_name(image.name, view), view) for view in views[image.camera_id]]
+        jobs.append(_Job(image.name, size, named, has_mask))
     jobs.sort(key=lambda job: job.name)
     count = Counter(name for job in jobs for name, _ in job.views)
     for name in (name for name, times in count.items() if times > 1):
@@ -161,6 +152,8 @@ def undistort(
     masks = _run(
         [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
     )
+    wide = {number: some for number, some in views.items() if some[0].rotation is not None}
+    pinholes = {number: some[0] for number, some in views.items() if number not in wide}
     if wide:
         model = in_views(model, wide)
     write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
@@ -174,8 +167,8 @@ def undistort(
     )
 
 
-def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
-    """The pinhole views of a lens with a field of view of more than 120°; empty: it is not wide.
+def _views_of(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensView]:
+    """The pinhole views of a lens: several, turned ones if its field of view is more than 120°.
 
     A panorama has six, the sides of a cube with a margin.
 
@@ -183,15 +176,26 @@ def _views_of_wide(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[L
     show only the circle.
     """
     lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+    found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
+    with suppress(ValueError):  # then `pinhole_view` decides: a part of the photo, or an error
+        fisheye = not (camera.is_spherical() or camera.is_perspective_pinhole())
+        views = lens_views(lens, _circle(camera, masks) if fisheye else None)
+        if views[0].rotation is not None:
+            return views
     try:
-        views = lens_views(lens, _circle(camera, masks) if _is_fisheye(camera) else None)
-    except ValueError:  # the error, or a part of the photo, is the business of `_pinhole`
-        return ()
-    return () if views[0].rotation is None else views
-
-
-def _is_fisheye(camera: pycolmap.Camera) -> bool:
-    return not (camera.is_spherical() or camera.is_perspective_pinhole())
+        view = pinhole_view(lens)
+    except ValueError as error:
+        raise UserError(
+            f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
+            "different positions, or set another camera_model"
+        ) from None
+    if view.cropped:
+        logger.warning(
+            "the estimated lens distortion (%s) is valid only near the centre of the photos, so "
+            "images are cropped; another camera_model may keep more",
+            found,
+        )
+    return (view,)
 
 
 def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
@@ -210,30 +214,9 @@ def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
     return reach if 0 < reach < _CIRCLE * radius.max() and is_full else None
 
 
-def _pinhole(camera: pycolmap.Camera) -> Pinhole:
-    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
-    found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
-    try:
-        pinhole = pinhole_of(lens)
-    except ValueError as error:
-        raise UserError(
-            f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
-            "different positions, or set another camera_model"
-        ) from None
-    if pinhole.cropped:
-        logger.warning(
-            "the estimated lens distortion (%s) is valid only near the centre of the photos, so "
-            "images are cropped; another camera_model may keep more",
-            found,
-        )
-    return pinhole
-
-
 def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
-    """Run jobs in threads; returns their results in any order.
-
-    After the first error or Ctrl-C, running jobs finish and the others are cancelled.
-    """
+    """Run jobs in threads; returns their results in any order. After the first error or Ctrl-C,
+    running jobs finish and the others are cancelled."""
     report(0, len(jobs), "photos")
     # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
     pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
@@ -291,7 +274,7 @@ def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int
     written = 0
     for name, view in job.views:
         made = None if mask is None else undistort_mask(mask, view)
-        if isinstance(view, LensView):
+        if view.rotation is not None:
             made = _with_blank(made, view)
         if made is not None:
             _save(made, dataset / "masks" / f"{name}.png", "PNG")

@@ -1,9 +1,10 @@
-"""Atomic writing: a file appears under its name only when it is complete."""
+"""Reading and atomic writing: a file appears under its name only when it is complete."""
 
 import contextlib
 import json
 import os
 import re
+import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -99,6 +100,26 @@ def _lock(temporary: Path) -> int:
         os.close(handle)
         raise
     return handle
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Context for reading a file: raises `UserError` instead of `OSError`."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Context with an empty folder. It is removed at the end, if the block has not renamed it."""
+    shutil.rmtree(path, ignore_errors=True)  # of a process that was killed
+    path.mkdir(parents=True)
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def make_parent(path: Path) -> None:

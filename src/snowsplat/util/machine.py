@@ -20,6 +20,13 @@ def processor_name() -> str:
     return platform.processor() or platform.machine() or "unknown processor"
 
 
+def processor_count() -> int:
+    """Number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def memory_bytes() -> int:
     """Memory of the machine in bytes; 0 if unknown."""
     try:

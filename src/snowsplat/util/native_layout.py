@@ -17,26 +17,16 @@ from types import UnionType
 from typing import Any, get_args, get_type_hints
 
 # Constants that Python and C++ share; they are part of the hash.
-TILE = 16
-"""Edge of a tile in pixels."""
-GROUP_CHANNELS = 4
-"""Maximum number of channels of one rasterization pass."""
-SLOT_WIDTH = 16
-"""Numbers of the gradient of an instance."""
-PACKED_HEADER = 8
-"""Columns of `Splats2D.packed` before the colours."""
-PACKED_STRIDE = 16
-"""The number of columns of `Splats2D.packed` is a multiple of this."""
-POSE_SUMS = 16
-"""Number of sums for the gradient of a pose: 9 for R, 3 for t, 3 for the position, 1 for log f."""
-MAX_NEIGHBOURS = 64
-"""Largest k of `nearest_neighbours.neighbours`."""
-ALIGNMENT_RADIUS = 7
-"""Radius of the window of `patches.align_patches` in pixels, without its centre."""
-MAX_SWEEP_SOURCES = 8
-"""Largest number of source images of `sweep.plane_sweep`."""
-MAX_SWEEP_RADIUS = 7
-"""Largest radius of the window of `sweep.plane_sweep` in pixels, without its centre."""
+TILE = 16  # edge of a tile in pixels
+GROUP_CHANNELS = 4  # maximum number of channels of one rasterization pass
+SLOT_WIDTH = 16  # numbers of the gradient of an instance
+PACKED_HEADER = 8  # columns of `Splats2D.packed` before the colours
+PACKED_STRIDE = 16  # the number of columns of `Splats2D.packed` is a multiple of this
+POSE_SUMS = 16  # for the gradient of a pose: 9 for R, 3 for t, 3 for the position, 1 for log f
+MAX_NEIGHBOURS = 64  # largest k of `nearest_neighbours.neighbours`
+ALIGNMENT_RADIUS = 7  # of the window of `patches.align_patches` in pixels, without its centre
+MAX_SWEEP_SOURCES = 8  # largest number of source images of `sweep.plane_sweep`
+MAX_SWEEP_RADIUS = 7  # of the window of `sweep.plane_sweep` in pixels, without its centre
 
 _CONSTANTS = {
     "tile": TILE,
@@ -52,8 +42,7 @@ _CONSTANTS = {
 }
 
 _WORD = 8  # bytes of a field
-LARGEST_PARAMS = 1024
-"""Maximum size of a struct in bytes."""
+LARGEST_PARAMS = 1024  # bytes of a struct, at most
 
 
 class Params:

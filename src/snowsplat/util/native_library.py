@@ -21,6 +21,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.machine import processor_count
 from snowsplat.util.native_layout import Params, layout_of
 
 # Worst to best. The index of a name is its number in native/cpu/isa.cpp.
@@ -140,9 +141,7 @@ def default_threads() -> int:
     """SNOWSPLAT_THREADS, or else the number of processors that this process may use."""
     asked = os.environ.get("SNOWSPLAT_THREADS", "")
     if not asked:
-        if hasattr(os, "sched_getaffinity"):
-            return len(os.sched_getaffinity(0))
-        return os.cpu_count() or 1
+        return processor_count()
     if not asked.isdecimal() or int(asked) < 1:
         raise UserError(f"SNOWSPLAT_THREADS={asked!r} is not a number of threads; use 1 or more")
     return int(asked)

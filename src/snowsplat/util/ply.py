@@ -17,6 +17,7 @@ from typing import BinaryIO
 import numpy as np
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 # Largest size of a header in bytes.
 _HEADER_LIMIT = 1 << 20
@@ -25,24 +26,12 @@ _LINE_LIMIT = 1 << 12
 _NUMBER_LIMIT = 1 << 10
 # Rows are converted in blocks of this size, which fit into the CPU cache.
 _CHUNK_BYTES = 4 << 20
-_SCALARS = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "float64": "f8",
-}
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_NAMES = (
+    ("char", "uchar", "short", "ushort", "int", "uint", "float", "double"),
+    ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"),
+)
+_SCALARS = {name: code for names in _NAMES for name, code in zip(names, _CODES, strict=True)}
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -99,7 +88,7 @@ class PlyTable:
             else:
                 for _ in range(sum(e.count for e in self._before)):
                     if not file.readline():
-                        raise self._truncated()
+                        raise _truncated(self.path)
                 read = self._read_ascii
             for start in range(0, self.count, chunk):
                 yield start, read(file, dtype, min(chunk, self.count - start))
@@ -107,7 +96,7 @@ class PlyTable:
     def _read_binary(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
         data = file.read(count * dtype.itemsize)
         if len(data) < count * dtype.itemsize:
-            raise self._truncated()
+            raise _truncated(self.path)
         return np.frombuffer(data, dtype) if dtype.itemsize else np.empty(count, dtype)
 
     def _read_ascii(self, file: BinaryIO, dtype: np.dtype, count: int) -> np.ndarray:
@@ -122,7 +111,7 @@ class PlyTable:
                 f"{self.path}: a row of the PLY file is not {len(self.columns)} numbers"
             ) from None
         if len(values) < count:
-            raise self._truncated()
+            raise _truncated(self.path)
         if values.shape[1] != len(self.columns):
             raise UserError(
                 f"{self.path}: the PLY file has {values.shape[1]} numbers per row, but its header "
@@ -139,9 +128,6 @@ class PlyTable:
         if len(line) == limit:
             raise UserError(f"{self.path}: a row of the PLY file is too long; export it again")
         return line
-
-    def _truncated(self) -> UserError:
-        return _truncated(self.path)
 
 
 def _truncated(path: Path) -> UserError:
@@ -163,14 +149,11 @@ def open_table(path: Path | str, element: str = "vertex", data: bytes | None = N
         UserError: the file is missing, truncated, or not a PLY file, or its header is invalid.
     """
     path = Path(path)
-    try:
-        with _open(path, data) as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(0)
-            lines = _header_lines(path, file)
-            data_start = file.tell()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    with reading(path), _open(path, data) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        lines = _header_lines(path, file)
+        data_start = file.tell()
 
     format, elements = _parse_header(path, lines)
     names = [e.name for e in elements]

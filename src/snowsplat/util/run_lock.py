@@ -144,10 +144,8 @@ def _in_use(what: str, file: Path) -> InUse:
 
 
 def _try(file: Path) -> tuple[int, bool] | None:
-    """Open and lock the file; None if another process or thread has the lock.
-
-    Returns its handle, and whether the file system has locks.
-    """
+    """Open and lock the file; None if another process or thread has the lock. Returns its handle,
+    and whether the file system has locks."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
     handle = os.open(file, flags, 0o666)
     try:

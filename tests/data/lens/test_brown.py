@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import pinhole_of
-from snowsplat.data.lens.project import BROWN, project, unproject
+from snowsplat.data.lens.project import BROWN, LensModel, project, unproject
+from snowsplat.data.lens.views import pinhole_view
 
 INTRINSICS = 900.0, 905.0, 655.0, 470.0
 
@@ -32,10 +31,12 @@ def test_the_directions_of_pixels_are_found():
 
 
 def test_a_photo_is_undistorted():
-    made = pinhole_of(lens(-0.04, 0.01))
-    assert made.nodes is not None
-    middle = made.nodes[made.nodes.shape[0] // 2, made.nodes.shape[1] // 2]
-    assert np.isfinite(made.nodes).all()
+    made = pinhole_view(lens(-0.04, 0.01))
+    assert not made.is_photo
+    ((_, positions),) = made.positions(made.width, made.height)
+    nodes = positions.nodes
+    middle = nodes[nodes.shape[0] // 2, nodes.shape[1] // 2]
+    assert np.isfinite(nodes).all()
     assert np.abs(middle - (655, 470)).max() < 30
 
 

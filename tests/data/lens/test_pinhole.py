@@ -4,9 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import Pinhole
-from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
+from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.views import LensView, pinhole_view
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
@@ -16,9 +15,14 @@ LENSES = {
 }
 
 
-def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
+def pinhole_of(camera: pycolmap.Camera) -> LensView:
     size = camera.width, camera.height
-    return pinhole_of_lens(LensModel(camera.model_name, *size, tuple(camera.params)))
+    return pinhole_view(LensModel(camera.model_name, *size, tuple(camera.params)))
+
+
+def nodes_of(view: LensView) -> np.ndarray:
+    ((_, positions),) = view.positions(view.width, view.height)
+    return positions.nodes
 
 
 def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
@@ -29,8 +33,9 @@ def lens(model: str, params: list[float], width: int = 320, height: int = 240) -
 def test_no_blank_borders_and_the_same_size_as_colmap(name):
     camera = lens(*LENSES[name])
     pinhole = pinhole_of(camera)
-    assert pinhole.nodes.min() > -1
-    assert (pinhole.nodes.max(axis=(0, 1)) < (321, 241)).all()
+    nodes = nodes_of(pinhole)
+    assert nodes.min() > -1
+    assert (nodes.max(axis=(0, 1)) < (321, 241)).all()
     theirs = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     assert (pinhole.width, pinhole.height) == (theirs.width, theirs.height)
     assert np.allclose(pinhole.params, theirs.params)
@@ -42,11 +47,12 @@ def test_nodes_are_the_distorted_positions(name):
     camera = lens(*LENSES[name])
     pinhole = pinhole_of(camera)
     fx, fy, cx, cy = pinhole.params
-    rows, columns = pinhole.nodes.shape[:2]
+    nodes = nodes_of(pinhole)
+    rows, columns = nodes.shape[:2]
     for row, column in ((0, 0), (rows - 1, columns - 1), (rows // 2, 1)):
         x, y = column * pinhole.width / (columns - 1), row * pinhole.height / (rows - 1)
         expected = camera.img_from_cam(np.array([(x - cx) / fx, (y - cy) / fy, 1.0]))
-        assert np.allclose(pinhole.nodes[row, column], expected)
+        assert np.allclose(nodes[row, column], expected)
 
 
 @pytest.mark.parametrize(
@@ -59,13 +65,13 @@ def test_nodes_are_the_distorted_positions(name):
 )
 def test_a_camera_without_distortion_is_unchanged(model, params, expected):
     pinhole = pinhole_of(lens(model, params))
-    assert pinhole.nodes is None
+    assert pinhole.is_photo
     assert (pinhole.width, pinhole.height) == (320, 240)
     assert pinhole.params == expected
 
 
 def test_a_fisheye_without_coefficients_is_no_pinhole():
-    assert pinhole_of(lens(*LENSES["fisheye"])).nodes is not None
+    assert not pinhole_of(lens(*LENSES["fisheye"])).is_photo
 
 
 @pytest.mark.parametrize(
@@ -85,9 +91,10 @@ def test_a_folded_image_is_cropped(model, params, cropped):
     assert pinhole.cropped == cropped
     assert pinhole.width >= 64
     # The map is monotonic in both directions.
-    assert (np.diff(pinhole.nodes[..., 0], axis=1) > 0).all()
-    assert (np.diff(pinhole.nodes[..., 1], axis=0) > 0).all()
-    assert pinhole.nodes.min() > -1
+    nodes = nodes_of(pinhole)
+    assert (np.diff(nodes[..., 0], axis=1) > 0).all()
+    assert (np.diff(nodes[..., 1], axis=0) > 0).all()
+    assert nodes.min() > -1
 
 
 @pytest.mark.parametrize("strength", [-30.0, 300.0])

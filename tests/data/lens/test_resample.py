@@ -7,12 +7,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import Pinhole
-from snowsplat.data.lens.pinhole import pinhole_of as pinhole_of_lens
 from snowsplat.data.lens.positions import Positions
-from snowsplat.data.lens.project import project
+from snowsplat.data.lens.project import LensModel, project
 from snowsplat.data.lens.resample import resampled, undistort_image, undistort_mask
+from snowsplat.data.lens.views import LensView, pinhole_view
 
 LENSES = {
     "pincushion": ("SIMPLE_RADIAL", [260.0, 160.0, 120.0, 0.15]),
@@ -22,16 +20,16 @@ LENSES = {
 }
 
 
-def pinhole_of(camera: pycolmap.Camera) -> Pinhole:
+def pinhole_of(camera: pycolmap.Camera) -> LensView:
     size = camera.width, camera.height
-    return pinhole_of_lens(LensModel(camera.model_name, *size, tuple(camera.params)))
+    return pinhole_view(LensModel(camera.model_name, *size, tuple(camera.params)))
 
 
 def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
     return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
-def as_camera(pinhole: Pinhole) -> pycolmap.Camera:
+def as_camera(pinhole: LensView) -> pycolmap.Camera:
     return lens("PINHOLE", list(pinhole.params), pinhole.width, pinhole.height)
 
 
@@ -184,7 +182,7 @@ def test_positions_between_nodes_are_exact_to_a_hundredth_of_a_pixel(name):
     model, params = LENSES[name]
     camera = LensModel(model, 1280, 960, (*(4 * np.array(params[: -4 if len(params) > 4 else 3])),))
     camera = LensModel(model, 1280, 960, (*camera.params, *params[len(camera.params) :]))
-    pinhole = pinhole_of_lens(camera)
+    pinhole = pinhole_view(camera)
     fx, fy, cx, cy = pinhole.params
     ((_, positions),) = pinhole.positions(pinhole.width, pinhole.height)
     for rows, found in positions.strips():

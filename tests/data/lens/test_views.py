@@ -9,8 +9,7 @@ import pytest
 from snowsplat.data.colmap.types import CAMERA_MODELS
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.coverage import shown
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import project, unproject
+from snowsplat.data.lens.project import LensModel, project, unproject
 from snowsplat.data.lens.resample import nearest, resampled
 from snowsplat.data.lens.views import lens_views, look
 

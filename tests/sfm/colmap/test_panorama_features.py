@@ -3,8 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import directions
+from snowsplat.data.lens.project import LensModel, directions
 from snowsplat.sfm.colmap.matching import match_descriptors
 from snowsplat.sfm.colmap.panorama_features import detect_in_panorama
 from snowsplat.synthetic.lens import Equirectangular

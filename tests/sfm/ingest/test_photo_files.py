@@ -6,6 +6,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from snowsplat.data.image_file import scaled_size
 from snowsplat.sfm.ingest.photo_files import (
     Unusable,
     decode,
@@ -13,7 +14,6 @@ from snowsplat.sfm.ingest.photo_files import (
     link_or_copy,
     read_header,
     save,
-    scaled_size,
 )
 
 from ..pictures import HEIGHT, WIDTH, exif, photo, wall

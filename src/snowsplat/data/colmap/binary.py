@@ -18,14 +18,13 @@ from snowsplat.data.colmap.types import (
     ColmapCamera,
     ColmapImage,
     PointFile,
-    PointRecords,
     check_count,
     checked_camera,
     damaged,
     track_rows,
-    unreadable,
 )
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 
 _COUNT = struct.Struct("<Q")
 # Id, index into CAMERA_MODELS, width, height. The parameters (doubles) follow.
@@ -51,10 +50,8 @@ class _Cursor:
 
     def __init__(self, path: Path, kind: str, least_bytes: int) -> None:
         self.path = path
-        try:
+        with reading(path):
             self.data = path.read_bytes()
-        except OSError as error:
-            raise unreadable(path, error) from None
         self.offset = 0
         (self.count,) = self.take(_COUNT)
         if self.count * least_bytes > len(self.data) - self.offset:
@@ -233,7 +230,9 @@ def write_model(
     folder: Path,
     cameras: Mapping[int, ColmapCamera],
     images: Sequence[ColmapImage],
-    points: PointRecords,
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    tracks: Sequence[Sequence[tuple[int, int]]],
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin; see `model.write_model` for the arguments."""
     model_numbers = {name: number for number, (name, _) in enumerate(CAMERA_MODELS)}
@@ -249,11 +248,11 @@ def write_model(
         + _COUNT.pack(0)  # no observations
         for number, image in enumerate(images, 1)
     ]
-    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.tracks, strict=True)
+    rows = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
     point_records = [
-        struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.0, len(track))
+        struct.pack("<Q3d3BdQ", number, *position, *color, 0.0, len(track))
         + b"".join(struct.pack("<II", *pair) for pair in track)
-        for number, (xyz, rgb, track) in enumerate(rows, 1)
+        for number, (position, color, track) in enumerate(rows, 1)
     ]
     _write(folder / "cameras.bin", camera_records)
     _write(folder / "images.bin", image_records)

@@ -18,7 +18,6 @@ from snowsplat.data.colmap.types import (
     ColmapImage,
     ColmapModel,
     PointFile,
-    PointRecords,
 )
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.util.errors import UserError
@@ -26,9 +25,13 @@ from snowsplat.util.errors import UserError
 logger = logging.getLogger(__name__)
 
 
+#: The files of a binary (False) and of a text model (True), and their suffix.
+_FILES = {False: (binary_files, ".bin"), True: (text_files, ".txt")}
+
+
 def model_is_text(folder: Path) -> bool | None:
     """Whether the model in a folder is text (True) or binary (False); None if there is no model."""
-    for is_text, suffix in ((False, ".bin"), (True, ".txt")):
+    for is_text, (_, suffix) in _FILES.items():
         if all((folder / (name + suffix)).is_file() for name in ("cameras", "images")):
             return is_text
     return None
@@ -56,24 +59,21 @@ def read_model(folder: Path) -> ColmapModel:
     is_text = model_is_text(folder)
     if is_text is None:
         raise UserError(f"{folder}: no COLMAP model here (cameras and images, .bin or .txt)")
-    if is_text:
-        cameras = text_files.read_cameras(folder / "cameras.txt")
-        images = text_files.read_images(folder / "images.txt")
-    else:
-        cameras = binary_files.read_cameras(folder / "cameras.bin")
-        images = binary_files.read_images(folder / "images.bin")
+    files, suffix = _FILES[is_text]
+    cameras = files.read_cameras(folder / f"cameras{suffix}")
+    images = files.read_images(folder / f"images{suffix}")
     ordered = sorted(images, key=lambda image: image.name)
     return ColmapModel(folder, is_text, cameras, ordered, _read_frames(folder, is_text))
 
 
 def _read_frames(folder: Path, is_text: bool) -> dict[int, int]:
     """`ColmapModel.frames`; empty with a warning if the file is damaged: it is used for no pose."""
-    path = folder / ("frames.txt" if is_text else "frames.bin")
+    files, suffix = _FILES[is_text]
+    path = folder / f"frames{suffix}"
     if not path.is_file():  # of COLMAP before version 3.12
         return {}
     try:
-        read = text_files.read_frames if is_text else binary_files.read_frames
-        frames = read(path)
+        frames = files.read_frames(path)
     except UserError as error:
         logger.warning("%s", error)
         return {}
@@ -100,12 +100,10 @@ def read_point_file(folder: Path) -> tuple[Path, PointFile] | None:
     Raises:
         UserError: the file is damaged.
     """
-    path = folder / "points3D.bin"
-    if path.is_file():
-        return path, binary_files.read_points(path)
-    path = folder / "points3D.txt"
-    if path.is_file():
-        return path, text_files.read_points(path)
+    for files, suffix in _FILES.values():
+        path = folder / f"points3D{suffix}"
+        if path.is_file():
+            return path, files.read_points(path)
     return None
 
 
@@ -113,12 +111,8 @@ def read_observations(
     model: ColmapModel, wanted: Mapping[int, np.ndarray]
 ) -> dict[int, np.ndarray]:
     """Read some observations of the images of a model; see `binary.read_observations`."""
-    read, suffix = (
-        (text_files.read_observations, ".txt")
-        if model.text
-        else (binary_files.read_observations, ".bin")
-    )
-    return read(model.folder / f"images{suffix}", wanted)
+    files, suffix = _FILES[model.text]
+    return files.read_observations(model.folder / f"images{suffix}", wanted)
 
 
 def write_model(
@@ -143,6 +137,5 @@ def write_model(
         text: write .txt files.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    points = PointRecords(xyz, rgb, [()] * len(xyz) if tracks is None else tracks)
-    write = text_files.write_model if text else binary_files.write_model
-    write(folder, cameras, images, points)
+    tracks = [()] * len(xyz) if tracks is None else tracks
+    _FILES[text][0].write_model(folder, cameras, images, xyz, rgb, tracks)

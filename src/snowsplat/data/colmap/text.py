@@ -17,15 +17,13 @@ from snowsplat.data.colmap.types import (
     ColmapCamera,
     ColmapImage,
     PointFile,
-    PointRecords,
     check_count,
     checked_camera,
     damaged,
     track_rows,
-    unreadable,
 )
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import shown
+from snowsplat.util.files import reading, shown
 
 logger = logging.getLogger(__name__)
 
@@ -45,13 +43,10 @@ _LONGEST_TRACK = 1 << 16
 
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text file, without comments."""
-    try:
-        with open(path, encoding="utf-8", errors="surrogateescape") as file:
-            for line in file:
-                if not line.startswith("#"):
-                    yield line.strip()
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path), open(path, encoding="utf-8", errors="surrogateescape") as file:
+        for line in file:
+            if not line.startswith("#"):
+                yield line.strip()
 
 
 def _count_words(line: str) -> int:
@@ -245,8 +240,7 @@ def _pairs(track: str) -> np.ndarray:
 
 def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
     """The lines of a points3D.txt without their ends, the tracks; some of these go to ``tracks``,
-    by row.
-    """
+    by row."""
     every = 1
     for row, line in enumerate(filter(None, _lines(path))):
         words = line.split(maxsplit=8)
@@ -264,7 +258,9 @@ def write_model(
     folder: Path,
     cameras: Mapping[int, ColmapCamera],
     images: Sequence[ColmapImage],
-    points: PointRecords,
+    xyz: np.ndarray,
+    rgb: np.ndarray,
+    tracks: Sequence[Sequence[tuple[int, int]]],
 ) -> None:
     """Write cameras.txt, images.txt and points3D.txt; see `model.write_model` for the arguments."""
     # repr() of a float is the shortest text that reads back as the same number.
@@ -277,10 +273,10 @@ def write_model(
         + "\n"  # the line of observations, empty
         for number, image in enumerate(images, 1)
     ]
-    rows = zip(points.xyz.tolist(), points.rgb.tolist(), points.tracks, strict=True)
+    rows = zip(xyz.tolist(), rgb.tolist(), tracks, strict=True)
     point_lines = [
-        " ".join(map(str, (number, *xyz, *rgb, 0.0, *sum(track, ()))))
-        for number, (xyz, rgb, track) in enumerate(rows, 1)
+        " ".join(map(str, (number, *position, *color, 0.0, *sum(track, ()))))
+        for number, (position, color, track) in enumerate(rows, 1)
     ]
     _write(folder / "cameras.txt", "cameras", camera_lines)
     _write(folder / "images.txt", "images", image_lines)

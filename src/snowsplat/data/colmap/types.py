@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 
 #: Name and number of parameters of each camera model; the index is its number in binary files.
@@ -74,15 +74,6 @@ class ColmapModel:
 
 
 @dataclass(frozen=True)
-class PointRecords:
-    """The 3D points of a model, as needed for writing. Point ids are 1, 2, …"""
-
-    xyz: np.ndarray  # (P, 3) float, world frame
-    rgb: np.ndarray  # (P, 3) uint8
-    tracks: Sequence[Sequence[tuple[int, int]]]  # per point: pairs (image id, observation index)
-
-
-@dataclass(frozen=True)
 class PointFile:
     """The 3D points of a file, and the tracks of up to `TRACKS` of them, spread over the file."""
 
@@ -106,11 +97,6 @@ def lens_of(camera: ColmapCamera) -> LensModel:
 def damaged(path: Path, problem: str) -> UserError:
     """The error for a file that does not follow the format."""
     return UserError(f"{path}: damaged: {problem}; copy the file again or run COLMAP again")
-
-
-def unreadable(path: Path, error: OSError) -> UserError:
-    """The error for a file that the system cannot read."""
-    return UserError(f"{path}: cannot be read ({error.strerror or error})")
 
 
 def check_count(path: Path, kind: str, count: int) -> None:

@@ -68,9 +68,7 @@ def original_of(name: str, siblings: Iterable[str], *, divided: bool = True) -> 
 
 
 def files_below(
-    root: Path,
-    enter: Callable[[Path, list[str]], Iterable[str]],
-    broken: list[str] | None = None,
+    root: Path, enter: Callable[[Path, list[str]], Iterable[str]], broken: list[str] | None = None
 ) -> list[str]:
     """Files that are not hidden; relative to ``root``, with "/", in natural order.
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.image_file import open_image
+from snowsplat.data.colour_profile import is_transparent
+from snowsplat.data.image_file import open_image, scaled_size
 
 #: The formats of masks, by the names of Pillow.
 MASK_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
@@ -35,8 +36,7 @@ def mask_levels(image: Image.Image) -> np.ndarray:
         return np.clip(values * 255 // scale, 0, 255).astype(np.uint8)
     if image.mode == "1":
         return np.asarray(image).astype(np.uint8) * 255
-    transparent = image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info
-    if not transparent:
+    if not is_transparent(image):
         brightest = _brightest(image)
         return brightest * 255 if brightest.max() == 1 else brightest
     pixels = image.convert("RGBA")
@@ -79,18 +79,14 @@ def looks_like_mask(path: Path) -> bool:
     try:
         with open_image(path, MASK_FORMATS) as opened:
             opened.draft("RGB", (_SMALL_SIDE, _SMALL_SIDE))
-            image = opened.resize(_small_size(opened), Image.Resampling.NEAREST)
+            size = scaled_size(opened.width, opened.height, _SMALL_SIDE)
+            image = opened.resize(size, Image.Resampling.NEAREST)
             image.info = opened.info
             levels = mask_levels(image)
     except Exception:  # Pillow raises many kinds of exceptions for damaged files
         return False
     dark, bright = np.mean(levels < _DARK), np.mean(levels >= _BRIGHT)
     return bool(dark + bright >= _LEAST_BLACK_AND_WHITE) and _has_one_hue(image)
-
-
-def _small_size(image: Image.Image) -> tuple[int, int]:
-    scale = min(1.0, _SMALL_SIDE / max(image.size))
-    return max(1, round(image.width * scale)), max(1, round(image.height * scale))
 
 
 def _has_one_hue(image: Image.Image) -> bool:

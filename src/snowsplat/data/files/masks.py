@@ -14,12 +14,14 @@ The format may be any of `IMAGE_SUFFIXES`; letters may be in upper or lower case
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
+from snowsplat.data.dataset import PosedImage
 from snowsplat.data.decode import IMAGE_SUFFIXES
 from snowsplat.data.files.listing import (
     PHOTO_FOLDERS,
@@ -29,6 +31,8 @@ from snowsplat.data.files.listing import (
     original_of,
 )
 from snowsplat.data.files.mask_pixels import looks_like_mask
+
+logger = logging.getLogger(__name__)
 
 _MARKED_END = re.compile(r"(.+?)[._-]masks?")
 _MARKED_START = re.compile(r"(?:dynamic_)?masks?[._-](.+)")
@@ -182,3 +186,52 @@ def _is_below(path: str, folder: str) -> bool:
 def is_marked(path: str) -> bool:
     """Whether a name says that the file is a mask: IMG_mask.png, mask_IMG.png …"""
     return len(list(_bases_of_mask(PurePosixPath(path).name))) > 1
+
+
+def with_masks(root: Path, posed: Sequence[PosedImage]) -> list[PosedImage]:
+    """The images, with the masks that `find_masks` finds for those that have none.
+
+    Logs a line if there are masks of no image in the folders of the images.
+
+    Args:
+        root: the folder of the dataset.
+    """
+    posed = list(posed)
+    for base in dict.fromkeys(_base(root, image) for image in posed):
+        here = [image for image in posed if _base(root, image) == base]
+        names = {image.path.relative_to(base).as_posix(): image for image in here}
+        folders = {name.rpartition("/")[0] for name in names}
+        try:
+            # All photos of these folders: a mask of a photo without a pose is not misspelt.
+            beside = [f"{f}/{name}".lstrip("/") for f in folders for name in _images_in(base / f)]
+            found = find_masks(base, sorted({*names, *beside}))
+        except OSError:  # a folder that may not be read
+            continue
+        masks = {names[name]: mask for name, mask in found.of.items() if name in names}
+        posed = [
+            replace(image, mask=masks[image]) if image.mask is None and image in masks else image
+            for image in posed
+        ]
+        named = {image.mask.resolve() for image in posed if image.mask is not None}
+        unused = [mask for mask in found.unused if mask.resolve() not in named]
+        if unused:
+            logger.warning(
+                "%s: %d masks are not used, because no photo has the name of %s; the mask of "
+                "IMG.jpg is masks/IMG.png, IMG.jpg.png or IMG_mask.png",
+                *(root, len(unused), unused[0]),
+            )
+    return posed
+
+
+def _base(root: Path, image: PosedImage) -> Path:
+    return root if image.folder.is_relative_to(root) else image.folder
+
+
+def _images_in(folder: Path) -> list[str]:
+    with os.scandir(folder) as entries:
+        return [
+            entry.name
+            for entry in entries
+            if not entry.name.startswith(".")
+            and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
+        ]

@@ -8,6 +8,7 @@ taken only if there is no doubt.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -173,21 +174,11 @@ def _readings(text: str) -> list[str]:
     try:
         raw.decode("utf-8")
     except UnicodeDecodeError:  # bytes of another encoding
-        readings += _decoded(raw, _ENCODINGS)
+        for encoding in _ENCODINGS:
+            with suppress(UnicodeDecodeError):
+                readings.append(raw.decode(encoding))
     else:  # perhaps UTF-8 that was taken for another encoding
         for encoding in _MISTAKEN:
-            try:
+            with suppress(UnicodeError):
                 readings.append(text.encode(encoding).decode("utf-8"))
-            except UnicodeError:
-                continue
     return list(dict.fromkeys(readings))
-
-
-def _decoded(raw: bytes, encodings: Sequence[str]) -> list[str]:
-    readings = []
-    for encoding in encodings:
-        try:
-            readings.append(raw.decode(encoding))
-        except UnicodeDecodeError:
-            continue
-    return readings

@@ -35,6 +35,15 @@ def photos_below(root: Path) -> list[str]:
     ]
 
 
+def warn_of_missing(
+    where: object, missing: Sequence[str], count: int, what: str = "images"
+) -> None:
+    """Log how many of the ``count`` photos of a dataset are missing, if any are."""
+    if missing:
+        line = "%s: %d of %d %s are missing (the first is %s); skipped"
+        logger.warning(line, where, len(missing), count, what, quoted(missing[0]))
+
+
 def find_photos(
     where: object, root: Path, names: Sequence[str], taken: Collection[str]
 ) -> dict[str, str]:

@@ -6,15 +6,26 @@ Nothing here undistorts photos: `PosedImage.lens` tells the lens of a distorted 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from snowsplat.data.dataset import Points, PosedImage, safe_name
-from snowsplat.data.imports.kinds import KINDS, Kind
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.files.photos import warn_of_missing
+from snowsplat.data.imports import (
+    alicevision,
+    bundler,
+    llff,
+    metashape,
+    openmvg,
+    opensfm,
+    polycam,
+    realityscan,
+    record3d,
+)
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.lens.project import intrinsics
 from snowsplat.scene.camera import Camera
@@ -22,6 +33,52 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
 logger = logging.getLogger(__name__)
+
+
+def _nowhere(folder: Path) -> Path | None:
+    return None
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How the files of a program are found and read.
+
+    Attributes:
+        name: of the program, for messages.
+        patterns: where in a dataset the files, or folders, are that describe its cameras.
+        is_one: whether a file or folder is one of them.
+        read: reads one of them. Errors are `UserError`.
+        photos: the folder of photos, if other images of the dataset are not photos.
+    """
+
+    name: str
+    patterns: tuple[str, ...]
+    is_one: Callable[[Path], bool]
+    read: Callable[[Path, PhotoFolder], Reconstruction]
+    photos: Callable[[Path], Path | None] = _nowhere
+
+    def find(self, folder: Path) -> Iterator[Path]:
+        """The files that describe the cameras of a dataset, the best first.
+
+        They are in the order of the patterns; of those of one pattern, a larger file says more.
+        """
+        for pattern in self.patterns:
+            found = [path for path in sorted(folder.glob(pattern)) if self.is_one(path)]
+            yield from sorted(found, key=lambda path: -path.stat().st_size)
+
+
+#: In the order in which they are tried: files of an unmistakable kind first.
+KINDS = (
+    Kind("Metashape", ("*.xml",), metashape.is_metashape, metashape.read),
+    Kind("RealityScan", ("*.csv",), realityscan.is_realityscan, realityscan.read),
+    Kind("Polycam", polycam.PATTERNS, polycam.is_polycam, polycam.read, polycam.photos),
+    Kind("Record3D", record3d.PATTERNS, record3d.is_record3d, record3d.read, record3d.photos),
+    Kind("OpenMVG", ("sfm_data*.json",), openmvg.is_openmvg, openmvg.read),
+    Kind("AliceVision", ("*.sfm", "sfm.json"), alicevision.is_alicevision, alicevision.read),
+    Kind("Bundler", bundler.PATTERNS, bundler.is_bundler, bundler.read),
+    Kind("OpenSfM", opensfm.PATTERNS, opensfm.is_opensfm, opensfm.read),
+    Kind("LLFF", ("poses_bounds.npy",), llff.is_llff, llff.read),
+)
 
 
 @dataclass(frozen=True)
@@ -97,11 +154,9 @@ def read_export(
 def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstruction) -> None:
     if not found.shots:
         if not found.missing:
-            of_photos = (
-                f"none of its {found.total} photos is aligned" if found.total else "no photos"
-            )
+            none = f"none of its {found.total} photos is aligned" if found.total else "no photos"
             raise UserError(
-                f"{cameras}: {of_photos}; align them in {program}, "
+                f"{cameras}: {none}; align them in {program}, "
                 "or estimate the poses: snowsplat sfm PHOTOS -o DATASET"
             )
         raise UserError(
@@ -109,14 +164,8 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
             f"{quoted(found.missing[0])}) is in {folder.root}; copy them to "
             f"{folder.root / 'images'}"
         )
-    if found.missing:
-        logger.warning(
-            "%s: %d of %d photos are missing (the first is %s); skipped",
-            cameras,
-            len(found.missing),
-            len(found.missing) + len(found.shots),
-            quoted(found.missing[0]),
-        )
+    aligned = len(found.missing) + len(found.shots)
+    warn_of_missing(cameras, found.missing, aligned, "photos")
     if found.points is None:
         with_depth = any(shot.depth is not None for shot in found.shots)
         logger.warning(
@@ -130,10 +179,7 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
 def _posed(root: Path, shot: Shot) -> PosedImage:
     lens = shot.lens
     camera = Camera(
-        lens.width,
-        lens.height,
-        *intrinsics(lens)[:4],
-        torch.from_numpy(shot.cam_from_world.copy()),
+        lens.width, lens.height, *intrinsics(lens)[:4], torch.from_numpy(shot.cam_from_world.copy())
     )
     first, slash, _ = shot.photo.partition("/")
     folder = root / first if slash else root

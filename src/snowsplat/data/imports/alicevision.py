@@ -13,9 +13,8 @@ import numpy as np
 
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.imports.lenses import fisheye, perspective
-from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.points import points_beside
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import (
     damaged,
     head_of,
@@ -26,7 +25,7 @@ from snowsplat.data.imports.values import (
     rigid,
     table,
 )
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.dataset import usable_points
+from snowsplat.data.decode import read_header
 from snowsplat.data.imports.lenses import centred, perspective
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import head_of, load_text, numbers, rigid
 from snowsplat.util.errors import UserError
 
@@ -44,7 +44,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             continue
         if (photo := found.photo(photos, name)) is None:
             continue
-        header = photos.header(photo)
+        header = read_header(photos.root / photo)
         size = header.width, header.height
         lens = perspective(where, *size, centred(*size, focal), (k1, k2))
         pose = rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from snowsplat.data.imports.values import damaged, size_of
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import BROWN
+from snowsplat.data.lens.project import BROWN, LensModel
 
 #: fx, fy, cx, cy in pixels.
 Intrinsics = tuple[float, float, float, float]

@@ -12,8 +12,7 @@ import numpy as np
 
 from snowsplat.data.image_file import reason_of
 from snowsplat.data.imports.lenses import centred, perspective
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import damaged, from_opengl, numbers
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file

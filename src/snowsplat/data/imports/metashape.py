@@ -15,9 +15,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from snowsplat.data.imports.lenses import equirectangular, fisheye, perspective
-from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.points import points_beside
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import (
     damaged,
     head_of,
@@ -28,7 +27,7 @@ from snowsplat.data.imports.values import (
     rigid,
     size_of,
 )
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.decode import ImageSource, load_thumbnail, read_header
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.lens.project import project
 from snowsplat.data.points_ply import read_points
 from snowsplat.util.errors import UserError

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.imports.lenses import perspective
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import from_opengl, load_json, number, table
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.data.decode import read_header
 from snowsplat.data.imports.lenses import perspective
-from snowsplat.data.imports.photos import PhotoFolder
 from snowsplat.data.imports.points import points_beside
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import damaged, from_opengl, head_of, load_text, number
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
@@ -63,7 +63,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         found.total += 1
         if (photo := found.photo(photos, values["name"])) is None:
             continue
-        header = photos.header(photo)
+        header = read_header(photos.root / photo)
         width, height = header.width, header.height
         unit = max(width, height)
         focal = number(where, values, "f") * unit / 36.0

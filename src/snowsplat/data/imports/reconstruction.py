@@ -1,15 +1,114 @@
-"""What a reader of this folder returns."""
+"""What a reader of this folder gets, a `PhotoFolder`, and what it returns, a `Reconstruction`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from snowsplat.data.dataset import Points
-from snowsplat.data.imports.photos import PhotoFolder
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.dataset import Points, safe_name
+from snowsplat.data.decode import IMAGE_SUFFIXES
+from snowsplat.data.files.listing import folded
+from snowsplat.data.files.photos import photos_below
+from snowsplat.data.lens.project import LensModel
+from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.safe_json import is_file, quoted
+
+# Smaller copies of the photos, whose folder may have any name.
+_SMALLER = {"images_2", "images_4", "images_8"}
+
+
+class PhotoFolder:
+    """The photos in the folder of a dataset.
+
+    Other programs name a photo by an absolute path of another computer, by its file name, or by its
+    name without suffix. A photo is found by its path, or by its name if only one photo has it.
+
+    Args:
+        root: the folder that is searched; no photo outside of it is used.
+        images: name of the folder of photos; photos elsewhere are used if it has the default name.
+
+    Raises:
+        SettingError: there is no folder ``images``, and it does not have the default name.
+    """
+
+    def __init__(self, root: Path, images: str = "images") -> None:
+        self.root = root
+        self._preferred = images
+        if images != "images" and not (root / images).is_dir():
+            raise SettingError("images", f"no such folder: {root / images}; use the right one")
+        self._only = images != "images"
+        self._by_name: dict[str, list[str]] | None = None
+
+    def find(self, name: str) -> str | None:
+        """The file of a photo, relative to the root, with "/"; None if it is not there.
+
+        Raises:
+            UserError: several photos have this name.
+        """
+        name = safe_name(name)
+        if not name:
+            return None
+        for folder in (f"{self._preferred}/", *(() if self._only else ("",))):
+            for suffix in ("", *IMAGE_SUFFIXES) if not is_photo(name) else ("",):
+                if is_file(self.root / (folder + name + suffix)) and is_photo(name + suffix):
+                    return folder + name + suffix
+        last = folded(PurePosixPath(name).name)
+        index = self._index()
+        return self._nearest(name, index.get(last) or index.get(_stem(last)) or [])
+
+    def sorted_files(self) -> list[str]:
+        """The photos of the folder of images, or of the root if there is none, sorted by name."""
+        folder = self.root / self._preferred
+        prefix = f"{self._preferred}/" if folder.is_dir() else ""
+        names = (path.name for path in (folder if prefix else self.root).iterdir())
+        return [prefix + name for name in sorted(names) if is_photo(name)]
+
+    def _nearest(self, name: str, found: list[str]) -> str | None:
+        """The one of several files that has most folders in common with ``name``."""
+        if len(found) < 2:
+            return found[0] if found else None
+        wanted = PurePosixPath(name).parts[-2::-1]
+
+        def common(file: str) -> tuple[int, bool]:
+            own = PurePosixPath(file).parts
+            pairs = zip(wanted, own[-2::-1], strict=False)
+            same = next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(wanted), len(own)))
+            return same, own[0] == self._preferred
+
+        found = sorted(found, key=common, reverse=True)
+        if common(found[0]) == common(found[1]):
+            raise UserError(
+                f"{self.root}: has several photos named {quoted(PurePosixPath(name).name)} "
+                f"({found[0]}, {found[1]}); keep only the right ones in its folder images"
+            )
+        return found[0]
+
+    def _index(self) -> dict[str, list[str]]:
+        """The photos below the root, by their names and by their names without suffix."""
+        if self._by_name is None:
+            self._by_name = {}
+            below = f"{self._preferred}/" if self._only else ""
+            try:
+                photos = photos_below(self.root / below)
+            except OSError:  # a folder that cannot be read
+                photos = []
+            for photo in (p for p in photos if _SMALLER.isdisjoint(p.split("/"))):
+                name = folded(PurePosixPath(photo).name)
+                for key in {name, _stem(name)}:
+                    self._by_name.setdefault(key, []).append(below + photo)
+        return self._by_name
+
+
+def is_photo(name: str) -> bool:
+    """Whether a file name has the suffix of a photo."""
+    return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+
+
+def _stem(name: str) -> str:
+    """The name without the suffix of a photo; "IMG.0001" has none."""
+    return name.rpartition(".")[0] if is_photo(name) else name
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,7 @@ import torch
 
 from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.imports.lenses import Intrinsics, perspective
-from snowsplat.data.imports.photos import PhotoFolder, is_photo
-from snowsplat.data.imports.reconstruction import Reconstruction, Shot
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot, is_photo
 from snowsplat.data.imports.values import (
     damaged,
     from_opengl,

@@ -12,6 +12,7 @@ from xml.parsers import expat
 import numpy as np
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 from snowsplat.util.safe_json import quoted, read_json
 
 #: Memory for JSON values per byte of the text. A point of OpenSfM needs 7 times its text.
@@ -31,16 +32,18 @@ def damaged(where: object, problem: str) -> UserError:
     return UserError(f"{where}: {problem}; export the file again")
 
 
-def load_json(path: Path) -> Any:
+def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
     """The value in a JSON file.
+
+    Args:
+        ratio: see `parse_json`.
 
     Raises:
         UserError: the file cannot be read, or is not JSON.
     """
     try:
-        return read_json(path, _JSON_RATIO)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+        with reading(path):
+            return read_json(path, ratio)
     except ValueError as error:  # not JSON, or not even text
         raise UserError(
             f"{path}: not a complete JSON file ({str(error)[:80]}); copy it again"
@@ -185,9 +188,7 @@ def from_opengl(where: object, world_from_cam: np.ndarray) -> np.ndarray:
 
 
 def _load_bytes(path: Path) -> bytes:
-    try:
+    with reading(path):
         if path.stat().st_size > _MOST_BYTES:
             raise UserError(f"{path}: larger than 1 GiB, which is not supported")
         return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None

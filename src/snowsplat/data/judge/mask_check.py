@@ -11,6 +11,7 @@ import numpy as np
 from snowsplat.data.dataset import Points, View
 from snowsplat.data.decode import ImageSource, load_mask
 from snowsplat.data.files.mask_look import INVERT, doubt_about_masks, look_of
+from snowsplat.data.image_file import scaled_size
 from snowsplat.data.judge.finding import Finding
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
@@ -40,8 +41,7 @@ def mask_findings(views: Sequence[View], points: Points | None) -> list[Finding]
 
 
 def _small(camera: Camera, mask: ImageSource) -> tuple[Camera, np.ndarray | None]:
-    scale = min(1.0, _SIDE / max(mask.width, mask.height))
-    size = max(1, round(mask.width * scale)), max(1, round(mask.height * scale))
+    size = scaled_size(mask.width, mask.height, _SIDE)
     try:
         small = load_mask(dataclasses.replace(mask, width=size[0], height=size[1])).numpy()
     except UserError:  # the training says so

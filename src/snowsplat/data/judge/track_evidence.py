@@ -82,8 +82,7 @@ class TrackFit:
 @dataclass(frozen=True)
 class _Photo:
     """Points in front of a camera, projected and observed (N, 2), relative to the principal point
-    and to the size of the photo.
-    """
+    and to the size of the photo."""
 
     typical: float  # distance relative to the longer side; infinite if most points are behind
     projected: np.ndarray
@@ -172,8 +171,7 @@ def _other_pictures(photos: Sequence[_Photo], centre: np.ndarray) -> bool:
 
 def _robust_fit(basis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
     """The coefficients (B, C) with which the basis (N, B) fits values (N, C), most of which are
-    right; and the median distance that is left.
-    """
+    right; and the median distance that is left."""
     weights = np.ones((len(values), 1))
     for _ in range(_ITERATIONS):
         coefficients = np.linalg.lstsq(weights * basis, weights * values, rcond=None)[0]

@@ -2,7 +2,7 @@
 
 Four witnesses are heard, as far as the dataset has them:
 
-- the numbers: lenses, positions (`lens_check`, `position_check`);
+- the numbers: lenses, positions (`lens_check`);
 - the points: have they the colours of the photos where the cameras see them (`ColourEvidence`)?
 - the photos: do matches between them agree with the poses (`MatchEvidence`)?
 - the tracks: are the points where they were observed (`track_fit`)?
@@ -26,7 +26,6 @@ from snowsplat.data.judge.lens_check import lens_findings
 from snowsplat.data.judge.mask_check import mask_findings
 from snowsplat.data.judge.match_evidence import Fit, MatchEvidence
 from snowsplat.data.judge.photo_sample import PhotoSample
-from snowsplat.data.judge.position_check import position_findings
 from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs, zooms
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.judge.track_evidence import TrackFit, track_fit
@@ -55,6 +54,11 @@ _POINTS_TO_TRY = 2000
 # Another focal length must divide the distances of matches by this, in the median of the pairs.
 _SHARPER = 2.0
 
+# Distance of the scene from the origin, relative to the extent of the cameras. Kernels compute in
+# float32, with a relative error of 6e-8. At a distance of 2000 extents this is a tenth of a pixel
+# of a photo with 1000 pixels; at 50,000 it is some pixels.
+_ROUNDED, _LOST = 2e3, 5e4
+
 
 def judge(dataset: Dataset) -> list[Finding]:
     """What is impossible or doubtful about the cameras and masks of a dataset; empty if nothing is.
@@ -64,7 +68,7 @@ def judge(dataset: Dataset) -> list[Finding]:
     views = sorted([*dataset.train, *dataset.test], key=lambda view: natural_key(view.name))
     masks = mask_findings(views, dataset.points)
     rig = Rig.of([view.camera for view in views])
-    lenses, positions = _lenses(views), position_findings(rig)
+    lenses, positions = _lenses(views), _positions(rig)
     if any(finding.impossible for finding in lenses):
         return [*lenses, *masks]
     poses = _poses(views, rig, dataset.points, far=dataset.origin != HERE)
@@ -91,6 +95,29 @@ def _lenses(views: list[View]) -> list[Finding]:
         )
         for finding, count in found.values()
     ]
+
+
+def _positions(rig: Rig) -> list[Finding]:
+    """What is impossible or doubtful about the positions of cameras, whatever the scene is."""
+    positions = rig.positions
+    if len(positions) < 2:
+        return []
+    middle = positions.mean(0)
+    extent = float(np.linalg.norm(positions - middle, axis=1).max())
+    distance = float(np.linalg.norm(middle))
+    # Positions are computed from rotations and translations, with rounding errors.
+    if extent <= 1e-9 * max(distance, np.abs(rig.translation).max(), 1e-30):
+        text = f"all {len(rig)} cameras are at one place, so the photos show no depth"
+        return [Finding("positions", text)]
+    if distance > _ROUNDED * extent:
+        text = (
+            f"the cameras are {distance:,.0f} units away from the origin, and {extent:.3g} from "
+            f"each other, which 32-bit numbers cannot resolve; subtract "
+            f"({', '.join(f'{value:.0f}' for value in middle)}) from the positions of cameras and "
+            "points"
+        )
+        return [Finding("origin", text, impossible=distance > _LOST * extent)]
+    return []
 
 
 def _poses(views: list[View], rig: Rig, points: Points | None, *, far: bool) -> list[Finding]:
@@ -197,8 +224,7 @@ def _by_both(
 
 def _focal(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
     """Matches may lie near their epipolar lines with any focal length, if all cameras look at one
-    small object. But they are nearest with the right one.
-    """
+    small object. But they are nearest with the right one."""
     best, best_fit = None, fit
     for repair in zooms(rig):
         if (tried := matches.fit(repair.rig)).median < best_fit.median:
@@ -253,9 +279,7 @@ def _of_colours(agreement: Agreement) -> str:
 
 def _mistake(repair: Repair, evidence: str) -> Finding:
     return Finding(
-        repair.about,
-        f"{evidence}; {repair.mistake}; correct the dataset",
-        impossible=True,
+        repair.about, f"{evidence}; {repair.mistake}; correct the dataset", impossible=True
     )
 
 

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import BROWN, project
+from snowsplat.data.lens.project import BROWN, LensModel, project
 
 _SAMPLES = 400  # radii at which a lens is fitted
 _GRID = 33  # pixels of the photo along each side, at which the error is measured
@@ -35,10 +34,8 @@ def as_colmap(lens: LensModel) -> tuple[LensModel, float]:
 
 
 def _ratio(lens: LensModel, radial: list[float]) -> tuple[list[float], list[float]]:
-    """Coefficients of r², r⁴ and r⁶ of a numerator and of a divisor that act as r² … r⁸.
-
-    Least squares of N(r) − g(r) D(r), which is linear, over the radii that the photo shows.
-    """
+    """Coefficients of r², r⁴ and r⁶ of a numerator and of a divisor that act as r² … r⁸. Least
+    squares of N(r) − g(r) D(r), which is linear, over the radii that the photo shows."""
     fx, fy, cx, cy = lens.params[:4]
     corner = math.hypot(max(cx, lens.width - cx) / fx, max(cy, lens.height - cy) / fy)
     # The smallest radius that is distorted to that of the corner.

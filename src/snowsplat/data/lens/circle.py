@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import intrinsics
+from snowsplat.data.lens.project import LensModel, intrinsics
 
 # Of 255: outside of the circle no photo is brighter, except for JPEG artefacts and noise.
 _BLACK = 24

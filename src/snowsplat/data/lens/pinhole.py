@@ -6,53 +6,33 @@ calibration that SfM may return.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.positions import Positions, node_grid
-from snowsplat.data.lens.project import BROWN, intrinsics, project, unproject
+from snowsplat.data.lens.positions import node_grid
+from snowsplat.data.lens.project import BROWN, LensModel, intrinsics, project, unproject
 
 _CROPPED = 0.95  # of width and height; without blank borders, an image shows more of the photo
 _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle
 # Models that are pinhole cameras if their coefficients are 0.
 _PINHOLES = frozenset(
     {
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "FULL_OPENCV",
-        BROWN,
-        "SIMPLE_DIVISION",
-        "DIVISION",
+        *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+        *(BROWN, "SIMPLE_DIVISION", "DIVISION"),
     }
 )
 _MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the calibration is wrong
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Pinhole:
-    """A camera without distortion, and the map from its pixels to those of the distorted photo.
-
-    ``nodes`` is that of `Positions`, for the whole image; None if there is no distortion.
-    """
+    """A camera without distortion."""
 
     width: int  # pixels
     height: int
     params: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
-    nodes: np.ndarray | None = None  # float32
     cropped: bool = False  # the outer part is cut off, because the calibration is invalid there
-    wraps: ClassVar[bool] = False  # see `LensView.wraps`
-
-    def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
-        """See `LensView.positions`."""
-        assert self.nodes is not None
-        yield slice(0, height), Positions.between(self.nodes, width, height)
 
 
 def is_pinhole(lens: LensModel) -> bool:
@@ -88,7 +68,7 @@ def pinhole_of(lens: LensModel) -> Pinhole:
             raise ValueError("less than a fifth of the width or height can be undistorted")
     nodes = node_grid(made.width, made.height, lambda x, y: _to_photo(lens, made, x, y))
     used = np.ptp(nodes, axis=(0, 1)) / (lens.width, lens.height)
-    return Pinhole(made.width, made.height, made.params, nodes, bool(used.min() < _CROPPED))
+    return replace(made, cropped=bool(used.min() < _CROPPED))
 
 
 def _without_blank_borders(lens: LensModel) -> Pinhole:
@@ -120,10 +100,8 @@ def _without_blank_borders(lens: LensModel) -> Pinhole:
 
 
 def _to_photo(lens: LensModel, pinhole: Pinhole, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels.
-
-    NaN where the lens model is undefined.
-    """
+    """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels. NaN where the
+    lens model is undefined."""
     fx, fy, cx, cy = pinhole.params
     across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
     return project(lens, np.stack([across, down, np.ones_like(across)], -1))

@@ -1,4 +1,4 @@
-"""From directions in the frame of a camera to pixels of its photo, for COLMAP's camera models.
+"""Lenses: from directions in the frame of a camera to pixels of its photo, and back.
 
 https://colmap.github.io/cameras.html describes the models. A model whose equation is a polynomial
 may fold: beyond some angle the pixels return to the centre. `field` finds this angle.
@@ -7,21 +7,16 @@ may fold: beyond some angle the pixels return to the centre. `field` finds this 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-
-from snowsplat.data.lens.model import LensModel
 
 # Models with one focal length; the others, except EQUIRECTANGULAR, start with fx, fy.
 _ONE_FOCAL_LENGTH = frozenset(
     {
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-        "SIMPLE_DIVISION",
-        "SIMPLE_FISHEYE",
+        *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE"),
+        *("RADIAL_FISHEYE", "SIMPLE_DIVISION", "SIMPLE_FISHEYE"),
     }
 )
 #: The model of Metashape and RealityScan, which COLMAP does not have: fx, fy, cx, cy, k1, k2, k3,
@@ -29,6 +24,19 @@ _ONE_FOCAL_LENGTH = frozenset(
 BROWN = "BROWN"
 _TINY = 1e-12
 _NEWTON_STEPS = 30
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """The intrinsics of a distorted photo: one of COLMAP's camera models and its parameters.
+
+    https://colmap.github.io/cameras.html lists the models and the order of their parameters.
+    """
+
+    model: str  # the name of a camera model of COLMAP, e.g. "OPENCV_FISHEYE"; or `BROWN`
+    width: int  # pixels, of the photos that ``params`` are for
+    height: int
+    params: tuple[float, ...]  # focal lengths and principal point in pixels, then coefficients
 
 
 def intrinsics(lens: LensModel) -> tuple[float, float, float, float, tuple[float, ...]]:
@@ -78,22 +86,13 @@ def unproject(lens: LensModel, pixels: np.ndarray) -> np.ndarray:
     if "FISHEYE" in lens.model:  # the angle instead of its tangent
         angle = np.maximum(np.linalg.norm(found, axis=1, keepdims=True), _TINY)
         found = found * np.tan(np.minimum(angle, 1.55)) / angle
-    with np.errstate(all="ignore"):
-        for _ in range(_NEWTON_STEPS):
-            step = 1e-6 * (1 + np.abs(found).max(1))
-            at, right, down = (
-                project(lens, np.column_stack([found[:, 0] + dx, found[:, 1] + dy, 1 + 0 * step]))
-                for dx, dy in ((0.0, 0.0), (step, 0.0), (0.0, step))
-            )
-            (a, b), (c, d) = ((right - at) / step[:, None]).T, ((down - at) / step[:, None]).T
-            x, y = (at - pixels).T
-            change = np.column_stack([d * x - c * y, a * y - b * x])
-            found = found - change / (a * d - b * c)[:, None]
-            wrong = np.hypot(x, y)
-            if not (wrong > 1e-6).any():
-                break
-    found[~(wrong < 1e-3)] = np.nan
-    return found
+    return _solved(
+        lens,
+        pixels,
+        found,
+        ray_of=lambda tangents: np.column_stack([tangents, np.ones(len(tangents))]),
+        step_of=lambda tangents: 1e-6 * (1 + np.abs(tangents).max(1, keepdims=True)),
+    )
 
 
 def _fisheye(
@@ -184,21 +183,37 @@ def directions(lens: LensModel, pixels: np.ndarray) -> np.ndarray:
     if not lens.model.endswith("FISHEYE"):  # these are tangents
         tangent = np.maximum(np.linalg.norm(angles, axis=1, keepdims=True), _TINY)
         angles = angles * np.arctan(tangent) / tangent
-    step = 1e-6
+    return _turned(_solved(lens, pixels, angles, ray_of=_turned, step_of=lambda _: 1e-6))
+
+
+def _solved(
+    lens: LensModel,
+    pixels: np.ndarray,
+    found: np.ndarray,
+    ray_of: Callable[[np.ndarray], np.ndarray],
+    step_of: Callable[[np.ndarray], np.ndarray | float],
+) -> np.ndarray:
+    """The values (N, 2) whose rays have these pixels, by Newton's method from ``found``; NaN: none.
+
+    Args:
+        ray_of: the directions (N, 3) of values (N, 2).
+        step_of: the difference, (N, 1) or one, from which derivatives at these values are computed.
+    """
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
+            step = step_of(found)
             at, right, down = (
-                project(lens, _turned(angles + offset)) for offset in ((0, 0), (step, 0), (0, step))
+                project(lens, ray_of(found + step * np.array(axis)))
+                for axis in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
             )
             (a, b), (c, d) = ((right - at) / step).T, ((down - at) / step).T
             x, y = (at - pixels).T
-            angles = (
-                angles - np.column_stack([d * x - c * y, a * y - b * x]) / (a * d - b * c)[:, None]
-            )
+            change = np.column_stack([d * x - c * y, a * y - b * x])
+            found = found - change / (a * d - b * c)[:, None]
             wrong = np.hypot(x, y)
             if not (wrong > 1e-6).any():
                 break
-    return np.where((wrong < 1e-3)[:, None], _turned(angles), np.nan)
+    return np.where((wrong < 1e-3)[:, None], found, np.nan)
 
 
 def _turned(angles: np.ndarray) -> np.ndarray:

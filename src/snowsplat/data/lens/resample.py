@@ -6,39 +6,17 @@ interpolation. Training uses every pixel, so blur added here would limit its qua
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
-
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.lens.pinhole import Pinhole
-from snowsplat.data.lens.positions import Positions
 from snowsplat.data.lens.views import LensView
 from snowsplat.util import array_kernels
 from snowsplat.util.native_library import ArrayPointer
 
 
-class PixelMap(Protocol):
-    """From the pixels of a view to those of a photo: a `Pinhole` or a `LensView`."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
-
-    @property
-    def wraps(self) -> bool: ...
-
-    def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
-        """See `LensView.positions`."""
-        ...
-
-
-def undistort_image(image: Image.Image, view: PixelMap) -> Image.Image:
+def undistort_image(image: Image.Image, view: LensView) -> Image.Image:
     """A photo, "L", "RGB" or "RGBA", resampled to the view; same mode."""
-    if isinstance(view, Pinhole) and view.nodes is None:
+    if view.is_photo:
         return image
     # Premultiplied alpha, so that the colours of transparent pixels do not affect other pixels.
     mode = "RGBa" if image.mode == "RGBA" else image.mode
@@ -48,13 +26,13 @@ def undistort_image(image: Image.Image, view: PixelMap) -> Image.Image:
     return Image.frombytes(mode, (view.width, view.height), pixels.tobytes()).convert(image.mode)
 
 
-def undistort_mask(mask: Image.Image, view: PixelMap) -> Image.Image:
+def undistort_mask(mask: Image.Image, view: LensView) -> Image.Image:
     """A mask, "L", resampled to the view: 255 where at least half of a pixel is set."""
     return undistort_image(mask, view).point(lambda value: 255 * (value >= 128))
 
 
 def resampled(
-    planes: np.ndarray, view: PixelMap, width: int, height: int, scale: tuple[float, float] = (1, 1)
+    planes: np.ndarray, view: LensView, width: int, height: int, scale: tuple[float, float] = (1, 1)
 ) -> np.ndarray:
     """(C, height, width) uint8: a photo (C, H, W) uint8 seen by a view at the given size.
 

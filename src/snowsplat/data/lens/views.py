@@ -18,10 +18,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.pinhole import pinhole_of
+from snowsplat.data.lens.pinhole import is_pinhole, pinhole_of
 from snowsplat.data.lens.positions import Positions, node_grid
-from snowsplat.data.lens.project import intrinsics, project
+from snowsplat.data.lens.project import LensModel, intrinsics, project
 
 # Radians: a pinhole image of a wider field has too many pixels near its border.
 _WIDEST = math.radians(120.0)
@@ -66,6 +65,11 @@ class LensView:
     circle: float | None = None
     partial: bool = False
     cropped: bool = False
+
+    @property
+    def is_photo(self) -> bool:
+        """Whether the view is the whole photo, as the lens has no distortion."""
+        return self.rotation is None and is_pinhole(self.lens)
 
     @property
     def wraps(self) -> bool:
@@ -129,6 +133,13 @@ class LensView:
             _, _, cx, cy, _ = intrinsics(self.lens)
             inside &= (x - cx) ** 2 + (y - cy) ** 2 <= self.circle**2
         return inside
+
+
+def pinhole_view(lens: LensModel) -> LensView:
+    """The only view of a lens that is not wide; raises the errors of `pinhole_of`."""
+    pinhole = pinhole_of(lens)
+    size = pinhole.width, pinhole.height
+    return LensView(lens, "", *size, pinhole.params, cropped=pinhole.cropped)
 
 
 def look(yaw: float, pitch: float) -> np.ndarray:
@@ -203,9 +214,7 @@ def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, 
     reach = [float(angle) for angle in field.reach[::quarter]]  # right, down, left, up
     across, down = reach[0] + reach[2], reach[1] + reach[3]
     if max(across, down) <= _WIDEST and circle is None:
-        pinhole = pinhole_of(lens)
-        size = pinhole.width, pinhole.height
-        return (LensView(lens, "", *size, pinhole.params, cropped=pinhole.cropped),)
+        return (pinhole_view(lens),)
     rays = field.rays()
     with np.errstate(divide="ignore"):
         half_angles = np.abs(np.arctan(rays[:, :2] / rays[:, 2:])).max(0)
@@ -280,10 +289,8 @@ _Turn = tuple[str, float, float]  # name, yaw and pitch in radians
 
 
 def _layout(rays: np.ndarray, across: float, down: float) -> list[_Turn]:
-    """The directions of the fewest views that cover ``rays`` (N, 3).
-
-    ``across``, ``down``: the largest angles in the horizontal and in the vertical direction.
-    """
+    """The directions of the fewest views that cover ``rays`` (N, 3). ``across``, ``down``: the
+    largest angles in the horizontal and in the vertical direction."""
     half = (_VIEW_ANGLE - _OVERLAP) / 2
     best: list[_Turn] = []
     for turns in _layouts(max(half / 2, across - half), max(half / 2, down - half)):

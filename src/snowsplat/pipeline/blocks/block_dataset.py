@@ -14,7 +14,7 @@ import numpy as np
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import Origin, opposite
 

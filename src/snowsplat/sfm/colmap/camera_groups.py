@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.lens import camera_ids, misfit
+from snowsplat.sfm.colmap.lens import camera_ids, misfit, robust_adjustment, used_cameras
 from snowsplat.sfm.ingest.photo import Photo
 
 # Focal lengths of two groups differ by at least this factor. Smaller differences have little effect
@@ -67,15 +67,10 @@ def own_focals(model: pycolmap.Reconstruction, threads: int) -> dict[int, float]
     """
     part = _with_separate_cameras(model)
     part.update_point_3d_errors()
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
+    before = part.compute_mean_reprojection_error()
+    options = robust_adjustment(threads, 1e-4, before)
     # With a distortion for each photo, the focal lengths are less well determined.
     options.refine_extra_params = False
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.function_tolerance = 1e-4
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    before = part.compute_mean_reprojection_error()
-    options.ceres.loss_function_scale = before
     pycolmap.bundle_adjustment(part, options)
     part.update_point_3d_errors()
     gain = 1 - part.compute_mean_reprojection_error() / before if before else 0.0
@@ -114,15 +109,6 @@ def grouped(photos: Sequence[Photo], focals: Mapping[int, float]) -> list[Photo]
     return None if made == list(photos) else made
 
 
-def by_camera(photos: Sequence[Photo], focals: Mapping[int, float]) -> dict[int, float]:
-    """The median focal length of the photos of each camera; ``focals`` as in `grouped`."""
-    values: dict[int, list[float]] = {}
-    for i, camera in enumerate(camera_ids(photos)):
-        if i + 1 in focals:
-            values.setdefault(camera, []).append(focals[i + 1])
-    return {camera: float(np.median(known)) for camera, known in values.items()}
-
-
 def better(
     model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction], several: bool
 ) -> bool:
@@ -137,25 +123,21 @@ def better(
     other = others[0]
     if model.num_reg_images() < other.num_reg_images():
         return False
-    if _cameras(model) <= _cameras(other):
+    if len(used_cameras(model)) <= len(used_cameras(other)):
         return misfit(other) >= (1 - _MIN_GAIN) * misfit(model)
     return misfit(model) < (1.0 if several else 1 - _MIN_GAIN) * misfit(other)
 
 
 def describe(model: pycolmap.Reconstruction) -> str:
     """The focal lengths of the cameras of ``model``, as text for users; empty: only one."""
-    used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
-    cameras = [model.cameras[i] for i in used if not model.cameras[i].is_spherical()]
+    cameras = [model.cameras[i] for i in used_cameras(model)]
+    cameras = [camera for camera in cameras if not camera.is_spherical()]
     distinct = sorted({round(camera.mean_focal_length()) for camera in cameras})
     if len(distinct) < 2:
         return ""
     if len(distinct) > _NAMED:
         return f"focal lengths from {distinct[0]} to {distinct[-1]} pixels"
     return f"focal lengths of {', '.join(map(str, distinct[:-1]))} and {distinct[-1]} pixels"
-
-
-def _cameras(model: pycolmap.Reconstruction) -> int:
-    return len({model.image(image_id).camera_id for image_id in model.reg_image_ids()})
 
 
 def _clusters(values: np.ndarray) -> list[int]:

@@ -108,10 +108,8 @@ def estimate_poses(
 
 
 def _check_disk(folder: Path) -> None:
-    """Raises OSError if there is no space for a larger file in ``folder``.
-
-    In this case, the full disk is the likely cause of the crash.
-    """
+    """Raises OSError if there is no space for a larger file in ``folder``. In this case, the full
+    disk is the likely cause of the crash."""
     try:
         largest = max(path.stat().st_size for path in folder.iterdir())
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -154,10 +152,7 @@ def _run(
 
 
 def _communicate(
-    child: subprocess.Popen[str],
-    job: dict[str, Any],
-    report: Report,
-    figures: Figures,
+    child: subprocess.Popen[str], job: dict[str, Any], report: Report, figures: Figures
 ) -> dict[str, Any]:
     """Send the job, report progress until the child ends, and return its last line.
 

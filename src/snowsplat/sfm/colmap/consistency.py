@@ -2,26 +2,23 @@
 
 docs/cameras.md describes the method, docs/measurements/2026-11-23-checking-poses.md an example.
 
-The mapper registers a photo if some of its matches agree with the points of the model. If two
-places look alike, it may register a photo, and then all following photos, at the wrong place. The
-reprojection error remains small, because the mapper drops the matches that disagree with the poses.
-Two photos that were taken one after the other may then have thousands of verified matches, but no
-point in common. A pair of photos whose verified matches contradict the model is a *tear*.
+If two places look alike, the mapper may register a photo, and then all following photos, at the
+wrong place. The reprojection error remains small, because the matches that disagree are dropped. A
+pair of photos whose verified matches contradict the model is a *tear*. Correct models have tears,
+too: places that look alike have verified matches that are false. So a photo is judged by all of its
+matches.
 
-Correct models have tears, too: places that look alike have verified matches that are false. So a
-photo is judged by all of its matches. The photos are the nodes of a graph, and each pair with
-verified matches is an edge. The *demand* of an edge is the squared number of its matches. Photos
-taken side by side have many matches. Because of the square, a few such pairs have more demand than
-many pairs with few matches, whose matches may be false. Matches of photos that follow each other
-count more (`CheckedPair.weight`). The *support* of a pair is the share of its matches that the
-model confirms. The *supported demand* of an edge is its demand multiplied by the support of its
-pair.
+The photos are the nodes of a graph, the pairs with verified matches its edges. The *demand* of an
+edge is the squared number of its matches: photos taken side by side have many, and false matches
+are few. Matches of photos that follow each other count more (`CheckedPair.weight`). The *support*
+of a pair is the share of its matches that the model confirms. The *supported demand* of an edge is
+its demand multiplied by the support of its pair.
 
-The photos of a model are divided into two parts. If only a small share of the demand between the
-parts is supported, the parts contradict each other (`find_parts`). The best division is the
-sparsest cut of the graph: the cut with the least ratio of supported demand to demand. This problem
-is relaxed to a generalised eigenvalue problem (Cucuringu, Koutis, Chawla, Miller and Peng, "Simple
-and scalable constrained clustering: a generalized spectral method", AISTATS 2016).
+Two parts of the photos contradict each other if only a small share of the demand between them is
+supported (`find_parts`). The best division is the sparsest cut of the graph: the cut with the least
+ratio of supported demand to demand. This problem is relaxed to a generalised eigenvalue problem
+(Cucuringu, Koutis, Chawla, Miller and Peng, "Simple and scalable constrained clustering: a
+generalized spectral method", AISTATS 2016).
 """
 
 from __future__ import annotations
@@ -41,10 +38,13 @@ from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.lens import is_fisheye, lens_of, pixels_per_radian
+from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
+# The points of a model: their ids (P,), ascending, and their positions (P, 3).
+_Points = tuple[NDArray[np.uint64], Floats]
 # One photo of a pair: the image, the id of the point that each matched feature observes, and the
 # positions (M, 2) of these features in the normalised image plane.
 _Side = tuple[pycolmap.Image, NDArray[np.uint64], Floats]
@@ -143,10 +143,8 @@ def agreement_of(pairs: Sequence[CheckedPair], possible: Callable[[CheckedPair],
             return 1.0
         return min(1.0, pair.agreeing / max(1e-9, min(possible(pair), 1 - pair.miss_share)))
 
-    shares = [(share(pair), pair) for pair in chosen]
-    worst = sorted(shares, key=lambda entry: entry[0])[
-        : max(_MIN_WORST, round(_WORST * len(shares)))
-    ]
+    shares = sorted(((share(pair), pair) for pair in chosen), key=lambda entry: entry[0])
+    worst = shares[: max(_MIN_WORST, round(_WORST * len(shares)))]
     total = sum(pair.matches for _, pair in worst)
     return sum(share * pair.matches for share, pair in worst) / total if total else 0.0
 
@@ -189,7 +187,8 @@ def check_pairs(
     """
     placed = set(model.reg_image_ids())
     points = {image_id: _point_ids(model.image(image_id)) for image_id in placed}
-    positions = _Positions.from_model(model)
+    ids = np.array(sorted(model.points3D), np.uint64)
+    xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
     rays: dict[int, Floats] = {}
     checked = []
     with closing_database(database) as source:
@@ -210,22 +209,22 @@ def check_pairs(
             rows = source.read_two_view_geometry(first, second).inlier_matches
             of_first, of_second = points[first][rows[:, 0]], points[second][rows[:, 1]]
             is_hit = (of_first == of_second) & (of_first != pycolmap.INVALID_POINT3D_ID)
-            follows = (first, second) in follow
-            pair = CheckedPair(first, second, len(rows), int(is_hit.sum()), follows=follows)
             images = model.image(first), model.image(second)
             focal = np.mean([pixels_per_radian(model.camera(i.camera_id)) for i in images])
             pose = images[1].cam_from_world() * images[0].cam_from_world().inverse()
             both = rays_of(first, rows[:, 0]), rays_of(second, rows[:, 1])
             error = max_error / float(focal)
             sides = (images[0], of_first, both[0]), (images[1], of_second, both[1])
-            missed = _misses(positions, sides[0], sides[1], _MIN_MISS_DISTANCE * error)
-            missed |= _misses(positions, sides[1], sides[0], _MIN_MISS_DISTANCE * error)
-            pair = replace(
-                pair,
-                agreeing=agreement(pose, *both, error),
-                miss_share=float(np.mean(missed & ~is_hit)),
+            missed = _misses((ids, xyz), sides[0], sides[1], _MIN_MISS_DISTANCE * error)
+            missed |= _misses((ids, xyz), sides[1], sides[0], _MIN_MISS_DISTANCE * error)
+            checked.append(
+                CheckedPair(
+                    *(first, second, len(rows), int(is_hit.sum())),
+                    follows=(first, second) in follow,
+                    agreeing=agreement(pose, *both, error),
+                    miss_share=float(np.mean(missed & ~is_hit)),
+                )
             )
-            checked.append(pair)
     return _without_bridged_tears(checked, following_pairs(names, max_step=1))
 
 
@@ -289,24 +288,7 @@ def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:
     return ids
 
 
-@dataclass(frozen=True)
-class _Positions:
-    """The positions of all points of a model."""
-
-    ids: NDArray[np.uint64]  # (P,) ascending
-    xyz: Floats  # (P, 3)
-
-    @staticmethod
-    def from_model(model: pycolmap.Reconstruction) -> _Positions:
-        ids = np.array(sorted(model.points3D), np.uint64)
-        xyz = np.array([model.point3D(int(i)).xyz for i in ids]).reshape(-1, 3)
-        return _Positions(ids, xyz)
-
-    def __getitem__(self, ids: NDArray[np.uint64]) -> Floats:
-        return self.xyz[np.searchsorted(self.ids, ids)]
-
-
-def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
+def _misses(model: _Points, one: _Side, other: _Side, max_error: float) -> NDArray[np.bool_]:
     """(M,) whether each match is a miss because of the point that its feature in ``one`` observes.
 
     The point is projected into the photo ``other``. The match is a miss if the distance between the
@@ -319,7 +301,7 @@ def _misses(positions: _Positions, one: _Side, other: _Side, max_error: float) -
     missed = np.zeros(len(ids), bool)
     rows = np.flatnonzero(ids != pycolmap.INVALID_POINT3D_ID)
     if len(rows):
-        points = positions[ids[rows]]
+        points = model[1][np.searchsorted(model[0], ids[rows])]
         camera = image.cam_from_world().matrix()
         seen = points @ camera[:, :3].T + camera[:, 3]
         if rays.shape[1] == 3:
@@ -450,27 +432,16 @@ def _nth_largest(values: Floats, n: int) -> float:
 
 
 def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
-    """The connected components of a graph with N nodes, as sorted lists of nodes.
-
-    ``linked``: (N, N) symmetric, whether two nodes have an edge.
-    """
-    left = set(range(len(linked)))
-    components = []
-    while left:
-        found, new = set(), {min(left)}
-        while new:
-            found |= new
-            new = set(np.flatnonzero(linked[sorted(new)].any(0)).tolist()) - found
-        components.append(sorted(found))
-        left -= found
-    return components
+    """The connected components of a graph of N nodes, as sorted lists of nodes. ``linked``: (N, N)
+    symmetric, whether two nodes have an edge."""
+    first, second = np.nonzero(linked)
+    label = components(first, second, len(linked))
+    return [np.flatnonzero(label == node).tolist() for node in np.unique(label)]
 
 
 def _split(graph: _Graph, photos: list[int]) -> Iterator[list[int]]:
     """Divide photos into parts, until no part can be divided into two that contradict each other.
-
-    Of all candidates, the division with the smallest supported share of the demand is used.
-    """
+    Of all candidates, the division with the smallest supported share of the demand is used."""
     best = None
     for one in itertools.chain(_grown_groups(graph, photos), _sweep_cuts(graph, photos)):
         inside = set(one)
@@ -553,9 +524,7 @@ def _laplacian(weights: Floats) -> Floats:
 
 def _cut_weights(weights: Floats, order: Ints) -> Floats:
     """(N − 1,) the sum of the weights between the first k photos of ``order`` and the other photos.
-
-    The entries are those for k = 1, …, N − 1.
-    """
+    The entries are those for k = 1, …, N − 1."""
     sorted_weights = weights[np.ix_(order, order)]
     # When photo k joins the first photos, its edges to them are not cut any more, and its edges to
     # the other photos are cut.
@@ -564,10 +533,8 @@ def _cut_weights(weights: Floats, order: Ints) -> Floats:
 
 
 def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
-    """Join parts that have supported demand between them and do not contradict each other.
-
-    The two parts with the largest supported demand between them are joined first.
-    """
+    """Join parts that have supported demand between them and do not contradict each other. The two
+    parts with the largest supported demand between them are joined first."""
     parts = [sorted(part) for part in parts]
     while True:
         best = None

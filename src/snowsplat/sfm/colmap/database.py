@@ -62,10 +62,7 @@ def open_database(path: Path, photos: list[Photo], lens: Lens, fingerprint: str)
 
 
 def set_cameras(path: Path, photos: list[Photo], lens: Lens) -> None:
-    """Replace the cameras in the database by those with which an attempt begins.
-
-    The photos may be in other groups than before.
-    """
+    """Replace the cameras by those with which an attempt begins; the groups may be other ones."""
     with closing_database(path) as database:
         _write_cameras(database, photos, lens)
     ids = camera_ids(photos)
@@ -265,16 +262,8 @@ def verified_pairs(path: Path) -> list[Pair]:
     return pairs
 
 
-def _largest(keypoints: NDArray[np.float32], count: int) -> NDArray[np.intp]:
-    # The columns after x and y are the matrix of the affine shape. Its determinant is the squared
-    # scale of the feature.
-    scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-    return np.argsort(-scale, kind="stable")[:count]
-
-
 def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
-    """(K, 128) float32 descriptors of the photo with this index, of its K ≤ ``limit`` largest
-    features."""
+    """(K, 128) float32: those of the K ≤ ``limit`` largest features of the photo ``index``."""
     with closing_database(path) as database:
         if not database.exists_descriptors(index + 1):
             return np.zeros((0, 128), np.float32)
@@ -282,7 +271,10 @@ def read_descriptors(path: Path, index: int, limit: int) -> NDArray[np.float32]:
         descriptors = np.asarray(database.read_descriptors(index + 1).data, np.float32)
     if len(descriptors) == 0:
         return np.zeros((0, 128), np.float32)
-    return descriptors[_largest(keypoints, limit)]
+    # The columns after x and y are the matrix of the affine shape, whose determinant is the squared
+    # scale of the feature.
+    scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    return descriptors[np.argsort(-scale, kind="stable")[:limit]]
 
 
 def displacement_of(path: Path, pairs: Sequence[Pair], still: float) -> float:

@@ -6,12 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.sfm.colmap.database import (
-    Pair,
-    displacement_of,
-    feature_counts,
-    verified_pairs,
-)
+from snowsplat.sfm.colmap.database import Pair, displacement_of, feature_counts, verified_pairs
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
 
@@ -75,9 +70,7 @@ class Evidence:
     @property
     def more_effort_is_useless(self) -> bool:
         """Whether an attempt with more effort cannot find a model, if no model was found yet."""
-        if self.still or self.flat:
-            return True
-        return self.usable < 3
+        return self.still or self.flat or self.usable < 3
 
 
 def gather_evidence(database: Path, photos: Sequence[Photo], matched: int) -> Evidence:
@@ -111,6 +104,7 @@ def explain(
         if photo.name in models[0]:
             continue
         other_model = next((model for model in models[1:] if photo.name in model), None)
+        others = f"{len(matches)} other photo{'' if len(matches) == 1 else 's'}"
         if photo.name in left_out:
             reason = left_out[photo.name]
         elif other_model is not None:
@@ -120,12 +114,8 @@ def explain(
         elif not matches:
             reason = "it matches no other photo"
         elif max(matches) < _WEAK_PAIR:
-            reason = (
-                f"it has too few matches with {_photos(len(matches), 'other ')} "
-                f"(at most {max(matches)})"
-            )
+            reason = f"it has too few matches with {others} (at most {max(matches)})"
         else:
-            others = _photos(len(matches), "other ")
             reason = f"its matches with {others} are not consistent with the model"
         reasons[photo.name] = reason
     return reasons
@@ -145,8 +135,9 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
             "blurred or plain; take sharp, well-lit photos of objects with texture"
         )
     if len(paired) < 3:
+        matching = f"only {len(paired)} of them match" if paired else "no two of them match"
         return UserError(
-            f"photos: the {count} photos do not overlap ({_matching(len(paired))}); take photos "
+            f"photos: the {count} photos do not overlap ({matching}); take photos "
             "of one scene, so that each shows more than half of what the previous one shows"
         )
     if evidence.still:
@@ -170,11 +161,3 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
         f"photos: no camera poses were found for the {count} photos, because their matches are "
         "too few or inconsistent; take more photos, with smaller steps between them"
     )
-
-
-def _matching(count: int) -> str:
-    return "no two of them match" if count == 0 else f"only {count} of them match"
-
-
-def _photos(count: int, kind: str) -> str:
-    return f"{count} {kind}photo{'' if count == 1 else 's'}"

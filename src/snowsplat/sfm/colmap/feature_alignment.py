@@ -62,15 +62,12 @@ def align_features(
         keypoints = {int(i): source.read_keypoints(int(i)) for i in np.unique(features.image)}
     for block in _blocks(features):
         names = {int(i): model.image(int(i)).name for i in np.unique(block.image)}
-        sizes = {i: detection_size(image_size, _is_panorama(model, i)) for i in names}
+        lenses = {i: model.cameras[model.image(i).camera_id] for i in names}
+        sizes = {i: detection_size(image_size, lens.is_spherical()) for i, lens in lenses.items()}
         patches = _Patches.cut(block, names, keypoints, images, sizes, threads)
         positions, good = patches.aligned(block)
         for i in np.flatnonzero(good):
             model.image(int(block.image[i])).points2D[int(block.row[i])].xy = positions[i]
-
-
-def _is_panorama(model: pycolmap.Reconstruction, image: int) -> bool:
-    return bool(model.cameras[model.image(image).camera_id].is_spherical())
 
 
 def _features_of(model: pycolmap.Reconstruction) -> _Features:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
-from snowsplat.data.lens.model import LensModel
+from snowsplat.data.lens.project import LensModel
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
 
@@ -160,7 +160,7 @@ def with_all_parameters(
     are not used where they would be impossible.
     """
     cameras, chosen = camera_ids(photos), []
-    for number in _used(model):
+    for number in used_cameras(model):
         camera, name = model.cameras[number], lens.model
         if name == "auto":
             enough = cameras.count(number) >= _MIN_PHOTOS_FOR_OPENCV
@@ -187,11 +187,16 @@ def _converted(camera: pycolmap.Camera, model: str) -> pycolmap.Camera:
 
 def exif_focals(photos: Sequence[Photo]) -> dict[int, float]:
     """The focal length of each camera in pixels, from EXIF; cameras without are left out."""
-    focals: dict[int, list[float]] = {}
-    for photo, number in zip(photos, camera_ids(photos), strict=True):
-        if photo.focal:
-            focals.setdefault(number, []).append(photo.focal)
-    return {number: float(np.median(values)) for number, values in focals.items()}
+    return focals_by_camera(photos, {i: p.focal for i, p in enumerate(photos, 1) if p.focal})
+
+
+def focals_by_camera(photos: Sequence[Photo], focals: Mapping[int, float]) -> dict[int, float]:
+    """The median focal length of the photos of each camera; ``focals`` by image id."""
+    values: dict[int, list[float]] = {}
+    for image_id, camera in enumerate(camera_ids(photos), 1):
+        if image_id in focals:
+            values.setdefault(camera, []).append(focals[image_id])
+    return {camera: float(np.median(known)) for camera, known in values.items()}
 
 
 def pixels_per_radian(camera: pycolmap.Camera) -> float:
@@ -216,8 +221,8 @@ def findings_of(camera: pycolmap.Camera, exif: float | None) -> list[Finding]:
     if is_fisheye(camera.model_name):
         found = [finding for finding in found if finding.about != "field of view"]
         reason = _implausible_fisheye(camera)
-        return [*found, Finding("distortion", reason, True)] if reason else found
-    reason = _implausible_distortion(camera)
+    else:
+        reason = _implausible_distortion(camera)
     if reason:
         return [*found, Finding("distortion", reason, True)]
     barrel = _barrel(camera)
@@ -266,10 +271,8 @@ def _barrel(camera: pycolmap.Camera) -> float:
 
 
 def _implausible_distortion(camera: pycolmap.Camera) -> str:
-    """Why the distortion is not that of a lens, as text; empty: it is plausible.
-
-    Fisheye models and models without distortion are plausible.
-    """
+    """Why the distortion is not that of a lens, as text; empty: it is plausible. Fisheye models and
+    models without distortion are plausible."""
     if not camera.is_perspective_pinhole() or camera.is_undistorted():
         return ""
     ideal = _border(camera)
@@ -327,10 +330,7 @@ Refine = Callable[
 
 
 def settled(
-    model: pycolmap.Reconstruction,
-    photos: Sequence[Photo],
-    lens: Lens,
-    refine: Refine,
+    model: pycolmap.Reconstruction, photos: Sequence[Photo], lens: Lens, refine: Refine
 ) -> Settled:
     """Replace a lens in doubt by a possible one.
 
@@ -369,12 +369,10 @@ def settled(
 def _with_square_pixels(
     model: pycolmap.Reconstruction, lens: Lens, refine: Refine
 ) -> pycolmap.Reconstruction:
-    """``model`` with one focal length in cameras whose two differ, if it agrees equally well.
-
-    A camera model that the user has stated is kept.
-    """
+    """``model`` with one focal length in cameras whose two differ, if it agrees equally well. A
+    camera model that the user has stated is kept."""
     unequal = {}
-    for number in _used(model):
+    for number in used_cameras(model):
         camera = model.cameras[number]
         # A panorama has no focal length: to ask for one ends the process.
         if lens.model != "auto" or camera.model_name != "OPENCV":
@@ -394,7 +392,7 @@ def _with_square_pixels(
 def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[str]:
     """What is wrong or in doubt about the lenses of a model, as text for users."""
     found = []
-    for number in _used(model):
+    for number in used_cameras(model):
         camera = model.cameras[number]
         found += [finding.text for finding in findings_of(camera, None)]
         exif, focal = known.get(number), camera.mean_focal_length()
@@ -409,12 +407,12 @@ def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[
 def _impossible(model: pycolmap.Reconstruction) -> bool:
     return any(
         finding.impossible
-        for number in _used(model)
+        for number in used_cameras(model)
         for finding in findings_of(model.cameras[number], None)
     )
 
 
-def _used(model: pycolmap.Reconstruction) -> list[int]:
+def used_cameras(model: pycolmap.Reconstruction) -> list[int]:
     """The ids of the cameras of photos that have a pose."""
     return sorted({model.image(image_id).camera_id for image_id in model.reg_image_ids()})
 
@@ -427,3 +425,19 @@ def misfit(model: pycolmap.Reconstruction) -> float:
     """
     count = model.compute_num_observations()
     return model.compute_mean_reprojection_error() / count if count else float("inf")
+
+
+def robust_adjustment(
+    threads: int, tolerance: float, scale: float
+) -> pycolmap.BundleAdjustmentOptions:
+    """Bundle adjustment with a Cauchy loss of this ``scale`` in pixels.
+
+    It ends when an iteration reduces the cost by less than the share ``tolerance``.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.function_tolerance = tolerance
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = scale
+    return options

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,10 +22,12 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.colmap.feature_alignment import align_features
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.incremental import IncrementalMapper
+from snowsplat.sfm.colmap.lens import robust_adjustment
 from snowsplat.sfm.colmap.options import Mapper, photos_with_adjustment
 from snowsplat.sfm.colmap.subset import spread_subset
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 from snowsplat.sfm.progress import Report
+from snowsplat.util.files import new_folder
 
 # A camera that sees fewer points has no reliable pose. The alignment of features reduces their
 # errors to a third; then fewer points are sufficient.
@@ -287,16 +289,9 @@ class Mapping:
             models = pycolmap.global_mapping(self.database, self.images, output, options)
         return list(models.values())
 
-    @contextmanager
-    def _output(self) -> Iterator[Path]:
+    def _output(self) -> AbstractContextManager[Path]:
         """A temporary folder, into which COLMAP writes each model as soon as it is complete."""
-        output = self.database.with_suffix(".models")
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir()
-        try:
-            yield output
-        finally:
-            shutil.rmtree(output, ignore_errors=True)
+        return new_folder(self.database.with_suffix(".models"))
 
     def _refine(
         self,
@@ -304,10 +299,8 @@ class Mapping:
         min_points: int = MIN_POINTS,
         scales: Sequence[float] = _FINAL_LOSS_SCALES,
     ) -> pycolmap.Reconstruction:
-        """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss.
-
-        Changes ``model`` and returns it. ``min_points`` as in `_remove_outliers`.
-        """
+        """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss. Changes
+        ``model`` and returns it. ``min_points`` as in `_remove_outliers`."""
         self._remove_outliers(model, min_points)
         for scale in scales:
             if model.num_reg_images() < MIN_PHOTOS:
@@ -321,20 +314,14 @@ class Mapping:
         self, model: pycolmap.Reconstruction, scale: float, tolerance: float = _FINAL_TOLERANCE
     ) -> None:
         """Run bundle adjustment; ``scale`` of the loss, in units of the mean reprojection error."""
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary = False
+        scale *= model.compute_mean_reprojection_error()
+        options = robust_adjustment(self.threads, tolerance, scale)
         options.refine_focal_length = not self.held
-        options.ceres.solver_options.num_threads = self.threads
-        options.ceres.solver_options.function_tolerance = tolerance
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = scale * model.compute_mean_reprojection_error()
         pycolmap.bundle_adjustment(model, options)
 
     def _remove_outliers(self, model: pycolmap.Reconstruction, min_points: int) -> None:
-        """Remove observations with a large error, flat points, and cameras with few points.
-
-        A camera remains if it sees at least ``min_points`` points.
-        """
+        """Remove observations with a large error, flat points, and cameras with few points. A
+        camera remains if it sees at least ``min_points`` points."""
         observations = pycolmap.ObservationManager(model)
         observations.filter_all_points3D(_MAX_REPROJECTION_ERROR * self.scale, self._min_angle)
         for image_id in list(model.reg_image_ids()):
@@ -362,11 +349,10 @@ def usable_models(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Recons
 
 def write_models(models: list[pycolmap.Reconstruction], sparse: Path) -> None:
     """Write the models as ``sparse/0``, ``sparse/1`` …; replaces the whole folder."""
-    temporary = sparse.with_name(f".{sparse.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    for number, model in enumerate(models):
-        folder = temporary / str(number)
-        folder.mkdir(parents=True)
-        model.write(folder)
-    shutil.rmtree(sparse, ignore_errors=True)
-    temporary.rename(sparse)
+    with new_folder(sparse.with_name(f".{sparse.name}.tmp")) as temporary:
+        for number, model in enumerate(models):
+            folder = temporary / str(number)
+            folder.mkdir()
+            model.write(folder)
+        shutil.rmtree(sparse, ignore_errors=True)
+        temporary.rename(sparse)

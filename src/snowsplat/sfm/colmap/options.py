@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+from snowsplat.util.machine import processor_count
 
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
 
 # The camera models of COLMAP that can be undistorted to pinhole cameras.
 CAMERA_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "FOV",
-    "OPENCV_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "EQUIRECTANGULAR",
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV"),
+    *("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+    *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE", "EQUIRECTANGULAR"),
 )
 #: The camera model of 360° panoramas, twice as wide as high.
 PANORAMA_MODEL = "EQUIRECTANGULAR"
@@ -96,9 +85,7 @@ class Effort:
     def reduced(self) -> Effort:
         """An effort that needs about a third of the memory, to repeat a run after a crash."""
         return dataclasses.replace(
-            self,
-            image_size=self.image_size * 2 // 3,
-            features=self.features // 2,
+            self, image_size=self.image_size * 2 // 3, features=self.features // 2
         )
 
 
@@ -137,8 +124,4 @@ def photos_with_adjustment(count: int) -> int:
 
 def thread_count(threads: int | None) -> int:
     """Number of threads: ``threads``, or the number of processors that this process may use."""
-    if threads is not None:
-        return max(1, threads)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return processor_count() if threads is None else max(1, threads)

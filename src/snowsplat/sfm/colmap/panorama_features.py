@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.data.lens.model import LensModel
-from snowsplat.data.lens.project import project
+from snowsplat.data.lens.project import LensModel, project
 from snowsplat.data.lens.resample import resampled
 from snowsplat.data.lens.views import LensView, lens_views
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL

@@ -63,17 +63,12 @@ from snowsplat.sfm.colmap.lens import (
     Refine,
     camera_ids,
     exif_focals,
+    focals_by_camera,
     settled,
     with_all_parameters,
 )
 from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
-from snowsplat.sfm.colmap.options import (
-    Effort,
-    Mapper,
-    SfmOptions,
-    SfmResult,
-    detection_size,
-)
+from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult, detection_size
 from snowsplat.sfm.colmap.pair_matching import match_pairs, verify_pairs
 from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.repair import repair
@@ -172,18 +167,10 @@ class PoseEstimation:
             best.mapping.add_points(model)
             model.extract_colors_for_all_images(self.folders.images, self.threads)
         write_models(best.models, self.folders.sparse)
-        reasons = explain(
-            self.photos,
-            self._evidence(best.matched),
-            [names_in(model) for model in best.models],
-            best.left_out,
-        )
+        names = [names_in(model) for model in best.models]
+        reasons = explain(self.photos, self._evidence(best.matched), names, best.left_out)
         result = result_of(
-            best.models,
-            self.photos,
-            reasons,
-            best.matched.choice.description,
-            self.log,
+            *(best.models, self.photos, reasons, best.matched.choice.description, self.log),
             exif=best.lens.exif,
             held=best.mapping.held,
         )
@@ -203,10 +190,8 @@ class PoseEstimation:
         )
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
-        """Make as many attempts as needed; returns the evidence of the last matching.
-
-        ``second`` is the path of the database for the attempts that have more features.
-        """
+        """Make as many attempts as needed; returns the evidence of the last matching. ``second`` is
+        the path of the database for the attempts that have more features."""
         first, mapper = self.folders.database, self.options.mapper
         matched = self._match(first, effort, effort, reserve=False)
         self.lens_evidence = lens_evidence(first, self.photos, matched.scale)
@@ -302,9 +287,7 @@ class PoseEstimation:
 
     def _other_lens(self, best: Attempt) -> list[str]:
         """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
-
-        The model FOV describes fisheye lenses, too.
-        """
+        The model FOV describes fisheye lenses, too."""
         if best.lens.any_fisheye or best.lens.model == "FOV":
             return []
         if not any(evidence.fisheye for evidence in self.lens_evidence.values()):
@@ -323,9 +306,7 @@ class PoseEstimation:
         self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
     ) -> Matched:
         """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
-
-        ``reserve``: whether the pairs of the reserve are matched, too.
-        """
+        ``reserve``: whether the pairs of the reserve are matched, too."""
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
@@ -349,10 +330,8 @@ class PoseEstimation:
         return more
 
     def _verify(self, matched: Matched, lens: Lens) -> None:
-        """Verify those matches of ``matched`` that are not verified yet.
-
-        The cameras of ``lens`` replace those in the database.
-        """
+        """Verify those matches of ``matched`` that are not verified yet. The cameras of ``lens``
+        replace those in the database."""
         set_cameras(matched.database, self.photos, lens)
         error, pairs = _MAX_ERROR * matched.scale, matched.choice.pairs
         verify_pairs(matched.database, pairs, error, self.threads, self.progress)
@@ -408,9 +387,7 @@ class PoseEstimation:
 
     def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> Lens:
         """Make attempts with several focal lengths per camera, if one does not fit all photos.
-
-        Returns the lens of further attempts.
-        """
+        Returns the lens of further attempts."""
         one, best = self.photos, self._best()
         if not camera_groups.may_differ(one):
             return lens
@@ -426,7 +403,7 @@ class PoseEstimation:
             if several is None or camera_ids(several) == camera_ids(before):
                 break
             self.photos = several
-            begin = dataclasses.replace(lens, focals=camera_groups.by_camera(several, focals))
+            begin = dataclasses.replace(lens, focals=focals_by_camera(several, focals))
             self._try("with several focal lengths", matched, mapper, begin)
             made, best = self.attempts.pop(), self._best()
             made_better = bool(made.models) and camera_groups.better(

@@ -60,9 +60,7 @@ def result_of(
 
 def _reprojection_error(model: pycolmap.Reconstruction) -> float:
     """The mean over the points that at least three photos see, in pixels; 0 without such points.
-
-    The points of two photos have small errors even if a pose is slightly wrong.
-    """
+    The points of two photos have small errors even if a pose is slightly wrong."""
     errors = [p.error for p in model.points3D.values() if p.track.length() > 2]
     return float(np.mean(errors)) if errors else 0.0
 

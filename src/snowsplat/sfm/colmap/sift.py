@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from snowsplat.data.image_file import scaled_size
 from snowsplat.sfm.ingest.photo_files import open_image
 from snowsplat.util.machine import memory_bytes
 
@@ -113,8 +114,7 @@ def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[in
     """The grey photo (H, W), resized, and its original width and height."""
     with open_image(photo) as image:
         width, height = image.size
-        ratio = min(1.0, image_size / max(width, height))
-        size = (max(1, round(width * ratio)), max(1, round(height * ratio)))
+        size = scaled_size(width, height, image_size)
         # A JPEG is decoded at 1/2, 1/4 or 1/8 of its size if this is not smaller than ``size``.
         image.draft("L", size)
         grey = np.asarray(image.convert("L"))
@@ -131,10 +131,8 @@ def read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _as_rows(keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
-    """Keypoints (N, 6), as in `Features`.
-
-    OpenCV measures positions from the centre of the first pixel.
-    """
+    """Keypoints (N, 6), as in `Features`. OpenCV measures positions from the centre of the first
+    pixel."""
     position = np.array([k.pt for k in keypoints]) + 0.5
     scale = np.array([k.size for k in keypoints]) / 2  # OpenCV has the diameter
     angle = np.radians([k.angle for k in keypoints])

@@ -76,10 +76,8 @@ def components(first: Ints, second: Ints, count: int) -> Ints:
 
 
 def _lengths(track: Ints, photo: Ints) -> Ints:
-    """(T,) the number of photos of each track, less the number of further features in them.
-
-    A track with several features in one photo has false matches, or repeated structures.
-    """
+    """(T,) the number of photos of each track, less the number of further features in them. A track
+    with several features in one photo has false matches, or repeated structures."""
     features = np.bincount(track, minlength=len(track))
     in_photos = np.unique(track.astype(np.int64) * (int(photo.max()) + 1) + photo)
     photos = np.bincount(in_photos // (int(photo.max()) + 1), minlength=len(track))

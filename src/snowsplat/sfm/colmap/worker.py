@@ -56,8 +56,7 @@ def main() -> None:
 
     try:
         progress = WorkerProgress(
-            report=report,
-            features=lambda mean: figures.update(features=mean),
+            report=report, features=lambda mean: figures.update(features=mean)
         )
         send(result=asdict(_run(job, progress)))
     except UserError as error:

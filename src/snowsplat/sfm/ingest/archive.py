@@ -11,11 +11,12 @@ import shutil
 import stat
 import struct
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import shown
+from snowsplat.util.files import new_folder, shown
 
 # Other archives, by their first bytes. They are named, not unpacked.
 _OTHERS = {b"Rar!": "RAR", b"7z\xbc\xaf": "7z", b"\x1f\x8b": "gzip", b"\xfd7zXZ": "xz"}
@@ -55,13 +56,8 @@ def files_in(path: Path) -> list[str]:
     Raises:
         UserError: as `unpack`, as far as the list of files shows it.
     """
-    try:
-        with _opened(path) as archive:
-            return [name for name, _ in _checked(archive, path)]
-    except UserError:
-        raise
-    except Exception as error:  # zipfile raises many kinds of exceptions for damaged files
-        raise _cannot(path, error) from None
+    with _opened(path) as archive:
+        return [name for name, _ in _checked(archive, path)]
 
 
 def unpack(path: Path) -> Path:
@@ -74,33 +70,37 @@ def unpack(path: Path) -> Path:
         UserError: the file is damaged, empty or has a password; a file in it has a path outside of
             the folder; it needs more disk space than there is; or the folder cannot be written.
     """
+    with _opened(path) as archive:
+        entries = _checked(archive, path)
+        if not entries:
+            raise UserError(f"{shown(path)}: has no files; copy it again, or use another file")
+        for folder in (path.with_suffix(""), path.with_name(f"{path.stem}_unpacked")):
+            if _has_all(folder, entries):
+                return folder
+            if not folder.exists():
+                _extract_all(archive, entries, folder)
+                return folder
+        raise UserError(
+            f"{shown(path)}: cannot be unpacked, because {shown(folder)} has other files; remove it"
+        )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    """A zip file. Raises UserError if it cannot be read, here or in the block."""
     try:
-        with _opened(path) as archive:
-            entries = _checked(archive, path)
-            if not entries:
-                raise UserError(f"{shown(path)}: has no files; copy it again, or use another file")
-            for folder in (path.with_suffix(""), path.with_name(f"{path.stem}_unpacked")):
-                if _has_all(folder, entries):
-                    return folder
-                if not folder.exists():
-                    break
-            else:
-                raise UserError(
-                    f"{shown(path)}: cannot be unpacked, because {shown(folder)} has other files; "
-                    "remove it"
-                )
-            _extract_all(archive, entries, folder)
-            return folder
+        if _directory_bytes(path) > _LONGEST_DIRECTORY:
+            raise UserError(f"{shown(path)}: has too many files; unpack it first")
+        with zipfile.ZipFile(path) as archive:
+            yield archive
     except UserError:
         raise
-    except Exception as error:  # as above
-        raise _cannot(path, error) from None
-
-
-def _opened(path: Path) -> zipfile.ZipFile:
-    if _directory_bytes(path) > _LONGEST_DIRECTORY:
-        raise UserError(f"{shown(path)}: has too many files; unpack it first")
-    return zipfile.ZipFile(path)
+    except Exception as error:  # zipfile raises many kinds of exceptions for damaged files
+        system = error.strerror if isinstance(error, OSError) else None
+        reason = system or " ".join(str(error).split())[:80] or "it is damaged"
+        raise UserError(
+            f"{shown(path)}: cannot be unpacked ({reason}); copy it again, or unpack it to a folder"
+        ) from None
 
 
 def _directory_bytes(path: Path) -> int:
@@ -164,25 +164,10 @@ def _extract_all(
             f"disk: about {size / 1e6:,.0f} MB are needed to unpack {shown(folder.name)}.zip and "
             f"{free / 1e6:,.0f} MB are free; free some space"
         )
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    try:
+    with new_folder(folder.with_name(f".{folder.name}.{os.getpid()}.tmp")) as temporary:
         for name, info in entries:
             target = temporary / name
             target.parent.mkdir(parents=True, exist_ok=True)
             with archive.open(info) as packed, open(target, "xb") as file:
                 shutil.copyfileobj(packed, file)
         temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _cannot(path: Path, error: Exception) -> UserError:
-    if isinstance(error, OSError) and error.strerror:
-        reason = error.strerror
-    else:
-        reason = " ".join(str(error).split())[:80] or "it is damaged"
-    return UserError(
-        f"{shown(path)}: cannot be unpacked ({reason}); copy it again, or unpack it to a folder"
-    )

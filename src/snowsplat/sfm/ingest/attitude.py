@@ -21,13 +21,9 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from PIL.ExifTags import GPS, Base
 
 from snowsplat.sfm.ingest.photo import Attitude, Direction
-
-_DESCRIPTION = 0x010E
-_MAKER_NOTE = 0x927C
-_LENS_MODEL = 0xA434
-_GPS_DIRECTION_REFERENCE, _GPS_DIRECTION = 16, 17
 
 _ANGLE = rb'%s:(?:Gimbal|Camera)%sDegree(?:\s*=\s*["\']|>)\s*([-+]?[0-9.]+)'
 _GIMBALS = (b"drone-dji", b"drone-parrot")
@@ -74,7 +70,8 @@ def read_attitude(
     heading = _compass(gps)
     if gravity is None and heading is None:
         return None
-    facing = None if heading is None else _north_of(heading)
+    # North in the frame of a level camera that looks at this azimuth.
+    facing = None if heading is None else np.array([-math.sin(heading), 0.0, math.cos(heading)])
     return Attitude(_rounded(gravity), _rounded(facing), gimbal=False)
 
 
@@ -113,8 +110,8 @@ def _apple_up(details: Mapping[int, Any]) -> np.ndarray | None:
     to its right side and z to the person who holds it. The pixels are stored as the sensor lies: x
     of the photo points to the bottom of the phone, and y to its left side.
     """
-    note = details.get(_MAKER_NOTE)
-    front = "front" in str(details.get(_LENS_MODEL, "")).lower()  # another frame
+    note = details.get(Base.MakerNote)
+    front = "front" in str(details.get(Base.LensModel, "")).lower()  # another frame
     if front or not isinstance(note, bytes) or not note.startswith(_APPLE_NOTE):
         return None
     order = "<" if note[12:14] == b"II" else ">"
@@ -132,11 +129,9 @@ def _apple_up(details: Mapping[int, Any]) -> np.ndarray | None:
 
 
 def _mapillary_up(exif: Image.Exif) -> np.ndarray | None:
-    """Up in the frame of the photo, apart from a quarter turn, from the description.
-
-    The axes are those of the phone; the app has turned the photo, but not the vector.
-    """
-    description = exif.get(_DESCRIPTION)
+    """Up in the frame of the photo, apart from a quarter turn, from the description. The axes are
+    those of the phone; the app has turned the photo, but not the vector."""
+    description = exif.get(Base.ImageDescription)
     if not isinstance(description, str) or "MAPAccelerometerVector" not in description:
         return None
     try:
@@ -150,18 +145,13 @@ def _mapillary_up(exif: Image.Exif) -> np.ndarray | None:
 
 def _compass(gps: Mapping[int, Any]) -> float | None:
     """Azimuth of the viewing direction in radians. Magnetic north differs by up to 20°: ignored."""
-    if str(gps.get(_GPS_DIRECTION_REFERENCE, "")).strip("\0 ") != "T":
+    if str(gps.get(GPS.GPSImgDirectionRef, "")).strip("\0 ") != "T":
         return None
     try:
-        degrees = float(gps[_GPS_DIRECTION])
+        degrees = float(gps[GPS.GPSImgDirection])
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
     return math.radians(degrees) if 0 <= degrees <= 360 else None
-
-
-def _north_of(heading: float) -> np.ndarray:
-    """North in the frame of a level camera that looks at this azimuth."""
-    return np.array([-math.sin(heading), 0.0, math.cos(heading)])
 
 
 def _of_gravity(vector: Sequence[float]) -> np.ndarray | None:

@@ -21,7 +21,7 @@ from PIL import Image, ImageOps
 
 from snowsplat.data.files.listing import folded
 from snowsplat.data.files.mask_pixels import has_shape, looks_like_mask
-from snowsplat.sfm.ingest.photo_files import Header, Unusable, open_image, read_header
+from snowsplat.sfm.ingest.photo_files import Unusable, open_image, read_header
 
 # What programs add to the name of a copy: "IMG (1)", "IMG - Copy (2)", "IMG copy", "IMG-edited".
 _COPY = re.compile(
@@ -80,20 +80,19 @@ def find_copies(root: Path, names: Sequence[str]) -> list[Copy]:
                 kinds = _stem_and_kind(one)[1], _stem_and_kind(other)[1]
                 pairs.setdefault(kinds, []).append((one, other))
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="copies") as pool:
+
+        def compared(some: Sequence[tuple[str, str]]) -> dict[tuple[str, str], bool]:
+            return dict(zip(some, pool.map(lambda p: _show_same(root, *p), some), strict=True))
+
         for of_kind in pairs.values():
             chosen = np.unique(np.linspace(0, len(of_kind) - 1, min(len(of_kind), _SAMPLE)))
-            sample = [of_kind[round(i)] for i in chosen]
-            is_same = dict(
-                zip(sample, pool.map(lambda p: _show_same(root, *p), sample), strict=True)
-            )
-            if all(is_same.values()) and len(sample) == _SAMPLE:
+            is_same = compared([of_kind[round(i)] for i in chosen])
+            if all(is_same.values()) and len(is_same) == _SAMPLE:
                 is_same = dict.fromkeys(of_kind, True)
             elif any(is_same.values()):
-                rest = [pair for pair in of_kind if pair not in is_same]
-                is_same |= zip(rest, pool.map(lambda p: _show_same(root, *p), rest), strict=True)
-            for pair, value in is_same.items():
-                if value:
-                    same.join(*pair)
+                is_same |= compared([pair for pair in of_kind if pair not in is_same])
+            for pair in (pair for pair, value in is_same.items() if value):
+                same.join(*pair)
     used = {
         name: best for group in same.groups() for best in [_best(root, group)] for name in group
     }
@@ -198,12 +197,8 @@ def _best(root: Path, names: Sequence[str]) -> str:
             header.transparent,
             header.width * header.height,
             header.exif.focal is not None,
-            _is_jpeg(header),
+            header.format in ("JPEG", "MPO"),  # needs no conversion
             -added,
         )
 
     return max(names, key=value)
-
-
-def _is_jpeg(header: Header) -> bool:
-    return header.format in ("JPEG", "MPO")  # needs no conversion

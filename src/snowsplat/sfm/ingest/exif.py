@@ -8,30 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
 
 from snowsplat.sfm.ingest.attitude import read_attitude
 from snowsplat.sfm.ingest.photo import Attitude
 
-# EXIF tags.
-ORIENTATION = 0x0112
-_MAKE = 0x010F
-_MODEL = 0x0110
-_EXIF_IFD = 0x8769
-_GPS_IFD = 0x8825
-_FOCAL_LENGTH = 0x920A  # mm
-_FOCAL_35MM = 0xA405  # equivalent focal length on 35 mm film, mm
-_PLANE_X = 0xA20E  # FocalPlaneXResolution: pixels of the sensor per `_PLANE_UNIT`
-_PLANE_Y = 0xA20F
-_PLANE_UNIT = 0xA210
-_MAKER_NOTE = 0x927C
-_USER_COMMENT = 0x9286
-_GPS_ERROR = 31  # GPSHPositioningError, m
-_PIXEL_WIDTH = 0xA002
-_PIXEL_HEIGHT = 0xA003
-_COLOUR_SPACE = 0xA001
 _SRGB = 1
-_INTEROPERABILITY = 0xA005
-
 _PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
 _JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
@@ -60,17 +42,17 @@ def read_exif(
 
     Missing and implausible values have the default of `ExifInfo`.
     """
-    details, gps = _ifd(exif, _EXIF_IFD), _ifd(exif, _GPS_IFD)
-    stored = exif.get(ORIENTATION, 1)
+    details, gps = _ifd(exif, IFD.Exif), _ifd(exif, IFD.GPSInfo)
+    stored = exif.get(Base.Orientation, 1)
     orientation = stored if stored in range(1, 9) else 1
-    named = [str(exif.get(tag) or "").strip("\0 ") for tag in (_MAKE, _MODEL)]
-    zoom = [_number(details.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_35MM)]
+    named = [str(exif.get(tag) or "").strip("\0 ") for tag in (Base.Make, Base.Model)]
+    zoom = [_number(details.get(tag)) for tag in (Base.FocalLength, Base.FocalLengthIn35mmFilm)]
     return ExifInfo(
         orientation=orientation,
         camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
         focal=_focal(details, width, height),
         location=_location(gps),
-        location_error=_number(gps.get(_GPS_ERROR)),
+        location_error=_number(gps.get(GPS.GPSHPositioningError)),
         attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
     )
 
@@ -84,13 +66,14 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
     the original. Therefore the result is multiplied by the ratio of the longest sides.
     """
     focal = None
-    equivalent, length = _number(details.get(_FOCAL_35MM)), _number(details.get(_FOCAL_LENGTH))
-    density = _number(details.get(_PLANE_X))
-    unit = _PLANE_UNITS_IN_MM.get(details.get(_PLANE_UNIT, 2))
+    equivalent = _number(details.get(Base.FocalLengthIn35mmFilm))
+    length = _number(details.get(Base.FocalLength))
+    density = _number(details.get(Base.FocalPlaneXResolution))
+    unit = _PLANE_UNITS_IN_MM.get(details.get(Base.FocalPlaneResolutionUnit, 2))
     if equivalent:
         focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(width, height)
     elif length and density and unit:
-        sizes = [_number(details.get(tag)) for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT)]
+        sizes = [_number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
         original = max((size for size in sizes if size), default=max(width, height))
         focal = length * density / unit * max(width, height) / original
     # These limits are fields of view of 150° and 1.5°. Values beyond them were not set correctly.
@@ -99,14 +82,14 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
 
 
 def _location(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    latitude = _degrees(gps.get(2), gps.get(1), "S")
-    longitude = _degrees(gps.get(4), gps.get(3), "W")
+    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S")
+    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
         return None
     if latitude == 0 and longitude == 0:  # GPS receivers store this if they have no position
         return None
-    altitude = _number(gps.get(6)) or 0.0
-    below_sea = gps.get(5) in (1, b"\x01")
+    altitude = _number(gps.get(GPS.GPSAltitude)) or 0.0
+    below_sea = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     return latitude, longitude, -altitude if below_sea else altitude
 
 
@@ -144,14 +127,15 @@ def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
     try:
         copy = Image.Exif()
         copy.load(exif.tobytes())
-        copy[ORIENTATION] = 1
-        details = copy.get_ifd(_EXIF_IFD)
+        copy[Base.Orientation] = 1
+        details = copy.get_ifd(IFD.Exif)
         # A maker note contains offsets into the old file. The pixels per unit may have changed.
-        for tag in (_MAKER_NOTE, _USER_COMMENT, _PLANE_X, _PLANE_Y, _PLANE_UNIT):
+        plane = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
+        for tag in (Base.MakerNote, Base.UserComment, *plane, Base.FocalPlaneResolutionUnit):
             details.pop(tag, None)
-        details[_PIXEL_WIDTH], details[_PIXEL_HEIGHT] = width, height
-        details[_COLOUR_SPACE] = _SRGB
-        details.pop(_INTEROPERABILITY, None)  # it may say that the colours are those of Adobe RGB
+        details[Base.ExifImageWidth], details[Base.ExifImageHeight] = width, height
+        details[Base.ColorSpace] = _SRGB
+        details.pop(IFD.Interop, None)  # it may say that the colours are those of Adobe RGB
         content = copy.tobytes()
     except Exception:  # as in `_ifd`
         return b""

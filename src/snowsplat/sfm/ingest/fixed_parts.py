@@ -267,10 +267,8 @@ def _overlays(edges: _Edges, copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _is_overlay(part: NDArray[np.bool_], box: tuple[int, int, int, int], edges: _Edges) -> bool:
-    """Whether a connected ``part`` (H, W) of the fixed edges is no part of the scene.
-
-    ``box``: left, top, width and height of the part.
-    """
+    """Whether a connected ``part`` (H, W) of the fixed edges is no part of the scene. ``box``:
+    left, top, width and height of the part."""
     if (edges.fixed & part).sum() < _MIN_EDGES:
         return False
     rows, columns = part.shape
@@ -289,9 +287,7 @@ def _is_overlay(part: NDArray[np.bool_], box: tuple[int, int, int, int], edges: 
 
 def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Add the parts of the frame that ``found`` separates from the scene: below a bonnet's edge.
-
-    The scene is the largest part.
-    """
+    The scene is the largest part."""
     number, labels, boxes, _ = cv2.connectedComponentsWithStats((~found).astype(np.uint8))
     if number <= 2:
         return found

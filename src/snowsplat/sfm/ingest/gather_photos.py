@@ -120,8 +120,8 @@ def write_photos(
     """Write photos to ``input/``, and their masks to ``distorted/masks``, in up to four threads.
 
     Each thread has one photo in memory. The photos have the order of ``planned``, and so have the
-    looks of the masks of some of them. Photos that cannot
-    be used are appended to ``skipped``, with the reason.
+    looks of the masks of some of them. Photos that cannot be used are appended to ``skipped``, with
+    the reason.
 
     Args:
         longest: largest allowed longest side in pixels; None: any.

@@ -81,9 +81,7 @@ def _distances(shape: tuple[int, ...], x: float, y: float) -> NDArray[np.float64
 
 def _edge(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(K, 2) the outermost lit pixels, from the centre of the frame; those at its border left out.
-
-    A direction counts only if the frame is black between this pixel and the border.
-    """
+    A direction counts only if the frame is black between this pixel and the border."""
     height, width = lit.shape
     turn = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
     steps = np.arange(0.0, np.hypot(width, height) / 2, 0.5)

@@ -17,12 +17,7 @@ from pathlib import Path, PurePosixPath
 
 from snowsplat.data.files.mask_look import doubt_about_masks
 from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
-from snowsplat.sfm.ingest.gather_photos import (
-    Planned,
-    evenly_spread,
-    plan_photos,
-    write_photos,
-)
+from snowsplat.sfm.ingest.gather_photos import Planned, evenly_spread, plan_photos, write_photos
 from snowsplat.sfm.ingest.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside
@@ -148,10 +143,8 @@ def _check(options: GatherOptions) -> None:
 
 
 def _with_panoramas(photos: list[Photo]) -> list[Photo]:
-    """The photos; those of a panorama's size are panoramas if most of this size are.
-
-    Not every panorama is recognised by its pixels: there may be an edge at a pole.
-    """
+    """The photos; those of a panorama's size are panoramas if most of this size are. Not every
+    panorama is recognised by its pixels: there may be an edge at a pole."""
     alike = [photo for photo in photos if is_twice_as_wide(photo.width, photo.height)]
     if 2 * sum(photo.panorama for photo in alike) < len(alike):
         return photos
@@ -170,19 +163,16 @@ def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
         UserError: they show all directions, but not as one equirectangular picture.
     """
     found = spherical_video(clip.path)
-    problem = found.problem if found else ""
-    if (
-        not problem
-        and (found or options.panoramas)
-        and not is_twice_as_wide(clip.width, clip.height)
-    ):
+    around = found is not None or options.panoramas
+    problem = found or ""
+    if around and not problem and not is_twice_as_wide(clip.width, clip.height):
         problem = f"has frames of {clip.width}x{clip.height} pixels"
     if problem:
         raise UserError(
             f"{shown(clip.path)}: is a 360° video that {problem}; export it with one "
             "equirectangular picture of all directions, which is twice as wide as high"
         )
-    return found is not None or options.panoramas
+    return around
 
 
 def _refuse_changes(

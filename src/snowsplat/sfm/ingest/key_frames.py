@@ -55,10 +55,8 @@ def choose(candidates: Sequence[Candidate], max_count: int) -> list[Candidate]:
 
 
 def _with_step(candidates: Sequence[Candidate], moved: Sequence[float], step: float) -> list[int]:
-    """The indices of the candidates that `choose` selects if the step is ``step``.
-
-    ``moved``: the motion of each candidate.
-    """
+    """The indices of the candidates that `choose` selects if the step is ``step``. ``moved``: the
+    motion of each candidate."""
     chosen: list[int] = []
     first, last = 0, moved[0] - step / 2  # the next index, and the motion of the last choice
     while first < len(candidates):
@@ -80,10 +78,8 @@ def _with_step(candidates: Sequence[Candidate], moved: Sequence[float], step: fl
 def _with_divided_steps(
     candidates: Sequence[Candidate], moved: Sequence[float], chosen: list[int], max_count: int
 ) -> list[int]:
-    """Add indices to ``chosen`` until there are ``max_count``, if possible.
-
-    Each addition divides the longest step: it is the sharpest candidate in the middle half of it.
-    """
+    """Add indices to ``chosen`` until there are ``max_count``, if possible. Each addition divides
+    the longest step: it is the sharpest candidate in the middle half of it."""
     chosen = list(chosen)
     # The lengths are negative, so that the heap returns the longest step first.
     steps = [(moved[a] - moved[b], a, b) for a, b in pairwise(chosen)]

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageOps
+from PIL.ExifTags import Base
 
 from snowsplat.data.files.mask_pixels import has_shape, mask_levels
 from snowsplat.data.image_file import reason_of
-from snowsplat.sfm.ingest.exif import ORIENTATION
 from snowsplat.sfm.ingest.photo_files import Header, made_upright, open_image
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
@@ -33,7 +33,7 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
     """
     try:
         with open_image(path) as opened:
-            has_orientation = opened.getexif().get(ORIENTATION, 1) != 1
+            has_orientation = opened.getexif().get(Base.Orientation, 1) != 1
             image = ImageOps.exif_transpose(opened)
             image.load()
     except Exception as error:  # Pillow may raise any exception for a damaged file

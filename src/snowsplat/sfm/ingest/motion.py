@@ -103,10 +103,8 @@ class FrameMotion:
 
 
 def _blocks(grey: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
-    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image.
-
-    ``fixed``: as for `FrameMotion`.
-    """
+    """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image. ``fixed``: as for
+    `FrameMotion`."""
     blocks = _divided(grey.astype(np.float32))
     if fixed is None:
         return blocks
@@ -133,10 +131,8 @@ def _textured(blocks: np.ndarray) -> np.ndarray:
 
 
 def _spectrum(blocks: np.ndarray) -> np.ndarray:
-    """The Fourier transforms of blocks: (N, 32, 32) to (N, 32, 17) complex.
-
-    A Hann window fades the blocks out at their edges; otherwise the edges would correlate.
-    """
+    """The Fourier transforms of blocks: (N, 32, 32) to (N, 32, 17) complex. A Hann window fades the
+    blocks out at their edges; otherwise the edges would correlate."""
     fade = np.hanning(_BLOCK + 2)[1:-1].astype(np.float32)
     return np.fft.rfft2((blocks - blocks.mean(axis=(1, 2), keepdims=True)) * fade[:, None] * fade)
 

@@ -18,6 +18,7 @@ from PIL import Image
 # Reasons why a photo is unusable.
 STITCHED = "is a stitched panorama, not of all directions"
 NOT_TWICE_AS_WIDE = "is not twice as wide as high, as a 360° panorama is"
+_TWO_EYES = "shows two pictures, for two eyes"
 
 # XMP, as an attribute or as an element: https://developers.google.com/streetview/spherical-metadata
 _PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
@@ -113,19 +114,12 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDAr
     return np.asarray(np.abs(first - second).mean(axis=0))
 
 
-@dataclass(frozen=True)
-class Spherical:
-    """What the header of a video says of its projection.
+def spherical_video(path: Path) -> str | None:
+    """Whether the header of an mp4 file says that its frames show all directions.
 
-    ``problem``: why its frames are no panoramas of all directions, as text for users; empty: they
-    are.
-    """
-
-    problem: str = ""
-
-
-def spherical_video(path: Path) -> Spherical | None:
-    """What the header of an mp4 file says; None: that it is an ordinary video.
+    Returns:
+        None: it is an ordinary video. Empty: its frames are panoramas of all directions. Otherwise,
+        why they are not, as text for users.
 
     Raises:
         OSError: the file cannot be read.
@@ -135,24 +129,24 @@ def spherical_video(path: Path) -> Spherical | None:
     if at >= 0:
         return _version_2(header, at)
     if _SPHERICAL.search(header):
-        return Spherical("shows two pictures, for two eyes" if _STEREO.search(header) else "")
+        return _TWO_EYES if _STEREO.search(header) else ""
     return None
 
 
-def _version_2(header: bytes, at: int) -> Spherical | None:
+def _version_2(header: bytes, at: int) -> str | None:
     """What the box sv3d says, whose name is at ``at`` in the header of an mp4 file."""
     near = header[at : at + _LONGEST_BOX]
     stereo = header[max(0, at - _LONGEST_BOX) : at + _LONGEST_BOX].partition(b"st3d")[2]
     if len(stereo) > 4 and stereo[4]:
-        return Spherical("shows two pictures, for two eyes")
+        return _TWO_EYES
     if b"cbmp" in near or b"mshp" in near:
-        return Spherical("has the projection of a cube or a mesh")
+        return "has the projection of a cube or a mesh"
     _, found, box = near.partition(b"equi")
     if not found:
         return None
     # Version and flags, then the parts cut off at the top, bottom, left and right.
     bounds = [int.from_bytes(box[i : i + 4], "big") for i in range(4, 20, 4)]
-    return Spherical("shows only a part of all directions" if any(bounds) else "")
+    return "shows only a part of all directions" if any(bounds) else ""
 
 
 def _header(path: Path) -> bytes:

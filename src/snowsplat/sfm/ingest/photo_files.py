@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
+from PIL.ExifTags import Base
 
 from snowsplat.data import image_file
-from snowsplat.data.colour_profile import is_transparent
-from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of
-from snowsplat.data.plain_pixels import plain_pixels
-from snowsplat.sfm.ingest.exif import ORIENTATION, ExifInfo, exif_for_copy, read_exif
+from snowsplat.data.colour_profile import is_transparent, plain_pixels
+from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
+from snowsplat.sfm.ingest.exif import ExifInfo, exif_for_copy, read_exif
 from snowsplat.sfm.ingest.panorama import STITCHED, Panorama, panorama_in_xmp
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
@@ -86,21 +86,11 @@ class Header:
 
     def file_name(self, name: str, longest: int | None) -> str:
         """The name in ``input/``: the original name, with the extension of the new format."""
-        target = self.format if self.is_ready(longest) else self._new_format()
+        lossy = self.format in _LOSSY and not self.transparent
+        target = self.format if self.is_ready(longest) else "JPEG" if lossy else "PNG"
         path = PurePosixPath(name)
         fits = path.suffix.lower() in _SUFFIXES[target]
         return name if fits else str(path.with_suffix(_SUFFIXES[target][0]))
-
-    def _new_format(self) -> str:
-        return "JPEG" if self.format in _LOSSY and not self.transparent else "PNG"
-
-
-def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    """The size with its longest side at most ``longest``; never enlarged."""
-    if longest is None or max(width, height) <= longest:
-        return width, height
-    scale = longest / max(width, height)
-    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def read_header(path: Path) -> Header:
@@ -170,10 +160,8 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _bits(path: Path, image: Image.Image) -> int:
-    """Bits per channel in the file.
-
-    The image mode does not show them, because Pillow converts 16-bit colours to 8 bits.
-    """
+    """Bits per channel in the file. The image mode does not show them, because Pillow converts
+    16-bit colours to 8 bits."""
     if image.format == "PNG":
         with open(path, "rb") as file:
             return file.read(25)[24]  # bit depth in the first chunk, IHDR
@@ -263,5 +251,5 @@ def link_or_copy(source: Path, target: Path) -> None:
 def made_upright(image: Image.Image, orientation: int) -> Image.Image:
     """Rotate and mirror an image as the EXIF ``orientation`` (1 to 8) says."""
     exif = image.getexif()
-    exif[ORIENTATION] = orientation
+    exif[Base.Orientation] = orientation
     return ImageOps.exif_transpose(image)

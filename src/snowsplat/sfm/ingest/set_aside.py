@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from snowsplat.data.plain_pixels import plain_pixels
+from snowsplat.data.colour_profile import plain_pixels
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     FIXED_SIDE,
@@ -95,11 +95,6 @@ def _copy(path: Path) -> NDArray[np.uint8]:
         return grey_copy(image, FIXED_SIDE)
 
 
-def _enlarged(still: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(H, W) bool in the size of a photo (width, height)."""
-    return np.asarray(Image.fromarray(still).resize(size, Image.Resampling.NEAREST), bool)
-
-
 def _cropped_and_masked(
     photo: Photo, dataset: Path, box: tuple[int, int, int, int], fixed: NDArray[np.bool_]
 ) -> Photo:
@@ -113,7 +108,8 @@ def _cropped_and_masked(
             cropped = plain_pixels(image, path).crop(box)
         save(cropped, new, path)
         os.replace(new, path)
-    used = ~_enlarged(fixed, (photo.width, photo.height))[box[1] : box[3], box[0] : box[2]]
+    still = Image.fromarray(fixed).resize((photo.width, photo.height), Image.Resampling.NEAREST)
+    used = ~np.asarray(still, bool)[box[1] : box[3], box[0] : box[2]]
     mask_path = dataset / "distorted" / "masks" / f"{photo.name}.png"
     if photo.mask:
         with Image.open(mask_path) as mask:

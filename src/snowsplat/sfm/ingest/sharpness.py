@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
+from snowsplat.data.image_file import scaled_size
+
 #: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of
 #: the copy is still detected, while noise of the sensor and of compression is mostly averaged out.
 SHARPNESS_SIDE = 640
@@ -42,8 +44,7 @@ def grey_copy(image: Image.Image, side: int) -> np.ndarray:
     factor = max(1, max(image.size) // (2 * side))
     if factor > 1:  # first by an integer factor, which is several times faster
         image = image.reduce(factor)
-    scale = min(1.0, side / max(image.size))
-    size = max(1, round(image.width * scale)), max(1, round(image.height * scale))
+    size = scaled_size(*image.size, side)
     grey = image.convert("L")
     return np.asarray(grey if grey.size == size else grey.resize(size, Image.Resampling.BOX))
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -17,11 +18,6 @@ from snowsplat.sfm.ingest.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.clip import ONLY_SOUND, why_no_video
 from snowsplat.sfm.ingest.copies import find_copies
 from snowsplat.sfm.ingest.photo_or_film import photos_or_films
-from snowsplat.sfm.ingest.unread_formats import (
-    UNREAD_SUFFIXES,
-    format_name,
-    unread_photos,
-)
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
@@ -36,6 +32,14 @@ PHOTO_SUFFIXES = _suffixes(
 )
 VIDEO_SUFFIXES = _suffixes(
     "mp4 mov m4v mkv avi webm mpg mpeg mts m2ts ts 3gp 3g2 wmv ogv mjpeg flv insv gif"
+)
+# Formats that are not read, first raw photos: the user should learn that such photos are not used.
+_UNREAD = (
+    "dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw iiq 3fr fff gpr rwl "
+    "avif jxl jp2 j2k jpx jpf jxr psd psb exr hdr tga"
+)
+_UNREAD_SUFFIXES = frozenset(
+    f".{name}" for name in _UNREAD.split() if name.upper() not in OPTIONAL_FORMATS
 )
 #: The record of the stages of a dataset, and its name in version 0.1.0.
 RECORDS = ("sfm.json", "capture.json")
@@ -105,11 +109,10 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
 
     Hidden files, datasets and output folders are skipped; so are folders of masks, depth maps and
     thumbnails. Of photos of the same picture, one is used. Of a dataset, the photos in ``input`` or
-    ``images`` are used. Videos in a folder
-    with photos are also skipped, because some phones save a video of three seconds with every
-    photo. A zip file is unpacked into a folder beside it. If there is a single input, the files
-    keep their names. If there are several, each input folder and each video gets its own folder in
-    ``input/``, so that equal names do not collide.
+    ``images`` are used. Videos in a folder with photos are also skipped, because some phones save a
+    video of three seconds with every photo. A zip file is unpacked into a folder beside it. If
+    there is a single input, the files keep their names. If there are several, each input folder and
+    each video gets its own folder in ``input/``, so that equal names do not collide.
 
     Raises:
         UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
@@ -205,7 +208,7 @@ def _search(root: Path) -> _Folder:
         found.left_out = []  # only photos called depth/1.png: they are the photos
         files = files_below(root, _masks_and_outputs)
     photos = [file for file in files if _is_photo_name(file)]
-    if unread := unread_photos(files, photos):
+    if unread := _unread_photos(files, photos):
         found.left_out.append((shown(root), unread))
     if links := _broken_links(broken):
         found.left_out.append((shown(root), links))
@@ -221,6 +224,34 @@ def _search(root: Path) -> _Folder:
     found.masks = find_masks(root, photos)
     found.photos = [photo for photo in photos if photo not in found.masks.beside]
     return found
+
+
+def _format_name(name: str) -> str:
+    """The name of a format, e.g. DNG, from the name of a file."""
+    return PurePosixPath(name).suffix[1:].upper()
+
+
+def _unread_photos(files: Iterable[str], read: Sequence[str]) -> str | None:
+    """What to say about the photos among ``files`` that are in such a format; None: there are none.
+
+    Cameras save a raw photo and a JPEG of it. Therefore a photo that is also among those that are
+    ``read`` does not count.
+    """
+    also = {_stem(name) for name in read}
+    counts = Counter(
+        _format_name(name)
+        for name in files
+        if PurePosixPath(name).suffix.lower() in _UNREAD_SUFFIXES and _stem(name) not in also
+    )
+    if not counts:
+        return None
+    listed = " and ".join(f"{count:,} {name}" for name, count in counts.most_common())
+    noun = "photo" if counts.total() == 1 else "photos"
+    return f"has {listed} {noun}, which cannot be read; save them as JPEG or PNG first"
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix("")).casefold()
 
 
 def _broken_links(broken: Sequence[str]) -> str | None:
@@ -304,10 +335,10 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
     except OSError as error:
         raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
     suffix = path.suffix.lower()
-    if suffix in UNREAD_SUFFIXES:  # many are TIFF files with a small preview
+    if suffix in _UNREAD_SUFFIXES:  # many are TIFF files with a small preview
+        form = _format_name(path.name)
         raise UserError(
-            f"{shown(path)}: is a {format_name(path.name)} photo, which cannot be read; save it as "
-            "JPEG or PNG first"
+            f"{shown(path)}: is a {form} photo, which cannot be read; save it as JPEG or PNG first"
         )
     if _is_photo(head):
         return "photo"
@@ -338,7 +369,7 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
     for path in inputs:
         broken: list[str] = []
         files = files_below(path, _masks_and_outputs, broken)
-        if reason := unread_photos(files, []) or _broken_links(broken):
+        if reason := _unread_photos(files, []) or _broken_links(broken):
             return UserError(f"{names}: {reason}")
     return UserError(
         f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "

@@ -21,13 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from snowsplat.sfm.ingest.clip import (
-    Clip,
-    decoded_frames,
-    open_video,
-    undecodable,
-    video_stream,
-)
+from snowsplat.data.image_file import scaled_size
+from snowsplat.sfm.ingest.clip import Clip, decoded_frames, open_video, undecodable, video_stream
 from snowsplat.sfm.ingest.fixed_parts import (
     ENOUGH_PHOTOS,
     Crop,
@@ -39,7 +34,7 @@ from snowsplat.sfm.ingest.interlace import field_order, whole_frames
 from snowsplat.sfm.ingest.key_frames import Candidate, choose
 from snowsplat.sfm.ingest.motion import FrameMotion, has_moved
 from snowsplat.sfm.ingest.panorama import shows_all_around
-from snowsplat.sfm.ingest.photo_files import resized, save, scaled_size
+from snowsplat.sfm.ingest.photo_files import resized, save
 from snowsplat.sfm.ingest.sharpness import (
     CONTENT_SIDE,
     SHARPNESS_SIDE,
@@ -119,7 +114,8 @@ def extract_frames(
         order = field_order(clip)
     except (av.FFmpegError, ValueError) as error:
         raise undecodable(clip.path, error) from None
-    frames.panoramas = panoramas or _are_panoramas(copies)
+    around = sum(shows_all_around(Image.fromarray(copy)) for copy in copies)
+    frames.panoramas = panoramas or around > len(copies) / 2
     # The rows at the poles of a panorama would be bars.
     parts = find_fixed_parts(np.stack(copies)) if copies and not frames.panoramas else None
     crop = parts.crop if parts else None
@@ -176,7 +172,7 @@ class _Candidates:
         self._candidates: list[Candidate] = []
         self._frames: dict[int, Frame] = {}  # by the number of the candidate
         self._written = 0
-        self._best = _SharpestFrame()
+        self._best: _Sharpest | None = None  # of the current window
         self._window_start = (0.0, 0.0)  # time (s) and motion at which the window began
         self._last: np.ndarray | None = None  # small copy of the last candidate
 
@@ -188,7 +184,7 @@ class _Candidates:
             seconds: its time, from the first frame.
             moved: the result of `FrameMotion.add`.
         """
-        if self._best.frame is None:
+        if self._best is None:
             self._window_start = seconds, moved
         # The motion only increases. At the end, `choose` uses a step of at least the whole motion
         # divided by the number of frames, so the step of a window is at most half of it.
@@ -199,7 +195,9 @@ class _Candidates:
         ):
             self._close_window()
             self._window_start = seconds, moved
-        self._best.offer(frame, grey, seconds, moved)
+        value = sharpness(grey)
+        if self._best is None or value > self._best.sharpness:
+            self._best = _Sharpest(frame, grey, seconds, moved, value)
 
     def finish(self) -> list[Frame]:
         """Delete the candidates that are not chosen, and rename the others."""
@@ -220,8 +218,8 @@ class _Candidates:
 
     def _close_window(self) -> None:
         """Write the sharpest frame of the window as a candidate, unless it must be skipped."""
-        best = self._best
-        if best.frame is None or best.grey is None:
+        best, self._best = self._best, None
+        if best is None:
             return
         small = grey_copy(Image.fromarray(best.grey), CONTENT_SIDE)
         reason = why_unusable(small)
@@ -238,7 +236,6 @@ class _Candidates:
                 self._thin(2 * self._count)
         else:
             self.skipped.append((best.seconds, reason))
-        best.reset()
 
     def _thin(self, max_frames: int) -> None:
         self._candidates = choose(self._candidates, max_frames)
@@ -247,24 +244,15 @@ class _Candidates:
             (self._folder / self._frames.pop(number).name).unlink()
 
 
-class _SharpestFrame:
-    """The sharpest frame since the last reset."""
+@dataclass(frozen=True)
+class _Sharpest:
+    """The sharpest frame of a window."""
 
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        self.frame: VideoFrame | None = None
-        self.grey: np.ndarray | None = None  # (H, W) uint8, not rotated, between the bars
-        self.seconds = 0.0
-        self.moved = 0.0
-        self.sharpness = -1.0
-
-    def offer(self, frame: VideoFrame, grey: np.ndarray, seconds: float, moved: float) -> None:
-        value = sharpness(grey)
-        if value > self.sharpness:
-            self.frame, self.grey, self.seconds = frame, grey, seconds
-            self.moved, self.sharpness = moved, value
+    frame: VideoFrame
+    grey: np.ndarray  # (H, W) uint8, not rotated, between the bars
+    seconds: float
+    moved: float
+    sharpness: float
 
 
 def _grey(frame: VideoFrame) -> np.ndarray:
@@ -283,11 +271,6 @@ def _copies(clip: Clip) -> list[np.ndarray]:
     if len(copies) < _FEW_KEY_FRAMES:
         copies = _spread_copies(clip, key_frames=False)
     return [copy for copy in copies if copy.shape == copies[0].shape]
-
-
-def _are_panoramas(copies: list[np.ndarray]) -> bool:
-    around = sum(shows_all_around(Image.fromarray(copy)) for copy in copies)
-    return around > len(copies) / 2
 
 
 def _spread_copies(clip: Clip, key_frames: bool) -> list[np.ndarray]:
@@ -313,11 +296,8 @@ def _cropped(pixels: np.ndarray, crop: Crop | None) -> np.ndarray:
     return np.ascontiguousarray(pixels[top:bottom, left:right])
 
 
-def _write(
-    best: _SharpestFrame, clip: Clip, path: Path, size: int | None, crop: Crop | None
-) -> Frame:
+def _write(best: _Sharpest, clip: Clip, path: Path, size: int | None, crop: Crop | None) -> Frame:
     frame = best.frame
-    assert frame is not None
     image = Image.fromarray(_cropped(rgb_image(frame), crop))
     width, height = round(image.width * clip.aspect), image.height
     turns = round(frame.rotation / 90) % 4

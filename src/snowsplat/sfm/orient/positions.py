@@ -109,11 +109,7 @@ def align(
         precision = precision[:, [0, 0, 1]]  # east, north, up
         # (N, 3, 7) derivatives of the positions by the rotation vector, log scale, translation.
         jacobian = np.concatenate(
-            [
-                -_cross(turned),
-                turned[:, :, None],
-                np.broadcast_to(np.eye(3), (len(turned), 3, 3)),
-            ],
+            [-_cross(turned), turned[:, :, None], np.broadcast_to(np.eye(3), (len(turned), 3, 3))],
             axis=2,
         )
         hessian = np.einsum("nij,ni,nik->jk", jacobian, precision, jacobian)
@@ -144,10 +140,8 @@ def align(
 def _start(
     centres: np.ndarray, places: np.ndarray, up: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray] | None:
-    """Scale, rotation and translation with this ``up``: the least median of the distances.
-
-    Half of the positions may be wrong (Rousseeuw, "Least median of squares regression", 1984).
-    """
+    """Scale, rotation and translation with this ``up``: the least median of the distances. Half of
+    the positions may be wrong (Rousseeuw, "Least median of squares regression", 1984)."""
     east = np.linalg.svd(up[None])[2][1]
     north = np.cross(up, east)
     # Horizontal positions as complex numbers: a factor turns and scales them.
@@ -174,9 +168,7 @@ def _start(
 
 def _error(sizes: np.ndarray, before: np.ndarray, expected: float) -> np.ndarray:
     """(2,) standard deviations, horizontal and vertical, of distances (N, 2) without outliers.
-
-    ``before``: an earlier estimate, which tells the outliers.
-    """
+    ``before``: an earlier estimate, which tells the outliers."""
     limits = _OUTLIER * np.maximum(before, np.median(sizes, axis=0))
     across, above = (size[size <= limit] for size, limit in zip(sizes.T, limits, strict=True))
     # Four unknowns are fitted to the horizontal positions, three to the altitudes.

@@ -80,7 +80,8 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
         ValueError: the model has no cameras.
     """
     cameras = read_cameras(model)
-    known = _known(cameras, photos)
+    by_name = {photo.name: photo for photo in photos}
+    known = [by_name.get(name) for name in cameras.names]
     cameras = _upright(cameras, known)
     up, doubts = _up(cameras, known)
     gps, more = _gps(cameras, known, up)
@@ -102,10 +103,7 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
     if north is not None:
         x, y, z = (round(float(v), 12) for v in rotation @ _horizontal(north.direction, direction))
         placement = replace(
-            placement,
-            north=(x, y, z),
-            north_from=north.name,
-            north_error=math.degrees(north.error),
+            placement, north=(x, y, z), north_from=north.name, north_error=math.degrees(north.error)
         )
     if gps is not None:
         scale = gps.alignment.scale
@@ -121,12 +119,6 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
     return Oriented(
         Similarity(scale, torch.from_numpy(rotation), torch.from_numpy(shift)), placement
     )
-
-
-def _known(cameras: Cameras, photos: Sequence[Photo]) -> list[Photo | None]:
-    """The photo of each camera, or None."""
-    by_name = {photo.name: photo for photo in photos}
-    return [by_name.get(name) for name in cameras.names]
 
 
 def _upright(cameras: Cameras, photos: Sequence[Photo | None]) -> Cameras:
@@ -218,10 +210,8 @@ def _horizontal(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _viewing_direction(cameras: Cameras, up: np.ndarray) -> np.ndarray:
-    """(3,) unit vector: the horizontal part of the mean viewing direction.
-
-    If this part is too short, that of the viewing direction of the first camera.
-    """
+    """(3,) unit vector: the horizontal part of the mean viewing direction. If this part is too
+    short, that of the viewing direction of the first camera."""
     level = np.eye(3) - np.outer(up, up)
     forward = cameras.forward
     # If the first camera looks straight down, use the direction of its upper image edge.
