@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -15,7 +17,6 @@ from PIL import Image
 from snowsplat.cli.main import main
 from snowsplat.data import load_dataset
 from snowsplat.data.placement import read_placement
-from snowsplat.sfm import dataset_folder
 from snowsplat.sfm.gps import location_of
 
 from ..sfm.colmap import scenes
@@ -248,7 +249,20 @@ def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, 
     assert not (out / ".new").exists()
 
 
-def test_without_pycolmap_the_remedy_is_named(refused, photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset_folder, "find_spec", lambda name: None)
-    assert "pycolmap is not installed" in refused("sfm", photos, "-o", tmp_path / "new")
+@pytest.mark.parametrize("command", ["sfm", "make"])
+def test_without_pycolmap_the_remedy_is_named(photos, tmp_path, command):
+    package = tmp_path / "modules" / "pycolmap"
+    package.mkdir(parents=True)
+    missing = """raise ModuleNotFoundError("No module named 'pycolmap'", name="pycolmap")"""
+    (package / "__init__.py").write_text(missing)
+    paths = [str(package.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    found = subprocess.run(
+        [sys.executable, "-m", "snowsplat", command, photos, "-o", tmp_path / "new"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+    )
+    assert found.returncode == 2
+    assert found.stderr.startswith("snowsplat: pycolmap is not installed")
+    assert found.stderr.count("\n") == 1
     assert not (tmp_path / "new").exists()

@@ -23,7 +23,6 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -116,11 +115,6 @@ def make_dataset(
             files remain.
         OSError: a file cannot be read or written.
     """
-    if find_spec("pycolmap") is None:
-        raise UserError(
-            "pycolmap is not installed, and PyPI may have no package for this computer; build it "
-            "from the sources of COLMAP 4.2, or make the dataset on another computer"
-        )
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     in_place = sources.contain(folder / "input")
     with one_run(folder):

@@ -4,8 +4,18 @@
 `reconstruct` makes the attempts there, from `features` to `repair`.
 """
 
-from snowsplat.sfm.colmap.child import estimate_poses
-from snowsplat.sfm.colmap.options import SfmOptions, SfmResult
-from snowsplat.sfm.colmap.result import describe_model
+from snowsplat.util.errors import UserError
+
+try:
+    from snowsplat.sfm.colmap.child import estimate_poses
+    from snowsplat.sfm.colmap.options import SfmOptions, SfmResult
+    from snowsplat.sfm.colmap.result import describe_model
+except ModuleNotFoundError as error:
+    if error.name != "pycolmap":
+        raise
+    raise UserError(
+        "pycolmap is not installed, and PyPI may have no package for this computer; build it "
+        "from the sources of COLMAP 4.2, or make the dataset on another computer; train needs none"
+    ) from None
 
 __all__ = ["SfmOptions", "SfmResult", "describe_model", "estimate_poses"]
