@@ -215,7 +215,7 @@ def _quality(made: MakeResult) -> str:
     ]
     if made.all_photos:
         lines.append(
-            f"                            before the last part, which has used "
+            "                            before the last part, which has used "
             + photos_of_last_part(made.all_photos, made.left_out)
         )
     return "\n".join(lines) + "\n"

@@ -35,6 +35,8 @@ _MIN_PHOTOS_FOR_OPENCV = 8
 GUESSED_FOCAL = 0.8
 # The same for a fisheye lens: its longest side spans 115°.
 _GUESSED_FISHEYE = 0.5
+# A lens whose picture is a disc spans about this angle: 180° to 220°.
+_CIRCLE = 190.0
 # Models without coefficients; a fisheye lens then begins without one, too.
 _EQUIDISTANT = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_PINHOLE")
 # A fisheye lens sees behind itself by this angle at most. Degrees from the axis.
@@ -192,6 +194,18 @@ def exif_focals(photos: Sequence[Photo]) -> dict[int, float]:
         if photo.focal:
             focals.setdefault(number, []).append(photo.focal)
     return {number: float(np.median(values)) for number, values in focals.items()}
+
+
+def circle_focals(photos: Sequence[Photo]) -> dict[int, float]:
+    """The focal length in pixels of each camera whose picture is a disc; others are left out.
+
+    It is that of an equidistant fisheye lens whose disc spans `_CIRCLE`.
+    """
+    radii: dict[int, list[float]] = {}
+    for photo, number in zip(photos, camera_ids(photos), strict=True):
+        if photo.circle is not None:
+            radii.setdefault(number, []).append(photo.circle)
+    return {number: float(np.median(r) / np.radians(_CIRCLE / 2)) for number, r in radii.items()}
 
 
 def pixels_per_radian(camera: pycolmap.Camera) -> float:
