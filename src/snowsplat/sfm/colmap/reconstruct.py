@@ -282,9 +282,8 @@ class PoseEstimation:
     def _first_lens(self) -> Lens:
         """The lens of the first attempt, with the focal lengths that discs and matches propose."""
         lens, circles = Lens(self.options.camera_model), circle_focals(self.photos)
-        sure = {
-            number: found.focal for number, found in self.lens_evidence.items() if found.fisheye
-        }
+        proposed = {number: found.focal for number, found in self.lens_evidence.items()}
+        sure = {n: focal for n, focal in proposed.items() if self.lens_evidence[n].fisheye}
         if lens.model == "auto":
             focals = circles | sure
             return dataclasses.replace(lens, fisheyes=frozenset(focals), focals=focals)
