@@ -55,9 +55,9 @@ _MAX_STRETCH = 1.3
 # An ordinary lens moves pixels outwards or inwards. If it does both ("moustache" distortion), the
 # second one compensates the first one by at most this share of the distance from the centre.
 _MAX_MOUSTACHE = 0.02
-# Two focal lengths agree equally well with the matches if the reprojection errors differ by less
-# than this share. Small systematic errors (rolling shutter, things that move) have this effect.
-_EQUAL_ERROR = 0.05
+#: Two focal lengths agree equally well with the matches if the reprojection errors differ by less
+#: than this share. Small systematic errors (rolling shutter, things that move) have this effect.
+EQUAL_ERROR = 0.05
 # A possible lens is used instead of an impossible one up to this factor between the errors.
 _MAX_WORSE = 2.0
 # fx and fy are in doubt if they differ by more than this share. Sensors have square pixels within
@@ -371,7 +371,7 @@ def settled(
 
     free, held = _with_square_pixels(refined(False), lens, refine), refined(True)
     ratio = misfit(held) / misfit(free)
-    if not _impossible(held) and ratio <= 1 + _EQUAL_ERROR:
+    if not _impossible(held) and ratio <= 1 + EQUAL_ERROR:
         return Settled(held, True, [])
     if not _impossible(free):
         return Settled(free, False, _doubts(free, known))
@@ -401,7 +401,7 @@ def _with_square_pixels(
     # The errors of the photos of other cameras hardly change, so they do not count.
     photos = [model.image(i).camera_id for i in model.reg_image_ids()]
     share = sum(number in unequal for number in photos) / len(photos)
-    worse = misfit(made) > (1 + _EQUAL_ERROR * share) * misfit(model)
+    worse = misfit(made) > (1 + EQUAL_ERROR * share) * misfit(model)
     return model if worse or _impossible(made) else made
 
 

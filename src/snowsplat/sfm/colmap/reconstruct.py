@@ -60,11 +60,13 @@ from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_ev
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
 from snowsplat.sfm.colmap.fisheye import LensEvidence, lens_evidence
 from snowsplat.sfm.colmap.lens import (
+    EQUAL_ERROR,
     Lens,
     Refine,
     camera_ids,
     circle_focals,
     exif_focals,
+    misfit,
     settled,
     with_all_parameters,
 )
@@ -132,6 +134,11 @@ class Attempt:
     def error(self) -> float:
         """The mean reprojection error of the first model, in pixels of the photos."""
         return self.models[0].compute_mean_reprojection_error() if self.models else float("inf")
+
+    @property
+    def misfit(self) -> float:
+        """`lens.misfit` of the first model."""
+        return misfit(self.models[0]) if self.models else float("inf")
 
 
 class PoseEstimation:
@@ -268,13 +275,19 @@ class PoseEstimation:
         """The attempt with the most registered photos, weighted by the share of correct matches.
 
         A model that is bent, because photos were registered with too few points, may have all
-        photos. So may a model of the wrong kind of lens, but it has larger errors.
+        photos. So may a model of the wrong kind of lens, but it has larger errors. A lens in doubt,
+        for example because of EXIF, is right only if no other lens agrees equally well with the
+        matches.
         """
         least = min(attempt.error for attempt in self.attempts)
         lenses = {attempt.lens.any_fisheye for attempt in self.attempts}
 
+        undoubted = min((a.misfit for a in self.attempts if not a.doubts), default=float("inf"))
+
         def score(attempt: Attempt) -> float:
             wrong_lens = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
+            if attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit:
+                wrong_lens = True
             return attempt.registered * attempt.agreement * (0.5 if wrong_lens else 1.0)
 
         return max(self.attempts, key=score)
