@@ -18,3 +18,12 @@ def test_what_is_fixed_to_the_frame_follows_the_number_of_photos():
 
 def test_records_of_earlier_versions_have_no_notes():
     assert described("photos", {"photos": [{}] * 8, "skipped": []}) == ["8 photos"]
+
+
+def test_the_last_part_says_how_many_photos_it_leaves_out():
+    (line,) = described("all", {"steps": 180, "photos": 19})  # as earlier versions wrote it
+    assert "180 more steps with all 19 photos" in line
+    (line,) = described("all", {"steps": 180, "photos": 18, "left_out": 1})
+    assert "180 more steps with 18 of 19 photos (the scene does not explain the other)" in line
+    (line,) = described("all", {"steps": 180, "photos": 17, "left_out": 2})
+    assert "17 of 19 photos (the scene does not explain the others)" in line

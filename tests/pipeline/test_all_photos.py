@@ -59,7 +59,7 @@ def test_it_continues_where_the_training_has_ended(trained, monkeypatch):
     monkeypatch.setattr(all_photos, "Trainer", remember)
     part = train_on_all(trained, 200, math.inf, Compute("cpu", 1), SILENT)
     (trainer,) = trainers
-    assert (part.steps, part.photos, part.why_not) == (24, 8, "")
+    assert (part.steps, part.photos, part.left_out, part.why_not) == (24, 8, 1, "")
     names = [view.name for view in trainer.dataset.train]
     assert sorted(names) == sorted(
         view.name for view in (*ended.dataset.train[1:], *ended.dataset.test)

@@ -16,6 +16,7 @@ from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, PageFlags
 from snowsplat.cli.reports import JsonFlag, Reports
+from snowsplat.cli.stage_lines import photos_of_last_part
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
@@ -206,14 +207,15 @@ def _quality(made: MakeResult) -> str:
     figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
     if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
         figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
+    photos = "1 photo" if made.views == 1 else f"{made.views} photos"
     lines = [
         f"Rendered test views:        {made.renders}",
         f" and held-out photos:       {made.photos}",
-        f"Quality of these views:     {figures} ({made.views} photos of {made.size})",
+        f"Quality of these views:     {figures} ({photos} of {made.size})",
     ]
     if made.all_photos:
         lines.append(
-            f"                            before the last part, which has used all "
-            f"{made.all_photos} photos"
+            "                            before the last part, which has used "
+            + photos_of_last_part(made.all_photos, made.left_out)
         )
     return "\n".join(lines) + "\n"

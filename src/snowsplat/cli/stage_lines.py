@@ -76,10 +76,16 @@ def _pictures(rendered: dict[str, Any]) -> list[str]:
 def _all(trained: dict[str, Any]) -> list[str]:
     if not trained["steps"]:
         return [f"no last part with the held-out photos: {trained['why_not']}"]
-    return [
-        f"{trained['steps']} more steps with all {trained['photos']} photos; the PSNR is that of "
-        "the scene before"
-    ]
+    photos = photos_of_last_part(trained["photos"], trained.get("left_out", 0))
+    return [f"{trained['steps']} more steps with {photos}; the PSNR is that of the scene before"]
+
+
+def photos_of_last_part(used: int, left_out: int) -> str:
+    """The photos of the last part of the training; photos that it leaves out are not explained."""
+    if not left_out:
+        return f"all {used} photos"
+    others = "the other" if left_out == 1 else "the others"
+    return f"{used} of {used + left_out} photos (the scene does not explain {others})"
 
 
 def _video(written: dict[str, Any]) -> list[str]:

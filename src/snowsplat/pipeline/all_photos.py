@@ -45,12 +45,14 @@ class LastPart:
     Attributes:
         gaussians: the scene; None if there was no last part.
         steps, photos: numbers of steps and of photos.
+        left_out: the number of photos that are left out, because the scene does not explain them.
         why_not: why there was no last part; "" if there was one.
     """
 
     gaussians: Gaussians | None
     steps: int
     photos: int
+    left_out: int = 0
     why_not: str = ""
 
 
@@ -74,7 +76,7 @@ def train_on_all(
         KeyboardInterrupt: Ctrl-C.
     """
     if (folder.path / "masks").is_dir():
-        return LastPart(None, 0, 0, "something moves in the photos")
+        return LastPart(None, 0, 0, why_not="something moves in the photos")
     scene = load_trained(folder.path, iteration=iteration, compute=compute)
     left_out = set(read_json(folder.path / "metrics.json").get("left_out", []))
     used = [view for view in scene.dataset.train if view.name not in left_out]
@@ -85,7 +87,7 @@ def train_on_all(
         pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
         steps = min(steps, int(seconds / pace)) if pace > 0 else 0
     if steps < _LOOKS * len(views):
-        return LastPart(None, 0, 0, "it would use each photo less than twice")
+        return LastPart(None, 0, 0, why_not="it would use each photo less than twice")
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
     with ImageLoader(views, device=background.device) as images:
         wrong = unexplained_views(
@@ -118,7 +120,8 @@ def train_on_all(
         trainer.run(observer.step)
     finally:
         observer.steps_end()
-    return LastPart(trainer.gaussians.detach(), steps, len(views))
+    photos = len(scene.dataset.train) + len(scene.dataset.test)
+    return LastPart(trainer.gaussians.detach(), steps, len(views), photos - len(views))
 
 
 def _last_config(

@@ -124,6 +124,8 @@ class MakeResult:
         renders, photos: folders with the rendered test views and the held-out photos.
         all_photos: the number of photos of the last part of the training, which follows the
             evaluation and uses the held-out photos, too; 0 if there was none.
+        left_out: the number of photos that the last part leaves out, because the scene does not
+            explain them.
         psnr, ssim, psnr_aligned: means over the held-out photos, before the last part; PSNR in
             dB. If gains of exposure are learnt, the colour-aligned PSNR tells the quality. None if
             no photos were held out.
@@ -142,6 +144,7 @@ class MakeResult:
     renders: Path
     photos: Path
     all_photos: int
+    left_out: int
     psnr: float | None
     ssim: float | None
     psnr_aligned: float | None
@@ -361,6 +364,7 @@ class _Job:
             renders=target / "renders",
             photos=target / "gt",
             all_photos=whole["photos"],
+            left_out=whole.get("left_out", 0),  # earlier versions did not say it
             psnr=scene.get("psnr"),
             ssim=scene.get("ssim"),
             psnr_aligned=scene.get("psnr_aligned"),
@@ -471,7 +475,7 @@ class _Job:
         last = train_on_all(folder, scene["iteration"], seconds, compute, self.observer)
         if last.gaussians is not None:
             write_gaussians(self.file, last.gaussians)
-        return {"steps": last.steps, "photos": last.photos, "why_not": last.why_not}
+        return {name: getattr(last, name) for name in ("steps", "photos", "left_out", "why_not")}
 
     def _minutes_left(self, given: float) -> float:
         """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""

@@ -155,6 +155,14 @@ def test_the_file_of_the_cameras_can_be_given(tmp_path):
     assert len(read(tmp_path / "bundle.out")[0]) == len(NAMES)
 
 
+def test_a_list_that_starts_with_its_length(tmp_path):
+    exports.bundler(tmp_path)
+    expected = [image.path.name for image in read(tmp_path)[0]]
+    file = tmp_path / "list.txt"
+    file.write_text(f"{len(NAMES) + 1}\n{file.read_text()}")
+    assert [image.path.name for image in read(tmp_path)[0]] == expected
+
+
 def test_photos_elsewhere_are_one_line(tmp_path):
     exports.realityscan(tmp_path)
     shutil.rmtree(tmp_path / "images")

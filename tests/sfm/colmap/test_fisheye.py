@@ -1,15 +1,20 @@
 """Photos of a fisheye lens are recognised by their matches, and their poses are found."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pycolmap
 import pytest
 
 from snowsplat.sfm.colmap.consistency import agreement, agreement_of_model
 from snowsplat.sfm.colmap.database import closing_database
+from snowsplat.sfm.colmap.features import Folders, WorkerProgress
 from snowsplat.sfm.colmap.fisheye import lens_evidence
 from snowsplat.sfm.colmap.lens import Lens, cameras_of, findings_of, with_all_parameters
 from snowsplat.sfm.colmap.mapping import Mapping
-from snowsplat.sfm.colmap.options import CAMERA_MODELS
+from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions
+from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.progress import silent
 from snowsplat.synthetic.lens import FisheyeLens
 from snowsplat.synthetic.lens import Lens as PhoneLens
@@ -21,6 +26,8 @@ pytestmark = pytest.mark.sfm
 # 150° from corner to corner, and an action camera's distortion.
 FISHEYE = FisheyeLens(walks.WIDTH, walks.HEIGHT, 305.0, (0.03, -0.008, 0.001, 0.0))
 WALK = walks.sideways(8, 700, FISHEYE)
+# A disc that spans 214°.
+WIDE = FisheyeLens(walks.WIDTH, walks.HEIGHT, 128.5, (0.0, 0.0, 0.0, 0.0))
 BARREL = PhoneLens(walks.WIDTH, walks.HEIGHT, 500.0, (-0.2, 0.05, 0.0, 0.0))
 
 
@@ -72,6 +79,25 @@ def test_photos_of_a_fisheye_lens_are_placed(tmp_path, lens):
     steps, true = (np.linalg.norm(c[:, None] - c[None], axis=-1) for c in (centres, WALK.centres))
     np.testing.assert_allclose(steps / steps.max(), true / true.max(), atol=0.005)
     assert agreement_of_model(model, database, 4.0) > 0.99
+
+
+def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
+    walk = walks.sideways(8, 700, WIDE)
+    photos = [replace(photo, circle=240.0) for photo in walk.photos(None)]
+    job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, WorkerProgress(silent))
+    lens = job._first_lens()  # without evidence from matches
+    assert lens.fisheyes == {1}
+    database = walk.write(tmp_path / "database.db", None, lens)
+    model = Mapping(database, tmp_path, 1.0, 1, silent).run("incremental")[0]
+    assert model.num_reg_images() == 8
+    (camera,) = model.cameras.values()
+    assert camera.mean_focal_length() == pytest.approx(WIDE.focal, rel=0.01)
+    # The matches of an ordinary attempt, which contradict its poses, do not hide the disc.
+    bent = SimpleNamespace(lens=Lens(), agreement=0.75)
+    assert "from a fisheye lens, but" in job._other_lens(bent)[0]
+    assert job._other_lens(SimpleNamespace(lens=Lens(), agreement=0.99)) == []
+    found = job._found_fisheye(SimpleNamespace(lens=lens))
+    assert found == "the photos are from a fisheye lens: the picture is a disc"
 
 
 def test_a_fisheye_lens_begins_with_few_parameters_and_a_prior():

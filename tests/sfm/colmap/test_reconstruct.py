@@ -44,7 +44,9 @@ def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
     progress = WorkerProgress(silent)
     job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, progress)
     job.attempts = [
-        SimpleNamespace(registered=n, agreement=share, error=1.0, lens=Lens())
+        SimpleNamespace(
+            registered=n, agreement=share, error=1.0, lens=Lens(), doubts=[], misfit=1.0
+        )
         for n, share in attempts
     ]
     assert job._good(SimpleNamespace(usable=10)) == good
@@ -55,9 +57,23 @@ def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
     job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
     fisheye = Lens(fisheyes=frozenset([1]))
     job.attempts = [
-        SimpleNamespace(registered=9, agreement=0.95, error=0.24, lens=fisheye),
-        SimpleNamespace(registered=10, agreement=0.99, error=0.62, lens=Lens()),
+        SimpleNamespace(registered=n, agreement=share, error=e, lens=lens, doubts=[], misfit=e)
+        for n, share, e, lens in ((9, 0.95, 0.24, fisheye), (10, 0.99, 0.62, Lens()))
     ]
     assert job._best() is job.attempts[0]
     job.attempts[1].error = 0.25
     assert job._best() is job.attempts[1]
+
+
+def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_path):
+    """A few photos of a flat field: with a wrong focal length, the poses are bent."""
+    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
+    job.attempts = [
+        SimpleNamespace(registered=5, agreement=0.79, error=0.69, misfit=1.10e-3, lens=Lens()),
+        SimpleNamespace(registered=5, agreement=0.75, error=0.61, misfit=1.00e-3, lens=Lens()),
+    ]
+    bent, other = job.attempts
+    bent.doubts, other.doubts = ["the focal length in EXIF does not agree with the photos"], []
+    assert job._best() is other
+    other.misfit = 1.2e-3  # the photos contradict the focal length in EXIF
+    assert job._best() is bent

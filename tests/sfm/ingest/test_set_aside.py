@@ -82,6 +82,19 @@ def test_bars_are_masked_if_the_photos_are_used_in_place(tmp_path):
     assert {path.name: path.read_bytes() for path in source.iterdir()} == before
 
 
+def test_the_radius_of_a_disc_is_known_in_pixels_of_the_photo(tmp_path):
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    radius = 0.45 * HEIGHT
+    dark = np.hypot(columns - WIDTH / 2, rows - HEIGHT / 2) > radius
+    made = pictures()
+    for picture in made:
+        picture[dark] = 0
+    large = [np.kron(picture, np.ones((2, 2, 1), np.uint8)) for picture in made]
+    photos = gathered(folder_of(tmp_path / "p", large), tmp_path / "out").photos
+    assert photos[0].width == 2 * WIDTH
+    assert [photo.circle for photo in photos] == pytest.approx([2 * radius] * 8, rel=0.03)
+
+
 def test_a_logo_is_masked_together_with_the_masks_of_the_user(tmp_path):
     source = folder_of(tmp_path / "p", with_logo())
     own = np.full((HEIGHT, WIDTH), 255, np.uint8)

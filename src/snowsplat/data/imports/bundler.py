@@ -65,6 +65,8 @@ def _names(path: Path, root: Path, count: int) -> list[str]:
     lists = [f for folder in folders for p in ("*.lst", "*.txt") for f in sorted(folder.glob(p))]
     for file in lists:
         names = [line.strip() for line in load_text(file).splitlines() if line.strip()]
+        if names[:1] == [str(count)]:  # some lists start with their length
+            names = names[1:]
         names = [_FOCAL.sub("", name) for name in names]
         if len(names) == count and all("." in name[-6:] for name in names):
             return names

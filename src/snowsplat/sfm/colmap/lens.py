@@ -35,6 +35,8 @@ _MIN_PHOTOS_FOR_OPENCV = 8
 GUESSED_FOCAL = 0.8
 # The same for a fisheye lens: its longest side spans 115°.
 _GUESSED_FISHEYE = 0.5
+# A lens whose picture is a disc spans about this angle: 180° to 220°.
+_CIRCLE = 190.0
 # Models without coefficients; a fisheye lens then begins without one, too.
 _EQUIDISTANT = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_PINHOLE")
 # A fisheye lens sees behind itself by this angle at most. Degrees from the axis.
@@ -53,9 +55,9 @@ _MAX_STRETCH = 1.3
 # An ordinary lens moves pixels outwards or inwards. If it does both ("moustache" distortion), the
 # second one compensates the first one by at most this share of the distance from the centre.
 _MAX_MOUSTACHE = 0.02
-# Two focal lengths agree equally well with the matches if the reprojection errors differ by less
-# than this share. Small systematic errors (rolling shutter, things that move) have this effect.
-_EQUAL_ERROR = 0.05
+#: Two focal lengths agree equally well with the matches if the reprojection errors differ by less
+#: than this share. Small systematic errors (rolling shutter, things that move) have this effect.
+EQUAL_ERROR = 0.05
 # A possible lens is used instead of an impossible one up to this factor between the errors.
 _MAX_WORSE = 2.0
 # fx and fy are in doubt if they differ by more than this share. Sensors have square pixels within
@@ -197,6 +199,16 @@ def focals_by_camera(photos: Sequence[Photo], focals: Mapping[int, float]) -> di
         if image_id in focals:
             values.setdefault(camera, []).append(focals[image_id])
     return {camera: float(np.median(known)) for camera, known in values.items()}
+
+
+def circle_focals(photos: Sequence[Photo]) -> dict[int, float]:
+    """The focal length in pixels of each camera whose picture is a disc; others are left out.
+
+    It is that of an equidistant fisheye lens whose disc spans `_CIRCLE`.
+    """
+    per_pixel = 1 / np.radians(_CIRCLE / 2)
+    circles = {i: p.circle * per_pixel for i, p in enumerate(photos, 1) if p.circle is not None}
+    return focals_by_camera(photos, circles)
 
 
 def pixels_per_radian(camera: pycolmap.Camera) -> float:
@@ -357,7 +369,7 @@ def settled(
 
     free, held = _with_square_pixels(refined(False), lens, refine), refined(True)
     ratio = misfit(held) / misfit(free)
-    if not _impossible(held) and ratio <= 1 + _EQUAL_ERROR:
+    if not _impossible(held) and ratio <= 1 + EQUAL_ERROR:
         return Settled(held, True, [])
     if not _impossible(free):
         return Settled(free, False, _doubts(free, known))
@@ -385,7 +397,7 @@ def _with_square_pixels(
     # The errors of the photos of other cameras hardly change, so they do not count.
     photos = [model.image(i).camera_id for i in model.reg_image_ids()]
     share = sum(number in unequal for number in photos) / len(photos)
-    worse = misfit(made) > (1 + _EQUAL_ERROR * share) * misfit(model)
+    worse = misfit(made) > (1 + EQUAL_ERROR * share) * misfit(model)
     return model if worse or _impossible(made) else made
 
 

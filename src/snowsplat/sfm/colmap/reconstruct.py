@@ -17,8 +17,9 @@ repeated with them.
 After the first four, bundle adjustment shows whether one focal length fits all photos of a camera.
 If not, the attempt is made with several, which remain for the others (`camera_groups`).
 
-Before the first attempt, the matches tell whether a camera has a fisheye lens (`fisheye`). If this
-attempt is not good, it is also made with an ordinary lens, and the better model decides.
+Before the first attempt, the matches tell whether a camera has a fisheye lens (`fisheye`); so does
+the picture, if it is a disc. If this attempt is not good, it is also made with an ordinary lens,
+and the better model decides.
 
 The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
 are verified again without it.
@@ -59,11 +60,14 @@ from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_ev
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
 from snowsplat.sfm.colmap.fisheye import LensEvidence, lens_evidence
 from snowsplat.sfm.colmap.lens import (
+    EQUAL_ERROR,
     Lens,
     Refine,
     camera_ids,
+    circle_focals,
     exif_focals,
     focals_by_camera,
+    misfit,
     settled,
     with_all_parameters,
 )
@@ -126,6 +130,11 @@ class Attempt:
         """The mean reprojection error of the first model, in pixels of the photos."""
         return self.models[0].compute_mean_reprojection_error() if self.models else float("inf")
 
+    @property
+    def misfit(self) -> float:
+        """`lens.misfit` of the first model."""
+        return misfit(self.models[0]) if self.models else float("inf")
+
 
 class PoseEstimation:
     """The attempts for one set of photos. `run` makes them and writes the best result."""
@@ -184,7 +193,7 @@ class PoseEstimation:
                 f"the poses may be bent: where they fit least, {best.agreement:.0%} of the matches "
                 "between neighbouring photos agree with them"
             )
-        doubts = doubts or self._other_lens(best)
+        doubts += self._other_lens(best)
         return dataclasses.replace(
             result, doubts=doubts, zooms=zooms, fisheye=self._found_fisheye(best)
         )
@@ -251,46 +260,60 @@ class PoseEstimation:
         """The attempt with the most registered photos, weighted by the share of correct matches.
 
         A model that is bent, because photos were registered with too few points, may have all
-        photos. So may a model of the wrong kind of lens, but it has larger errors.
+        photos. So may a model of the wrong kind of lens, but it has larger errors. A lens in doubt,
+        for example because of EXIF, is right only if no other lens agrees equally well with the
+        matches.
         """
         least = min(attempt.error for attempt in self.attempts)
         lenses = {attempt.lens.any_fisheye for attempt in self.attempts}
 
+        undoubted = min((a.misfit for a in self.attempts if not a.doubts), default=float("inf"))
+
         def score(attempt: Attempt) -> float:
             wrong_lens = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
+            if attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit:
+                wrong_lens = True
             return attempt.registered * attempt.agreement * (0.5 if wrong_lens else 1.0)
 
         return max(self.attempts, key=score)
 
     def _first_lens(self) -> Lens:
-        """The lens of the first attempt, with the focal lengths that the matches propose."""
-        lens, found = Lens(self.options.camera_model), self.lens_evidence
+        """The lens of the first attempt, with the focal lengths that discs and matches propose."""
+        lens, circles = Lens(self.options.camera_model), circle_focals(self.photos)
+        proposed = {number: found.focal for number, found in self.lens_evidence.items()}
+        sure = {n: focal for n, focal in proposed.items() if self.lens_evidence[n].fisheye}
         if lens.model == "auto":
-            found = {number: evidence for number, evidence in found.items() if evidence.fisheye}
-            lens = dataclasses.replace(lens, fisheyes=frozenset(found))
-        elif not lens.any_fisheye:
+            focals = circles | sure
+            return dataclasses.replace(lens, fisheyes=frozenset(focals), focals=focals)
+        if not lens.any_fisheye:
             return lens
-        focals = {number: evidence.focal for number, evidence in found.items()}
-        return dataclasses.replace(lens, focals=focals)
+        return dataclasses.replace(lens, focals=proposed | circles | sure)
 
     def _found_fisheye(self, best: Attempt) -> str:
         """`SfmResult.fisheye` of the attempt ``best``."""
         if not best.lens.fisheyes:
             return ""
         count = sum(number in best.lens.fisheyes for number in camera_ids(self.photos))
-        gain = min(self.lens_evidence[number].gain for number in best.lens.fisheyes) - 1
         which = "the photos are" if count == len(self.photos) else f"{count} photos are"
+        found = [self.lens_evidence.get(number) for number in best.lens.fisheyes]
+        gains = [evidence.gain for evidence in found if evidence is not None and evidence.fisheye]
+        if len(gains) < len(found):
+            return f"{which} from a fisheye lens: the picture is a disc"
         return (
-            f"{which} from a fisheye lens: {gain:.0%} more matches agree with one than with any "
-            "ordinary lens"
+            f"{which} from a fisheye lens: {min(gains) - 1:.0%} more matches agree with one than "
+            "with any ordinary lens"
         )
 
     def _other_lens(self, best: Attempt) -> list[str]:
         """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
-        The model FOV describes fisheye lenses, too."""
+
+        The model FOV describes fisheye lenses, too. An endoscope shows a disc without one: if poses
+        of an ordinary lens agree with the matches, there is no doubt.
+        """
         if best.lens.any_fisheye or best.lens.model == "FOV":
             return []
-        if not any(evidence.fisheye for evidence in self.lens_evidence.values()):
+        disc = best.agreement < CONSISTENT and any(photo.circle for photo in self.photos)
+        if not disc and not any(evidence.fisheye for evidence in self.lens_evidence.values()):
             return []
         return [
             "the photos seem to be from a fisheye lens, but their poses were estimated with an "

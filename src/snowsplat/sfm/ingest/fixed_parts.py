@@ -92,13 +92,14 @@ class FixedParts:
         bars: widths of the bars at the left, top, right and bottom, in pixels of the copy.
         fixed: (H, W) bool, whether a pixel of the copy shows no scene; includes the bars.
         backdrop: the background, if it stands still and only an object in front of it moves.
-        circle: ``fixed`` is what is outside of an image circle (`image_circle`).
+        circle: the radius of the image circle (`image_circle`) in pixels of the copy; ``fixed`` is
+            what is outside. None: there is none.
     """
 
     bars: tuple[int, int, int, int]
     fixed: NDArray[np.bool_]
     backdrop: Backdrop | None
-    circle: bool = False
+    circle: float | None = None
 
     @property
     def crop(self) -> Crop | None:
@@ -142,7 +143,8 @@ def find_fixed_parts(copies: NDArray[np.uint8]) -> FixedParts | None:
         return None
     circle = find_image_circle(copies)
     if circle is not None:
-        return FixedParts((0, 0, 0, 0), circle.outside(copies.shape[1:]), None, circle=True)
+        outside = circle.outside(copies.shape[1:])
+        return FixedParts((0, 0, 0, 0), outside, None, circle=circle.radius)
     bars = _bars(copies)
     inner = _inner(copies.shape[1:], bars)
     fixed = np.ones(copies.shape[1:], bool)
@@ -316,7 +318,7 @@ def describe_bars(parts: FixedParts, cropped: bool, where: str) -> str:
 def describe(parts: FixedParts, cropped: bool, where: str) -> list[str]:
     """What is fixed to the frame, and what was done about it; ``where``: e.g. "all 14 photos"."""
     lines = [describe_bars(parts, cropped, where)] if any(parts.bars) else []
-    if parts.circle:
+    if parts.circle is not None:
         lines.append(f"the picture is a disc, as of a fisheye lens: its outside masked in {where}")
     elif parts.backdrop is not None:
         lines.append(

@@ -40,3 +40,4 @@ class Photo:
     attitude: Attitude | None = None
     panorama: bool = False  # equirectangular, of all directions
     turned: int = 1  # EXIF orientation if the pixels in input/ are not upright
+    circle: float | None = None  # radius in pixels, if the picture is a disc, as of a fisheye lens

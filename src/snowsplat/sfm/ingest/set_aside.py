@@ -81,6 +81,9 @@ def set_fixed_parts_aside(
                 fixed = parts.overlays if cropped else parts.fixed
                 if parts.backdrop is not None:
                     fixed = parts.backdrop.seen_in(_copy(dataset / "input" / photo.name))
+                if parts.circle is not None:
+                    radius = parts.circle * photo.width / fixed.shape[1]
+                    photo = replace(photo, circle=radius)
                 return _cropped_and_masked(photo, dataset, box, fixed)
 
             for photo in pool.map(work, group):
