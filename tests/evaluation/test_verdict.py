@@ -27,9 +27,12 @@ def test_lines():
     assert Verdict.of([REMARK, FEW]).lines("the photos") == [
         "the photos: usable, with limits",
         "  - 11 photos are few",
-        "  - all photos show one side",
+        "  also: all photos show one side",
         "  next time: take more",
     ]
+    assert Verdict.of([REMARK]).lines("it") == ["it: good", "  - all photos show one side"]
+    box = "".join(ET.fromstring(Verdict.of([REMARK, FEW]).html("the photos")).itertext())
+    assert "11 photos are fewAlso: all photos show one side" in box
 
 
 def test_html_is_escaped():

@@ -83,13 +83,19 @@ class Verdict:
         """The verdict as lines for a terminal. ``what``: what is judged, such as "the photos"."""
         return [
             f"{what}: {self.grade}{_MEANING[self.grade]}",
-            *(f"  - {reason.text}" for reason in self.told),
+            *(f"  {self._mark(reason)} {reason.text}" for reason in self.told),
             *(f"  next time: {advice}" for advice in self.advice),
         ]
 
+    def _mark(self, reason: Reason) -> str:
+        """What stands before a reason: "also:" before a remark that is none for this grade."""
+        return "-" if self.grade == "good" or reason.grade != "good" else "also:"
+
     def html(self, what: str) -> str:
         """The verdict as a box of a page with `STYLE`."""
-        reasons = "".join(f"<li>{text(_sentence(reason.text))}</li>" for reason in self.told)
+        marked = [(self._mark(reason), reason.text) for reason in self.told]
+        told = [why if mark == "-" else f"{mark} {why}" for mark, why in marked]
+        reasons = "".join(f"<li>{text(_sentence(why))}</li>" for why in told)
         advice = "".join(f"<li>{text(_sentence(advice))}</li>" for advice in self.advice)
         return (
             f'<div class="verdict {self.grade}"><b>{text(_sentence(what))}: {self.grade}</b>'
