@@ -80,7 +80,6 @@ class Convert(Reports):
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch, with_flags
+from snowsplat.cli.flags import Threads, flag, switch, with_flags
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, PageFlags
@@ -86,8 +86,7 @@ class Make(Reports):
     ] = None
     """Whether to learn a gain for each photo and colour channel, for photos with different
     exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to train on."""
     memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
@@ -101,9 +100,7 @@ class Make(Reports):
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""

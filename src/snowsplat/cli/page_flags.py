@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 from urllib.parse import urlsplit
 
 import tyro
@@ -19,7 +19,11 @@ from snowsplat.viewer.hosts import LOCAL_HOST
 if TYPE_CHECKING:
     from snowsplat.pipeline.run.live_page import LivePage
 
-AllowHost = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("NAME")]
+AllowHost: TypeAlias = Annotated[
+    tuple[str, ...],
+    tyro.conf.UseAppendAction,
+    flag("NAME", help="Name of a proxy through which browsers open the page. Can be repeated."),
+]
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,6 @@ class Render(SceneFlags, Reports):
     video: Annotated[Path | None, flag("FILE.mp4", "--film", default="in OUT/videos")] = None
     """File to which the video is written."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code, 0."""

@@ -38,7 +38,6 @@ class Train(TrainFlags, Reports):
     """
 
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""

@@ -10,7 +10,7 @@ import tyro
 
 from snowsplat.cli.config_file import training_in
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, ConfigFlags, RecipeName
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Quiet, flag, switch
 from snowsplat.cli.page_flags import AllowHost
 from snowsplat.util.errors import UserError
 
@@ -63,7 +63,6 @@ class JobFlags:
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
     """Memory limit of the training, for example 4GB. On a GPU, this is memory of the GPU; on the
@@ -97,8 +96,7 @@ class JobFlags:
     ] = ()
     """Also write loss, number of Gaussians and metrics of the steps: csv: to OUT/log.csv;
     tensorboard: to OUT/tensorboard, which needs the package snowsplat[tensorboard]."""
-    quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result and no progress."""
+    quiet: Quiet = False
 
 
 @dataclass

@@ -32,7 +32,6 @@ class Watch(SceneFlags):
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     def run(self) -> int:
         """Runs until Ctrl-C; returns the exit code, 0."""
