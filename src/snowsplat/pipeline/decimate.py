@@ -28,10 +28,7 @@ _STEPS = 60
 
 
 def gaussians_to_keep(decimate: int | str, count: int) -> int:
-    """How many of ``count`` Gaussians ``decimate`` keeps.
-
-    Args:
-        decimate: a number such as 5000 or "5000", or a percentage such as "50%".
+    """How many of ``count`` Gaussians a number (5000, "5000") or a percentage ("50%") keeps.
 
     Raises:
         SettingError: ``decimate`` is neither.
@@ -82,13 +79,10 @@ class Decimation:
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))
 
-        self.observer.steps_begin(0, _STEPS)
-        try:
+        with self.observer.stepping(0, _STEPS):
             whole = seen_from_dataset(scene, self.origin).select(scene.usable_rows())
             color = torch.tensor(self.background)
             return distill(smaller, whole, self.cameras, color, _STEPS, report)
-        finally:
-            self.observer.steps_end()
 
 
 def write_within(
@@ -99,9 +93,6 @@ def write_within(
     decimation: Decimation,
 ) -> None:
     """Write ``scene`` with so many Gaussians that the file ``target`` has at most ``size`` bytes.
-
-    Args:
-        write: writes a scene to a path.
 
     Raises:
         SettingError: even one Gaussian needs more.

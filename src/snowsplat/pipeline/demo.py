@@ -18,10 +18,8 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Outcome
 
 PHOTOS, TRUTH, MADE = "photos", "truth", "made"
-MAX_DEGREES = 0.1  # largest accepted rotation error of a photo
-MAX_SHARE = (
-    0.002  # largest accepted position error of a photo, relative to the extent of the cameras
-)
+# Largest accepted errors of a photo: rotation, and position relative to the extent of the cameras.
+MAX_DEGREES, MAX_SHARE = 0.1, 0.002
 _OPTIONS = MakeOptions(quality="normal", minutes=2.2)
 
 

@@ -58,11 +58,7 @@ def refine(
         max_gaussians=max(1, len(gaussians)),
         antialias=gaussians.antialiased,
     )
-    config = replace(config, learning_rates=_RATES)
-    trainer = Trainer(dataset, config, initial=gaussians.clone())
-    observer.steps_begin(0, _STEPS)
-    try:
+    trainer = Trainer(dataset, replace(config, learning_rates=_RATES), initial=gaussians.clone())
+    with observer.stepping(0, _STEPS):
         trainer.run(observer.step)
-    finally:
-        observer.steps_end()
     return trainer.gaussians.detach()

@@ -39,14 +39,9 @@ def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> Po
     aligned = similarity.apply_to_poses(found_poses)
     extent = float(torch.cdist(true_centres, true_centres).max())
     distances = (invert_rigid(aligned)[..., 3] - true_centres).norm(dim=1)
-    return PoseErrors(
-        names=names,
-        missing=sorted(true.keys() - found.keys()),
-        rotations=_angles(aligned[..., :3], true_poses[..., :3]),
-        centres=distances / extent,
-        extent=extent,
-        true_from_found=similarity,
-    )
+    missing = sorted(true.keys() - found.keys())
+    rotations = _angles(aligned[..., :3], true_poses[..., :3])
+    return PoseErrors(names, missing, rotations, distances / extent, extent, similarity)
 
 
 def _angles(a: Tensor, b: Tensor) -> Tensor:

@@ -87,12 +87,8 @@ def write_synthetic_photos(
 ) -> Truth:
     """Render photos ``IMG_0001.jpg`` … of a still life into ``folder``, in two rounds around it.
 
-    Equal arguments produce equal photos. Existing photos are kept.
-
-    Args:
-        seed: seed of the scene and of the path.
-        distortion: k1, k2, p1, p2 of COLMAP's model OPENCV.
-        report: progress callback.
+    Equal arguments produce equal photos. Existing photos are kept. ``seed``: of the scene and of
+    the path. ``distortion``: k1, k2, p1, p2 of COLMAP's model OPENCV.
     """
     lens = phone_lens(width, height, distortion)
     return take_photos(folder, lambda: still_life(seed), lens, walk(n_views, seed), seed, report)
@@ -114,10 +110,8 @@ def fisheye_lens(
     angle: float,
     distortion: tuple[float, float, float, float] = _FISHEYE_DISTORTION,
 ) -> FisheyeLens:
-    """A fisheye lens that fills the frame.
-
-    ``angle``: the field of view in degrees from corner to corner; without distortion.
-    """
+    """A fisheye lens that fills the frame; ``angle``: its field of view in degrees from corner to
+    corner, without distortion."""
     focal = math.hypot(width, height) / 2 / math.radians(angle / 2)
     return FisheyeLens(width, height, focal, distortion)
 
@@ -203,13 +197,7 @@ def photograph(
     passing: Scene | None = None,
     shutter: Shutter | None = None,
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB, with the noise of a small image sensor.
-
-    Args:
-        random: draws the noise.
-        passing: more objects, which cast no shadow on the scene.
-        shutter: None: everything is sharp.
-    """
+    """(H, W, 3) uint8 sRGB, with the noise of a small image sensor; see `take_photos`."""
     world_from_cam = invert_rigid(cam_from_world).numpy()
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
     spread = 1 / (lens.focal * _RAYS)

@@ -98,11 +98,7 @@ class Scene:
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distances (R,) float32 to the first hits along rays, in metres; infinite without a hit.
 
-        Glass is no hit.
-
-        Args:
-            origins: (3, 1) or (3, R) float32, metres.
-            directions: (3, R) float32, of length 1.
+        Glass is no hit. ``origins`` and ``directions``: see `radiance`.
         """
         candidates = self._candidates(origins, directions)
         solid = [i for i in candidates if i not in self._panes]
@@ -168,12 +164,8 @@ class Scene:
     ) -> None:
         """Add the light that surfaces reflect to ``colours`` (3, R), in place.
 
-        Args:
-            rays: (M,) indices of the rays that hit the surfaces.
-            owner: (M,) indices of their shapes.
-            positions: (3, M).
-            normals: (3, R).
-            directions: (3, R).
+        ``rays`` (M,) are the indices of the rays that hit the surfaces, at ``positions`` (3, M),
+        and ``owner`` (M,) those of their shapes; ``normals`` and ``directions`` (3, R) of all rays.
         """
         if not len(rays):
             return

@@ -26,17 +26,12 @@ _SAMPLES_PER_FRAME = 20
 def training_path(
     cameras: Sequence[Camera], names: Sequence[str], frames: int, distance: float
 ) -> list[Camera]:
-    """The smoothed path of the photographer.
+    """The smoothed path of the photographer, in ``frames`` frames.
 
     Photos that were taken in portrait format are rotated to match their neighbours. All frames have
-    the field of view of the median photo.
-
-    Args:
-        cameras: the training cameras.
-        names: the names of the photos. If they are not in the order of a path, a short tour
-            through the cameras is used.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    the field of view of the median photo. If the ``names`` of the photos are not in the order of a
+    path, a short tour through the cameras is used. ``distance``: world units from the cameras to
+    what they see.
 
     Raises:
         UserError: all cameras have the same position and direction.
@@ -53,26 +48,16 @@ def key_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Ca
     """A smooth path through key cameras, in their order and with their fields of view.
 
     If the last key is the same as the first, the path is a closed loop without a corner. The frames
-    have the image size of the first camera.
-
-    Args:
-        cameras: the keys.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    have the image size of the first camera. ``distance``: world units from the cameras to what they
+    see.
 
     Raises:
         UserError: fewer than two keys differ.
     """
     lens = cameras[0]
-    zooms = [[math.log(camera.fx / camera.width)] for camera in cameras]
-    return _path(
-        lens,
-        positions_of(cameras),
-        rotations_of(cameras),
-        torch.tensor(zooms, dtype=torch.float64),
-        frames,
-        distance,
-    )
+    logs = [[math.log(camera.fx / camera.width)] for camera in cameras]
+    zooms = torch.tensor(logs, dtype=torch.float64)
+    return _path(lens, positions_of(cameras), rotations_of(cameras), zooms, frames, distance)
 
 
 def _same_roll(rotations: Tensor, up: Tensor) -> Tensor:

@@ -43,16 +43,11 @@ _Path = Callable[[Tensor], Tensor]
 
 
 def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Camera]:
-    """An ellipse near the training cameras, around their focus.
+    """An ellipse near the training cameras, around their focus, in ``frames`` frames.
 
     If the cameras surround the focus, the ellipse is horizontal, at their median height. Otherwise
     it is a vertical oval in front of the focus. Its width and height are the ranges of azimuth and
-    elevation that the cameras cover.
-
-    Args:
-        cameras: the training cameras.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    elevation that the cameras cover. ``distance``: world units from the cameras to what they see.
     """
     up, focus = up_of(cameras), focus_of(cameras, distance)
     from_focus = positions_of(cameras) - focus
@@ -87,9 +82,8 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
         azimuth = middle + mid_azimuth + swing * angle.sin()
         elevation = (mid_elevation + rise * angle.cos()).clamp(-_STEEPEST, _STEEPEST)
         x, y = elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin()
-        return focus + radius * (
-            x[:, None] * east + y[:, None] * north + elevation.sin()[:, None] * up
-        )
+        flat = x[:, None] * east + y[:, None] * north
+        return focus + radius * (flat + elevation.sin()[:, None] * up)
 
     return _looking_at(focus, up, oval, typical(cameras), frames)
 
@@ -97,10 +91,7 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
 def spiral_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Camera]:
     """A spiral for cameras that look in one direction: from their middle outwards and back.
 
-    Args:
-        cameras: the training cameras.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    ``distance``: world units from the cameras to what they see.
 
     Raises:
         UserError: the cameras look in different directions.
@@ -134,12 +125,8 @@ def orbit_path(
 ) -> list[Camera]:
     """A horizontal circle around a scene whose cameras are not known; −y is up.
 
-    Args:
-        points: (P, 3) means of the Gaussians.
-        weights: (P,) their opacities.
-        frames: number of frames.
-        width: width of the images in pixels.
-        height: height of the images in pixels.
+    ``points`` (P, 3) are the means of the Gaussians, ``weights`` (P,) their opacities. The images
+    have ``width`` × ``height`` pixels.
 
     Raises:
         UserError: there are no points.

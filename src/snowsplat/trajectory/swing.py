@@ -15,15 +15,10 @@ _SWING = math.radians(4)
 
 
 def swing_path(camera: Camera, distance: float, frames: int) -> list[Camera]:
-    """Cameras on an ellipse around the position of ``camera``, in its image plane.
+    """``frames`` cameras on an ellipse around the position of ``camera``, in its image plane.
 
-    All frames look at the point at ``distance`` on its optical axis, so that this point does not
-    move in the image. The ellipse is half as high as it is wide.
-
-    Args:
-        camera: the camera of the photo.
-        distance: world units, positive.
-        frames: number of frames of the closed path, at least 1.
+    All look at the point at ``distance`` (world units) on its optical axis, so that this point does
+    not move in the image. The ellipse is half as high as it is wide.
     """
     angles = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
     radius = distance * math.tan(_SWING)

@@ -67,8 +67,7 @@ class KnownHosts:
     def include_page(self, origin: str, host: str) -> bool:
         """Whether, by the Origin and Host headers, the requesting page comes from this server.
 
-        A proxy may replace the Host header, but not the Origin header. So the page also comes from
-        this server if its origin is an allowed name.
+        A proxy may replace the Host header, but not the Origin header: an allowed name is enough.
         """
         scheme, _, place = origin.lower().partition("://")
         if scheme not in ("http", "https"):

@@ -66,16 +66,11 @@ class Arrangement:
 def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arrangement:
     """At most ``count`` Gaussians of the subject of a scene, in the frame of the globe.
 
-    The subject is at the focus of the cameras. Without cameras, it is at the median of the
-    Gaussians, and −y is up. It is scaled so that it fills the globe. It stands on the floor of the
-    globe: the largest horizontal surface near the focus becomes the floor or, without such a
+    The subject is at the focus of the cameras of the photos. Without cameras, it is at the median
+    of the Gaussians, and −y is up. It is scaled so that it fills the globe. It stands on the floor
+    of the globe: the largest horizontal surface near the focus becomes the floor or, without such a
     surface, the lowest Gaussians do. What is outside of the glass or below the floor is left out,
     as are isolated Gaussians. Opacities decrease towards the glass.
-
-    Args:
-        gaussians: the scene.
-        cameras: the cameras of its photos; may be empty.
-        count: maximum number of Gaussians.
 
     Raises:
         UserError: no Gaussians are left.

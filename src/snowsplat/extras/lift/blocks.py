@@ -117,13 +117,14 @@ def _leaves(errors: dict[int, Tensor], limit: float, known: Tensor) -> dict[int,
     covered = torch.zeros_like(chosen[_LARGEST])
     for side, accepted in chosen.items():
         chosen[side] = accepted & ~covered
-        covered = _doubled(accepted | covered)
+        covered = _enlarged(accepted | covered, 2)
     height, width = known.shape
     return chosen | {1: known & ~covered[:height, :width]}
 
 
-def _doubled(mask: Tensor) -> Tensor:
-    return mask.repeat_interleave(2, 0).repeat_interleave(2, 1)
+def _enlarged(blocks: Tensor, side: int) -> Tensor:
+    """(h, w) -> (h · side, w · side): a value for each pixel of the blocks."""
+    return blocks.repeat_interleave(side, 0).repeat_interleave(side, 1)
 
 
 def _numbered(chosen: dict[int, Tensor]) -> Blocks:
@@ -134,7 +135,7 @@ def _numbered(chosen: dict[int, Tensor]) -> Blocks:
     for side, mask in chosen.items():
         ids = torch.full(mask.shape, -1, dtype=torch.int64)
         ids[mask] = torch.arange(int(mask.sum())) + count
-        ids = ids.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width]
+        ids = _enlarged(ids, side)[:height, :width]
         owner = torch.where(ids >= 0, ids, owner)
         sizes += [float(side)] * int(mask.sum())
         count = len(sizes)

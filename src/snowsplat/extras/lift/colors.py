@@ -29,11 +29,7 @@ def match_photo(
     Nesterov's momentum (Beck and Teboulle 2009). The backward pass of the rasterizer computes
     Wᵀ x. Gaussians that are not visible keep their colours.
 
-    Args:
-        gaussians: of SH degree 0.
-        camera: the camera of the photo.
-        photo: (H, W, 3) in 0..1.
-        steps: number of gradient steps.
+    ``gaussians`` have the SH degree 0; ``photo`` (H, W, 3) is in 0..1.
     """
     colors = gaussians.base_colors.clamp(0.0, 1.0)
     # The scaling bounds the step by the mean of a row of Wᵀ W, which its largest row may exceed.

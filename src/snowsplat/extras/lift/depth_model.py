@@ -93,9 +93,8 @@ def _run_transformers(model: Path, photo: Tensor) -> Any:
     try:
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
     except ImportError:
-        raise UserError(
-            f"{model}: this model needs a package; run pip install transformers"
-        ) from None
+        what = "this model needs a package; run pip install transformers"
+        raise UserError(f"{model}: {what}") from None
     try:
         # Only files of this folder are read, and no code in it is executed.
         processor = AutoImageProcessor.from_pretrained(model, local_files_only=True)

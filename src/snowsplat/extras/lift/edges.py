@@ -79,13 +79,8 @@ def _between(depth: Tensor, right: Tensor) -> Tensor:
 def resize_depth(
     depth: Tensor, width: int, height: int, threshold: float = EDGE_THRESHOLD
 ) -> Tensor:
-    """The depth map at another size: bilinear on surfaces, the nearest value at discontinuities.
-
-    Args:
-        depth: (H, W) positive; NaN where it is unknown.
-
-    Returns:
-        (height, width).
+    """(height, width): the depth map (H, W) at another size: bilinear on surfaces, the nearest
+    value at discontinuities. Depths are positive; NaN where they are unknown.
     """
     if depth.shape == (height, width):
         return depth

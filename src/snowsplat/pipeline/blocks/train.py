@@ -84,9 +84,8 @@ def train_blocks(
             with one_run(folder / block.name):
                 if not is_finished(out):  # by another process, a moment ago
                     on_block(f"{block.name}: {block.views} photos, {block.points:,} points")
-                    results.append(
-                        _train(folder, plan, block, compute or Compute(), memory, observer)
-                    )
+                    compute = compute or Compute()
+                    results.append(_train(folder, plan, block, compute, memory, observer))
         except InUse as error:
             elsewhere.append(error)
             on_block(str(error))

@@ -125,11 +125,7 @@ def joined(device: torch.device) -> Iterator[Shards]:
 def follow(
     shards: Shards, device: torch.device, parts: Sequence[Part] = (), loss: Loss | None = None
 ) -> None:
-    """Take part in the training of process 0, until it ends.
-
-    Args:
-        parts, loss: as those of process 0.
-    """
+    """Take part in the training of process 0, until it ends; ``parts`` and ``loss`` as there."""
     from snowsplat.pipeline.run.collective import Collective
     from snowsplat.training.core.checkpoint import load
     from snowsplat.training.core.finite import Diverged
@@ -203,8 +199,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
 def _wait(running: Sequence[subprocess.Popen[bytes]]) -> int | None:
     """Wait until all processes have ended, or a while after one of them has failed.
 
-    Returns:
-        The first process that has failed, except for those that lost the connection to it.
+    Returns the first process that has failed, except for those that lost the connection to it.
     """
     # Ctrl-C reaches the processes, too. They save the scene and end.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

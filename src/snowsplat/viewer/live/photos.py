@@ -58,8 +58,7 @@ class Photos:
         """
         Args:
             train, test: with cameras in the frame of the page, see `NetworkViewer`.
-            extent: extent of the scene in that frame.
-            centre: (3,) centre of the scene, around which a browser rotates.
+            extent, centre: of the scene in that frame; (3,), around which a browser rotates.
             background: (3,) colour behind transparent photos, 0..1.
         """
         self.views = [*train, *test]

@@ -30,17 +30,11 @@ class _Server(viser.ViserServer):
 
 @dataclass(frozen=True)
 class RunningServer:
-    """A server and its address.
-
-    Attributes:
-        url: the URL for browsers on this machine; if a host name was given, also for other
-        machines.
-        others: the URLs for other machines, if they are different ones.
-    """
+    """A server and its address."""
 
     server: viser.ViserServer
-    url: str
-    others: list[str]
+    url: str  # for browsers on this machine; with a host name, also for other machines
+    others: list[str]  # the URLs for other machines, if they are different ones
     guard: Guard
 
     def open(self) -> None:

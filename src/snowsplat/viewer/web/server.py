@@ -266,7 +266,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _web_server(self) -> _Server:
-        """`server` with its type."""
         return cast(_Server, self.server)
 
     def _answer(self, with_body: bool) -> None:

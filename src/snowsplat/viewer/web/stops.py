@@ -54,13 +54,10 @@ class Stops(NamedTuple):
 def stops_of(
     gaussians: Gaussians, cameras: Sequence[Camera], depth: float, background: Sequence[float]
 ) -> Stops:
-    """The stops of a scene.
+    """The stops of a scene, with the ``cameras`` of the photos in their order.
 
-    Args:
-        cameras: of the photos, in their order. Without cameras, there are no stops, and the subject
-            is the `bound` of the scene.
-        depth: the distance of the targets of the views.
-        background: red, green, blue in 0..1.
+    Without cameras, there are no stops, and the subject is the `bound` of the scene. ``depth``: the
+    distance of the targets of the views. ``background``: red, green, blue in 0..1.
     """
     if not cameras:
         return Stops([], b"", *bound(gaussians), [])
