@@ -55,9 +55,7 @@ class Blocks:
     """
 
     action: Annotated[
-        Literal["plan", "train", "merge"] | None,
-        tyro.conf.Positional,
-        flag("{plan,train,merge}"),
+        Literal["plan", "train", "merge"] | None, tyro.conf.Positional, flag("{plan,train,merge}")
     ] = None
     """plan: cut a dataset into blocks; train: train blocks; merge: join their scenes."""
     path: Annotated[Path | None, tyro.conf.Positional, flag("DATASET|OUT")] = None

@@ -37,8 +37,7 @@ class PageFlags:
     def page(self, view: bool = True) -> LivePage | None:
         """The page, not yet open; None without ``view``.
 
-        Raises:
-            UserError: a port or host without a page, or one that cannot be used.
+        Raises: UserError: a port or host without a page, or one that cannot be used.
         """
         if view:
             from snowsplat.pipeline.run.live_page import LivePage

@@ -179,8 +179,7 @@ PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
 def translated(subcommand: str, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """The arguments for a subcommand without the flags that it does not have, and notes on these.
 
-    Raises:
-        UserError: a flag is refused; the message names what to use instead.
+    Raises: UserError: a flag is refused; the message names what to use instead.
     """
     _, flags = PROGRAMS.get(subcommand, ("", ()))
     known = {s.replace("_", "-"): flag for flag in flags for s in flag.spellings}

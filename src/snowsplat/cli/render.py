@@ -60,8 +60,7 @@ class Render(SceneFlags, Reports):
     rendered. Use it if a scene file from another program lacks this mark."""
 
     projection: Annotated[
-        Literal["pinhole", "equirectangular"],
-        flag("{pinhole,equirectangular}", default="pinhole"),
+        Literal["pinhole", "equirectangular"], flag("{pinhole,equirectangular}", default="pinhole")
     ] = "pinhole"
     """equirectangular: 360° pictures of all directions, level, from the places of the photos or
     along --path: images to OUT/SPLIT/ours_N/panoramas, or a 360° video; --size is their width."""

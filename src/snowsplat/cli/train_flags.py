@@ -143,8 +143,5 @@ class TrainFlags(ConfigFlags, JobFlags):
         if self.white_background and settings.setdefault("background", "white") != "white":
             raise UserError("-w and --background set different colours; use one of them")
         if self.feature_lr is not None:
-            settings = {
-                "lr_sh_dc": self.feature_lr,
-                "lr_sh_rest": self.feature_lr / 20,
-            } | settings
+            settings = {"lr_sh_dc": self.feature_lr, "lr_sh_rest": self.feature_lr / 20} | settings
         return settings

@@ -30,8 +30,7 @@ _STEPS = 60
 def gaussians_to_keep(decimate: int | str, count: int) -> int:
     """How many of ``count`` Gaussians a number (5000, "5000") or a percentage ("50%") keeps.
 
-    Raises:
-        SettingError: ``decimate`` is neither.
+    Raises: SettingError: ``decimate`` is neither.
     """
     text = str(decimate)
     if re.fullmatch(r"\d+", text):
@@ -94,8 +93,7 @@ def write_within(
 ) -> None:
     """Write ``scene`` with so many Gaussians that the file ``target`` has at most ``size`` bytes.
 
-    Raises:
-        SettingError: even one Gaussian needs more.
+    Raises: SettingError: even one Gaussian needs more.
     """
     count = len(scene)
     with atomic_path(target) as temporary:

@@ -84,8 +84,7 @@ def _take_photos(folder: Path, observer: Observer) -> Truth:
 def compare_with_truth(dataset: Path, poses: Mapping[str, Tensor]) -> PoseErrors:
     """The errors of the poses of a dataset; ``poses`` are the true ones, as in `Truth`.
 
-    Raises:
-        ValueError: fewer than three photos have poses.
+    Raises: ValueError: fewer than three photos have poses.
     """
     model = read_model(dataset / "sparse" / "0")
     found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}

@@ -149,8 +149,7 @@ class MakeResult:
 def scene_name(inputs: Sequence[Path]) -> str:
     """The name of a scene: the name of the first input, without its suffix.
 
-    Raises:
-        UserError: no inputs.
+    Raises: UserError: no inputs.
     """
     if not inputs:
         raise UserError("make needs photos; add a folder of photos, or a video")

@@ -26,9 +26,7 @@ def photos_of(scene: Path, dataset: Path) -> tuple[Dataset, str]:
 
     If ``scene`` is in an output folder, the photos have the size of its training, those that it
     held out are held out, and the cameras are those that it has refined.
-
-    Raises:
-        UserError: ``dataset`` is not a dataset.
+    Raises: UserError: ``dataset`` is not a dataset.
     """
     folder, background = folder_around(scene), "black"
     settings = DatasetSettings(str(dataset.absolute()))

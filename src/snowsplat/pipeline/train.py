@@ -226,9 +226,7 @@ def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | N
     """Take part in the training of process 0; for the other processes. Returns at its end.
 
     ``parts`` and ``loss`` are as those of process 0.
-
-    Raises:
-        ProcessLost: process 0 or another process has ended with an error.
+    Raises: ProcessLost: process 0 or another process has ended with an error.
     """
     device = compute.apply()
     with joined(device) as shards:

@@ -26,8 +26,7 @@ class PoseErrors:
 def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> PoseErrors:
     """Compare poses by name; each is a ``cam_from_world`` (3, 4), in two different world frames.
 
-    Raises:
-        ValueError: fewer than three common names, or all camera centres on one line.
+    Raises: ValueError: fewer than three common names, or all camera centres on one line.
     """
     names = sorted(found.keys() & true.keys())
     if len(names) < 3:

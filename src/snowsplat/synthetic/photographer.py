@@ -95,9 +95,7 @@ def write_synthetic_photos(
 
 
 def phone_lens(
-    width: int,
-    height: int,
-    distortion: tuple[float, float, float, float] = _DISTORTION,
+    width: int, height: int, distortion: tuple[float, float, float, float] = _DISTORTION
 ) -> Lens:
     """A wide-angle lens like a phone's. Its focal length differs slightly from that in EXIF."""
     focal = _FOCAL_TRUE * _FOCAL_35MM * math.hypot(width, height) / math.hypot(36, 24)

@@ -39,8 +39,7 @@ _SHADERS = {
 def write_page(path: Path | str, arrangement: Arrangement, name: str) -> None:
     """Write the page of at least one Gaussian atomically. ``name``: on the plate, and the title.
 
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full.
+    Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
     columns, data = encode(arrangement.gaussians)
     simulation = _source("simulation.js")

@@ -71,9 +71,7 @@ def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arra
     of the globe: the largest horizontal surface near the focus becomes the floor or, without such a
     surface, the lowest Gaussians do. What is outside of the glass or below the floor is left out,
     as are isolated Gaussians. Opacities decrease towards the glass.
-
-    Raises:
-        UserError: no Gaussians are left.
+    Raises: UserError: no Gaussians are left.
     """
     gaussians = gaussians.detach()
     usable = gaussians.usable_rows() & (gaussians.opacities > _MIN_OPACITY)

@@ -196,8 +196,7 @@ class Snow:
     ) -> None:
         """Advance by ``seconds``, during which the globe has this acceleration (units/s²).
 
-        Raises:
-            ValueError: the step is longer than `LONGEST_STEP`.
+        Raises: ValueError: the step is longer than `LONGEST_STEP`.
         """
         if not 0 < seconds <= LONGEST_STEP * 1.0001:
             raise ValueError(f"a step has at most {LONGEST_STEP:.4f} s, not {seconds}")

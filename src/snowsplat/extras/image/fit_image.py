@@ -172,9 +172,7 @@ def load_photo(photo: Path, size: int) -> Tensor:
     """A photo, scaled down so that its longer side has at most `size` pixels.
 
     Returns (H, W, 3) float32 in 0..1. A transparent photo is composited over white.
-
-    Raises:
-        UserError: the file is missing or damaged.
+    Raises: UserError: the file is missing or damaged.
     """
     header = read_header(photo)
     width, height = header.width, header.height

@@ -169,9 +169,7 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     """An upright photo (H, W, 3) in 0..1, its camera, and where the focal length is from.
 
     Transparent photos are composited over white. The pose is the identity.
-
-    Raises:
-        UserError: see `lift_photo`.
+    Raises: UserError: see `lift_photo`.
     """
     least, most = _SIDES
     if not least <= size <= most:

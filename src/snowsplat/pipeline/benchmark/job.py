@@ -82,8 +82,7 @@ class SceneResult:
     def read(job: Job) -> SceneResult | None:
         """The result of an earlier run, if there is one.
 
-        Raises:
-            UserError: it is damaged, or was made with other settings.
+        Raises: UserError: it is damaged, or was made with other settings.
         """
         if not job.result.is_file():
             return None

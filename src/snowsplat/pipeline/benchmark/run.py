@@ -110,8 +110,7 @@ def benchmark(
 def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
     """The folders of scenes in ``folder``.
 
-    Raises:
-        UserError: there are none, or one of ``only`` is missing.
+    Raises: UserError: there are none, or one of ``only`` is missing.
     """
 
     def is_dataset(path: Path) -> bool:

@@ -65,10 +65,7 @@ SUITES = {
         "Tanks and Temples",
         "The two scenes truck and train, as distributed with the paper, at their full size. Every "
         "8th photo is a test photo.",
-        published={
-            "truck": Figures(25.187, 0.879, 0.148),
-            "train": Figures(21.097, 0.802, 0.218),
-        },
+        published={"truck": Figures(25.187, 0.879, 0.148), "train": Figures(21.097, 0.802, 0.218)},
         source=_PAPER,
     ),
     "db": Suite(
@@ -99,8 +96,7 @@ SUITES = {
         source=_PAPER,
     ),
     "custom": Suite(
-        "Own scenes",
-        "Every 8th photo is a test photo, unless the dataset has a split of its own.",
+        "Own scenes", "Every 8th photo is a test photo, unless the dataset has a split of its own."
     ),
 }
 

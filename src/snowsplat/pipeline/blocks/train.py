@@ -26,8 +26,7 @@ def scene_folder(folder: Path, block: Block) -> OutputFolder:
 def is_finished(out: OutputFolder) -> bool:
     """Whether a training run in an output folder has reached its last step.
 
-    Raises:
-        UserError: its settings are damaged.
+    Raises: UserError: its settings are damaged.
     """
     scenes = out.scenes()
     if not scenes:

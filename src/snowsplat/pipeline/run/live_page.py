@@ -60,9 +60,7 @@ class LivePage:
         """Open the page, and report its address to the observer.
 
         ``background``: red, green, blue in 0..1. ``label``: the title of the page.
-
-        Raises:
-            UserError: another process has opened the port since the constructor checked it.
+        Raises: UserError: another process has opened the port since the constructor checked it.
         """
         viewer = NetworkViewer(
             dataset,

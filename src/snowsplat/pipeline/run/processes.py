@@ -95,8 +95,7 @@ def local_count() -> int:
 def joined(device: torch.device) -> Iterator[Shards]:
     """The processes that train together, as `Shards`.
 
-    Raises:
-        ProcessLost: another process has ended.
+    Raises: ProcessLost: another process has ended.
     """
     from snowsplat.training.processes.shards import ALONE
 
@@ -157,9 +156,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run ``snowsplat ARGUMENTS`` in several processes on this computer; returns the exit code.
 
     The output is that of process 0. If a process ends with an error, the others end, too.
-
-    Raises:
-        UserError: fewer than 1 process.
+    Raises: UserError: fewer than 1 process.
     """
     if processes < 1:
         raise UserError(f"{processes} processes are too few; use 1 or more")

@@ -51,8 +51,7 @@ def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
 def with_refined(output: Path, dataset: Dataset) -> Dataset:
     """The dataset with the cameras of `write_refined`; unchanged if there are none.
 
-    Raises:
-        UserError: the model is damaged, or a photo is not in it.
+    Raises: UserError: the model is damaged, or a photo is not in it.
     """
     folder = output.joinpath(FOLDER, *_SPARSE)
     if not folder.is_dir():

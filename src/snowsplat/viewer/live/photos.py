@@ -122,8 +122,7 @@ class Photos:
     async def read(self, visitor: Visitor, index: int) -> PhotoView:
         """Read a photo. Only one photo is read at a time, for all browsers together.
 
-        Raises:
-            UserError: the photo is missing or damaged.
+        Raises: UserError: the photo is missing or damaged.
         """
         view = self.views[index]
         async with self._reading:

@@ -53,10 +53,8 @@ class StaticServer:
 
     Every response has the additional ``headers``. ``allow_host``: names of proxies; see
     `KnownHosts`.
-
-    Raises:
-        UserError: the port is in use or not permitted, or the host is not an address of this
-            machine; or an allowed name is none.
+    Raises: UserError: the port is in use or not permitted, or the host is not an address of this
+    machine; or an allowed name is none.
     """
 
     def __init__(
