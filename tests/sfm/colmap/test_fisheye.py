@@ -11,9 +11,9 @@ from snowsplat.sfm.colmap.lens import Lens, cameras_of, findings_of, with_all_pa
 from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import CAMERA_MODELS
 from snowsplat.sfm.progress import silent
-from snowsplat.synthetic.lens import FisheyeLens
 from snowsplat.synthetic.lens import Lens as PhoneLens
 
+from ...scenes.lenses import FisheyeLens
 from . import walks
 
 pytestmark = pytest.mark.sfm

@@ -7,7 +7,8 @@ from snowsplat.data.lens.model import LensModel
 from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.matching import match_descriptors
 from snowsplat.sfm.colmap.panorama_features import detect_in_panorama
-from snowsplat.synthetic.lens import Equirectangular
+
+from ...scenes.lenses import Equirectangular
 
 WIDTH = 640
 LENS = LensModel("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (float(WIDTH), WIDTH / 2))
