@@ -45,7 +45,6 @@ class Clean(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.scene is None or self.target is None:
             raise UserError("clean needs a scene and the name of a file to write")
         from snowsplat.pipeline.clean import clean

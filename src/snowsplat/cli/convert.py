@@ -82,7 +82,6 @@ class Convert(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if len(self.paths) < 2:
             raise UserError("convert needs a scene and the name of a file to write")
         *sources, target = self.paths

@@ -47,7 +47,6 @@ class Evaluate(SceneFlags, Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         several = [
             replace(self, model_path=path, model_paths=())._evaluate() for path in self.model_paths
         ]

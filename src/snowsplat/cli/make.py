@@ -14,7 +14,7 @@ import tyro
 from snowsplat.cli.flags import Threads, flag, switch, with_flags
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
-from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.cli.page_flags import AllowHost, page_at
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
@@ -26,17 +26,8 @@ if TYPE_CHECKING:
 
 # The flags that the command for resuming repeats, in this order.
 _RESUMED_FLAGS = (
-    "output",
-    "quality",
-    "minutes",
-    "hold_out",
-    "title",
-    "exposure",
-    "threads",
-    "device",
-    "memory",
-    "port",
-    "host",
+    *("output", "quality", "minutes", "hold_out", "title", "exposure", "threads", "device"),
+    *("memory", "port", "host"),
 )
 
 
@@ -111,12 +102,12 @@ class Make(Reports):
             quality=self.quality,
             minutes=self.minutes,
             memory=self.memory,
-            hold_out=_hold_out(self.hold_out),
             title=self.title,
             exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
+            **({} if self.hold_out is None else {"hold_out": _hold_out(self.hold_out)}),
         )
-        page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
+        page = page_at(self.port, self.host, self.allow_host, self.view)
         with page or nullcontext():
             try:
                 with TerminalObserver() as observer:
@@ -169,10 +160,8 @@ class Make(Reports):
             )
 
 
-def _hold_out(text: str | None) -> int | None:
+def _hold_out(text: str) -> int | None:
     """Raises UserError: the text is neither a number from 2 on nor "none"."""
-    if text is None:
-        return 8
     if text == "none":
         return None
     if not text.isdecimal() or int(text) < 2:

@@ -52,7 +52,6 @@ class Publish(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.scene is None:
             raise UserError("publish needs a scene; use a file or the output folder of a training")
         if self.output is None:

@@ -85,7 +85,6 @@ class Render(SceneFlags, Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.path is not None:
             self._render_video(self.path)
             return 0

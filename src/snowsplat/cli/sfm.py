@@ -78,7 +78,6 @@ class Sfm(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         inputs, folder = self._inputs_and_folder()
         from snowsplat.data.placement import placement_of
         from snowsplat.evaluation.verdict import Verdict

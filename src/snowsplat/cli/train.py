@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.page_flags import PageFlags
+from snowsplat.cli.page_flags import page_at
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.train_flags import TrainFlags
 from snowsplat.util.errors import UserError
@@ -67,7 +67,7 @@ class Train(TrainFlags, Reports):
         from snowsplat.pipeline.train import resume, train
 
         logs = [LOGS[name](self.output) for name in self.log]
-        page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
+        page = page_at(self.port, self.host, self.allow_host, self.view)
         with TerminalObserver(self.quiet) as terminal, page or nullcontext():
             observer = Observers(terminal, *logs)
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,7 +16,9 @@ from snowsplat.cli.page_flags import AllowHost
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
+    from snowsplat.pipeline.output.output_folder import DatasetSettings
     from snowsplat.pipeline.train import TrainOptions
+    from snowsplat.training.settings.config import TrainConfig
 
 
 @dataclass
@@ -109,16 +112,22 @@ class TrainFlags(ConfigFlags, JobFlags):
             raise UserError("the dataset is named twice; leave out DATASET or -s")
         given = self.dataset or self.source_path
         if given is None and self.config is not None and not self.resume:
-            earlier = training_in(self.config)[1].path
+            earlier = self._earlier[1].path
             given = Path(earlier) if earlier else None
         return given
+
+    @cached_property
+    def _earlier(self) -> tuple[TrainConfig, DatasetSettings]:
+        """The configuration and the dataset of the earlier training that is the configuration."""
+        assert self.config is not None
+        return training_in(self.config)
 
     def options(self) -> TrainOptions:
         """The options of `pipeline.train.train`. Raises: UserError: contradictory flags."""
         from snowsplat.pipeline.compute import Compute
         from snowsplat.pipeline.train import TrainOptions
 
-        config, earlier = (None, None) if self.config is None else training_in(self.config)
+        config, earlier = (None, None) if self.config is None else self._earlier
         before = {} if earlier is None else asdict(earlier)
         if self.eval or self.test_list is not None:
             before |= dict.fromkeys(("hold_out", "first_held_out", "test_list"))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.observer import WatchObserver
-from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.cli.page_flags import AllowHost, page_at
 from snowsplat.cli.scene_flags import SceneFlags
 
 
@@ -38,7 +38,7 @@ class Watch(SceneFlags):
         path = self.output_path()
         from snowsplat.pipeline.watch import watch
 
-        page = PageFlags(self.port, self.host, self.allow_host).page()
+        page = page_at(self.port, self.host, self.allow_host)
         assert page is not None
         with WatchObserver() as observer, page:
             watch(

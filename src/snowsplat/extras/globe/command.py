@@ -54,7 +54,6 @@ class Globe(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.scene is None:
             raise UserError("globe needs a scene; use a file or the output folder of a training")
         if self.video is None and self.size is not None:

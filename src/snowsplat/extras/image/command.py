@@ -58,7 +58,6 @@ class Image(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.photo is None or self.output is None:
             raise UserError(
                 "image needs a photo and an output folder: snowsplat image PHOTO -o OUT"

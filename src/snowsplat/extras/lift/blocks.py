@@ -48,11 +48,8 @@ def merge_pixels(depth: Tensor, photo: Tensor, links: Links, most: int) -> Block
     block is divided into four if its error is above a limit, or if two neighbouring pixels in it
     are not linked. The limit is found by bisection.
 
-    Args:
-        depth: (H, W) positive; NaN where it is unknown.
-        photo: (H, W, 3) in 0..1.
-        links: see `find_links`.
-        most: if too many pixels are not linked, the result has more blocks than that.
+    ``depth`` (H, W) is positive, NaN where it is unknown, ``photo`` (H, W, 3) in 0..1. If too many
+    pixels are not linked, the result has more than ``most`` blocks.
     """
     known = depth.isfinite()
     if int(known.sum()) <= most:

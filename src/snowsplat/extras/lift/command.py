@@ -80,7 +80,6 @@ class Lift(Reports):
     json: JsonFlag = False
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.photo is None or self.output is None:
             raise UserError(
                 "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"

@@ -39,11 +39,7 @@ _READING_SHARE = 0.2  # maximum share of the time for reading thumbnails during 
 
 
 class Photos:
-    """The photos of a dataset in the scene of a server.
-
-    Attributes:
-        views: the training views, then the test views.
-    """
+    """The photos of a dataset in the scene of a server."""
 
     def __init__(
         self,

@@ -223,9 +223,7 @@ class Session:
     def next_request(self, scene: int, training: bool) -> RenderRequest | None:
         """The next image to render; None if there is none, or if the training has to run first.
 
-        Args:
-            scene: a number that changes when the scene changes.
-            training: whether the training waits to continue.
+        ``scene`` changes when the scene changes. ``training``: whether it waits to continue.
         """
         now = self._clock()
         with self._changed:

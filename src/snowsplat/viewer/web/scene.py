@@ -54,11 +54,9 @@ def site(
 
     The initial view is the first of ``cameras``; without cameras, an overview of the scene.
 
-    Args:
-        levels: returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
-            loads instead of the complete scene.
-        count: the number of Gaussians, if ``gaussians`` is only a coarse level. Then the levels
-            stay as they are, and the page only scales them.
+    ``levels`` returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
+    loads instead of the complete scene. ``count``: the number of Gaussians, if ``gaussians`` is
+    only a coarse level. Then the levels stay as they are, and the page only scales them.
     """
     in_place = count is not None
     scene = ready(gaussians, cameras, background, turn=not in_place)

@@ -99,11 +99,8 @@ def _look(
 def _seen(
     gaussians: Gaussians, view: InitialView, depth: float, others: Sequence[Camera]
 ) -> tuple[float, float]:
-    """See `Stops.seen`. What is hidden from another photo counts as seen by it.
-
-    Args:
-        depth: where there is no surface, that of the place that must be in other photos.
-    """
+    """See `Stops.seen`. What is hidden from another photo counts as seen by it. Where there is no
+    surface, a place at ``depth`` must be in other photos."""
     height = _BESIDE_HEIGHT
     width = max(1, round(height * view.aspect))
     wide, high = round(_WIDEST * width), round(_WIDEST * height)

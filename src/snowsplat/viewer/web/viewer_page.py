@@ -64,9 +64,8 @@ def settings(
 ) -> dict[str, Any]:
     """The viewer's settings: its initial view, and a background colour in 0..1.
 
-    Args:
-        film: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
-            If there are none, the viewer uses an animation of its own.
+    ``film``: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
+    If there are none, the viewer uses an animation of its own.
     """
     off = {"enabled": False}
     first = view_numbers(start, start.aspect)
