@@ -233,30 +233,27 @@ def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | N
         follow(shards, device, parts, loss)
 
 
+@dataclass
 class _Job:
     """One call of `train` or `resume`: prepares a `TrainingRun` and runs it."""
 
-    def __init__(
-        self,
-        out: OutputFolder,
-        options: TrainOptions,
-        observer: Observer,
-        page: LivePage | None,
-        started: float,
-        parts: Sequence[Part],
-        loss: Loss | None,
-    ) -> None:
-        self.out, self.options, self.observer, self.page = out, options, observer, page
-        self.started = started
-        self.parts, self.loss = parts, loss
-        self.shards: Shards = ALONE
-        if page is not None and count() > 1:
+    out: OutputFolder
+    options: TrainOptions
+    observer: Observer
+    page: LivePage | None
+    started: float
+    parts: Sequence[Part]
+    loss: Loss | None
+    shards: Shards = ALONE
+    doubts: tuple[str, ...] = ()  # about the dataset
+    photos: dict[str, Stamp] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.page is not None and count() > 1:
             raise UserError("the page needs one process; leave out `view`, and use snowsplat watch")
-        self.device = options.compute.apply()
+        self.device = self.options.compute.apply()
         reset_peak()
         self.memory_before = resident_bytes()
-        self.doubts: tuple[str, ...] = ()  # about the dataset
-        self.photos: dict[str, Stamp] = {}
 
     def train(self, path: Path | str) -> TrainResult:
         options = self.options

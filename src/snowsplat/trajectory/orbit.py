@@ -1,4 +1,4 @@
-"""Closed paths around the focus of the cameras; all frames look at the focus."""
+"""Closed paths around one point, such as the focus of the cameras; all frames look at it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import look_at
+from snowsplat.scene.geometry import compose_rigid, look_at
 from snowsplat.scene.near_plane import near_of_overview
 from snowsplat.trajectory.focus import (
     DEFAULT_UP,
@@ -33,6 +33,8 @@ _ONE_DIRECTION = 0.75
 _LEAST_SWING = math.radians(2)
 # Smallest ratio of the shorter to the longer axis of an oval.
 _FLATTEST = 0.25
+# Largest angle between the optical axes of a frame of a swing and of the photo.
+_SWING = math.radians(4)
 # Samples per frame for measuring the length of a path.
 _SAMPLES_PER_FRAME = 20
 # Values outside of these quantiles are considered outliers.
@@ -150,6 +152,24 @@ def orbit_path(
         return focus + torch.stack([level * angle.sin(), y, -level * angle.cos()], 1)
 
     return _looking_at(focus, DEFAULT_UP, circle, lens, frames)
+
+
+def swing_path(camera: Camera, distance: float, frames: int) -> list[Camera]:
+    """``frames`` cameras on an ellipse around the position of ``camera``, in its image plane.
+
+    All look at the point at ``distance`` (world units) on its optical axis, so that this point does
+    not move in the image. The ellipse is half as high as it is wide.
+    """
+    angles = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
+    radius = distance * math.tan(_SWING)
+    positions = torch.stack(
+        [radius * angles.cos(), 0.5 * radius * angles.sin(), torch.zeros_like(angles)], dim=1
+    )
+    # In the frame of the camera; its y axis points down.
+    target = torch.tensor([0.0, 0.0, distance], dtype=torch.float64).expand_as(positions)
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    poses = compose_rigid(look_at(positions, target, up), camera.cam_from_world.double())
+    return [dataclasses.replace(camera, cam_from_world=pose) for pose in poses]
 
 
 def _looking_at(focus: Tensor, up: Tensor, path: _Path, lens: Camera, frames: int) -> list[Camera]:

@@ -26,7 +26,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.trajectory.swing import swing_path
+from snowsplat.trajectory.orbit import swing_path
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
