@@ -91,6 +91,14 @@ def focus_of(cameras: Sequence[Camera], distance: float) -> Tensor:
     return centres.mean(0) + distance * mean / mean.norm()
 
 
+def weighted_quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
+    """The weighted quantile, a scalar, of ``values`` (P,), P > 0."""
+    order = values.argsort()
+    sums = weights[order].cumsum(0)
+    index = torch.searchsorted(sums, share * sums[-1]).clamp_max(len(values) - 1)
+    return values[order[int(index)]]
+
+
 def resized(camera: Camera, width: int, height: int) -> Camera:
     """The camera with another image size in pixels and aspect ratio, and with square pixels.
 

@@ -19,7 +19,9 @@ from snowsplat.trajectory.focus import (
     rotations_of,
     typical,
     up_of,
+    weighted_quantile,
 )
+from snowsplat.trajectory.spline import SAMPLES_PER_FRAME, interpolate
 from snowsplat.util.errors import UserError
 
 # Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
@@ -35,8 +37,6 @@ _LEAST_SWING = math.radians(2)
 _FLATTEST = 0.25
 # Largest angle between the optical axes of a frame of a swing and of the photo.
 _SWING = math.radians(4)
-# Samples per frame for measuring the length of a path.
-_SAMPLES_PER_FRAME = 20
 # Values outside of these quantiles are considered outliers.
 _OUTERMOST = torch.tensor([0.1, 0.9], dtype=torch.float64)
 
@@ -136,9 +136,10 @@ def orbit_path(
     if not len(points):
         raise UserError("the scene has no Gaussians to orbit")
     points, weights = points.detach().to(torch.float64), weights.detach().to(torch.float64)
-    focus = torch.stack([_weighted_median(column, weights) for column in points.T])
+    focus = torch.stack([weighted_quantile(column, weights, 0.5) for column in points.T])
     # At this distance, half of the Gaussians fill half of the image.
-    radius = 3.0 * (float(_weighted_median((points - focus).norm(dim=1), weights)) or 1.0)
+    distances = (points - focus).norm(dim=1)
+    radius = 3.0 * (float(weighted_quantile(distances, weights, 0.5)) or 1.0)
     elevation = math.radians(15)
     focal = 1.2 * min(width, height)
     pose = look_at(focus - torch.tensor([0.0, 0.0, radius]), focus, DEFAULT_UP)
@@ -174,12 +175,10 @@ def swing_path(camera: Camera, distance: float, frames: int) -> list[Camera]:
 
 def _looking_at(focus: Tensor, up: Tensor, path: _Path, lens: Camera, frames: int) -> list[Camera]:
     """Cameras that look at the focus, at equal distances along a closed path."""
-    t = torch.linspace(0, 1, _SAMPLES_PER_FRAME * max(frames, 50) + 1, dtype=torch.float64)
+    t = torch.linspace(0, 1, SAMPLES_PER_FRAME * max(frames, 50) + 1, dtype=torch.float64)
     length = torch.cat([t.new_zeros(1), path(t).diff(dim=0).norm(dim=1).cumsum(0)])
     wanted = torch.arange(frames, dtype=torch.float64) / frames * length[-1]
-    i = torch.searchsorted(length, wanted).clamp(1, len(t) - 1)
-    share = (wanted - length[i - 1]) / (length[i] - length[i - 1]).clamp_min(1e-300)
-    positions = path(t[i - 1] + share * (t[i] - t[i - 1]))
+    positions = path(interpolate(wanted, length, t))
     poses = look_at(positions, focus.expand_as(positions), up)
     return [dataclasses.replace(lens, cam_from_world=pose) for pose in poses]
 
@@ -216,9 +215,3 @@ def _range(angles: Tensor) -> tuple[float, float]:
     """The middle and half the width of the range between the 10% and the 90% quantile."""
     low, high = torch.quantile(angles, _OUTERMOST).tolist()
     return (low + high) / 2, max((high - low) / 2, _LEAST_SWING)
-
-
-def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    order = values.argsort()
-    sums = weights[order].cumsum(0)
-    return values[order[int(torch.searchsorted(sums, sums[-1] / 2).clamp_max(len(values) - 1))]]

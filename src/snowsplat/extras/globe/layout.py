@@ -27,6 +27,7 @@ from snowsplat.trajectory.focus import (
     rotations_of,
     up_of,
     viewing_distance,
+    weighted_quantile,
 )
 from snowsplat.util.errors import UserError
 
@@ -125,8 +126,8 @@ def _globe_frame(gaussians: Gaussians, cameras: Sequence[Camera]) -> Similarity:
     near = (level_distance < radius) & (around[:, 1] <= floor)
     weights = gaussians.opacities.double()
     if bool(near.any()):
-        height = floor - _quantile(around[near, 1], weights[near], 0.01)
-        width = _quantile(level_distance[near], weights[near], 0.98)
+        height = floor - float(weighted_quantile(around[near, 1], weights[near], 0.01))
+        width = float(weighted_quantile(level_distance[near], weights[near], 0.98))
     else:
         height = width = radius
     # A slim subject is not enlarged until it touches the glass.
@@ -152,7 +153,7 @@ def _floor_height(gaussians: Gaussians, rotation: Tensor, around: Tensor, radius
     weights = near_gaussians.opacities.double()
     flat = (normals[:, 1].abs() > _HORIZONTAL) & (scales[:, 0] < 0.5 * scales[:, 1])
     areas = weights * scales[:, 1] * scales[:, 2] * flat
-    lowest = _quantile(heights, weights, 0.995)
+    lowest = float(weighted_quantile(heights, weights, 0.995))
     cells = ((heights + radius) / (2 * radius) * _HEIGHT_CELLS).long().clamp(0, _HEIGHT_CELLS - 1)
     histogram = torch.zeros(_HEIGHT_CELLS + 2, dtype=torch.float64).index_add_(0, cells + 1, areas)
     # Three cells at a time, so that a surface at the border of two cells is found.
@@ -161,7 +162,7 @@ def _floor_height(gaussians: Gaussians, rotation: Tensor, around: Tensor, radius
     if float(sums[best]) < _FLOOR_SHARE * float(areas.sum()) or not float(areas.sum()) > 0:
         return lowest
     surface = (cells - best).abs() <= 1
-    return _quantile(heights[surface], areas[surface], 0.5)
+    return float(weighted_quantile(heights[surface], areas[surface], 0.5))
 
 
 def _surrounded(frame: Similarity, cameras: Sequence[Camera]) -> bool:
@@ -188,11 +189,3 @@ def _inside(gaussians: Gaussians) -> Gaussians:
     keep = (opacities > _MIN_OPACITY) & (means[:, 1] < FLOOR + _SUNK) & (lowest < FLOOR + 2 * _SUNK)
     faded = replace(gaussians, opacity_logits=opacities.logit(1e-6))
     return faded.select(keep)
-
-
-def _quantile(values: Tensor, weights: Tensor, share: float) -> float:
-    """The weighted quantile of ``values`` (P,), P > 0."""
-    order = values.argsort()
-    sums = weights[order].cumsum(0)
-    index = int(torch.searchsorted(sums, share * sums[-1]).clamp_max(len(values) - 1))
-    return float(values[order[index]])

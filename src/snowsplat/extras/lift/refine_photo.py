@@ -17,7 +17,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
 
@@ -65,7 +64,9 @@ def refine_photo(
     view = _view_of(posed, Path(photo))
     if posed.points is None:
         raise UserError(f"{dataset}: has no points, which the depth is aligned to; use lift alone")
-    config = _capped(recipe("default", iterations=iterations, init="points"), posed)
+    sizes = sorted(view.camera.width * view.camera.height for view in posed.train)
+    config = recipe("default", iterations=iterations, init="points")
+    config = config.capped(sizes[len(sizes) // 2], len(sizes))  # as in the training
     Compute("cpu", threads).apply()
     with ImageLoader([view], background=(1.0, 1.0, 1.0)) as loader:
         pixels = loader.get(view).rgb.float().div(255).contiguous()
@@ -103,12 +104,6 @@ def _view_of(dataset: Dataset, photo: Path) -> View:
     problem = "is held out for testing" if held_out else "is not a photo of the dataset"
     names = ", ".join(view.name for view in dataset.train[:3])
     raise UserError(f"{photo}: {problem}; use one of its training photos, for example {names}")
-
-
-def _capped(config: TrainConfig, dataset: Dataset) -> TrainConfig:
-    """The configuration with its limit of Gaussians, as the trainer sets it."""
-    sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
-    return config.capped(sizes[len(sizes) // 2], len(sizes))
 
 
 def _with_unseen_points(
