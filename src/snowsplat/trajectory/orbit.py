@@ -24,8 +24,8 @@ from snowsplat.trajectory.focus import (
 from snowsplat.trajectory.spline import SAMPLES_PER_FRAME, interpolate
 from snowsplat.util.errors import UserError
 
-# Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
-_WIDEST_GAP = math.radians(110)
+#: Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
+WIDEST_GAP = math.radians(110)
 # Largest elevation. Near the vertical, the image would rotate quickly.
 _STEEPEST = math.radians(80)
 # Cameras look in one direction if the mean of their unit forward vectors is at least this long.
@@ -57,8 +57,8 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
     level = from_focus - heights[:, None] * up
     east, north = _level_axes(level, up)
     azimuths = torch.atan2(level @ north, level @ east)
-    gap, middle = _widest_gap(azimuths)
-    if gap < _WIDEST_GAP:
+    gap, middle = widest_gap(azimuths)
+    if gap < WIDEST_GAP:
         radii = level.norm(dim=1)
         low, high = torch.quantile(radii, _OUTERMOST)
         # On a circle the mean square of a coordinate is half the squared radius.
@@ -199,7 +199,7 @@ def _level_axes(level: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     return east, torch.linalg.cross(up, east)
 
 
-def _widest_gap(azimuths: Tensor) -> tuple[float, float]:
+def widest_gap(azimuths: Tensor) -> tuple[float, float]:
     """The width of the widest sector without a camera, and the middle of the remaining sector.
 
     All angles are in radians.

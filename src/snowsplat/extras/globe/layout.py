@@ -5,7 +5,6 @@ The frame is that of `snowsplat.extras.globe.dimensions`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +28,7 @@ from snowsplat.trajectory.focus import (
     viewing_distance,
     weighted_quantile,
 )
+from snowsplat.trajectory.orbit import WIDEST_GAP, widest_gap
 from snowsplat.util.errors import UserError
 
 # Gaussians with a lower opacity are left out: as snow, they would be invisible.
@@ -51,7 +51,6 @@ _FADE = (0.84, 0.97)
 _ISOLATED = 8.0
 # How far the scene may extend below the floor. A table top is not perfectly flat.
 _SUNK = 0.03
-_WIDEST_GAP = math.radians(110)
 
 
 @dataclass(frozen=True)
@@ -166,13 +165,11 @@ def _floor_height(gaussians: Gaussians, rotation: Tensor, around: Tensor, radius
 
 
 def _surrounded(frame: Similarity, cameras: Sequence[Camera]) -> bool:
-    """Whether no sector around the globe that is wider than `_WIDEST_GAP` is without a camera."""
+    """Whether no sector around the globe that is wider than `WIDEST_GAP` is without a camera."""
     if not cameras:
         return True
     x, _, z = frame.apply(positions_of(cameras)).T
-    azimuths = torch.atan2(x, z).sort().values
-    gaps = torch.cat([azimuths[1:], azimuths[:1] + 2 * math.pi]) - azimuths
-    return float(gaps.max()) < _WIDEST_GAP
+    return widest_gap(torch.atan2(x, z))[0] < WIDEST_GAP
 
 
 def _inside(gaussians: Gaussians) -> Gaussians:
