@@ -58,22 +58,23 @@ def write_synthetic_photos(
     width: int = 640,
     height: int = 480,
     seed: int = 0,
-    distortion: tuple[float, float, float, float] = _DISTORTION,
     report: Report = silent,
 ) -> Truth:
     """Render photos ``IMG_0001.jpg`` … of a still life into ``folder``, in two rounds around it.
 
-    Equal arguments produce equal photos. Existing photos are kept. ``seed``: of the scene and of
-    the path. ``distortion``: k1, k2, p1, p2 of COLMAP's model OPENCV.
+    Equal arguments produce equal photos. Existing photos are kept. ``seed``: of scene and path.
     """
-    lens = phone_lens(width, height, distortion)
+    lens = phone_lens(width, height)
     return take_photos(folder, lambda: still_life(seed), lens, walk(n_views, seed), seed, report)
 
 
 def phone_lens(
     width: int, height: int, distortion: tuple[float, float, float, float] = _DISTORTION
 ) -> Lens:
-    """A wide-angle lens like a phone's. Its focal length differs slightly from that in EXIF."""
+    """A wide-angle lens like a phone's. Its focal length differs slightly from that in EXIF.
+
+    ``distortion``: k1, k2, p1, p2 of COLMAP's model OPENCV.
+    """
     focal = _FOCAL_TRUE * _FOCAL_35MM * math.hypot(width, height) / math.hypot(36, 24)
     return Lens(width, height, focal, distortion)
 

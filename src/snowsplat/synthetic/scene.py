@@ -77,22 +77,19 @@ class Scene:
         self._all = np.concatenate(texels).astype(np.float32)
         self._starts, self._widths, self._heights = starts, widths, heights
 
-    def radiance(
-        self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool = True
-    ) -> np.ndarray:
+    def radiance(self, origins: np.ndarray, directions: np.ndarray, spread: float) -> np.ndarray:
         """Linear colours (3, R) along rays; black where they hit nothing.
 
         Args:
             origins: (3, 1) or (3, R) float32, metres.
             directions: (3, R) float32, of length 1.
             spread: width of a ray at distance 1, which selects the texture level.
-            mirrored: whether to trace one reflected ray at glossy objects.
         """
         result = np.zeros_like(directions)
         for start in range(0, directions.shape[1], _BLOCK):
             block = slice(start, start + _BLOCK)
             own = origins if origins.shape[1] == 1 else origins[:, block]
-            result[:, block] = self._block(own, directions[:, block], spread, mirrored)
+            result[:, block] = self._block(own, directions[:, block], spread, mirrored=True)
         return result
 
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -18,9 +18,7 @@ from snowsplat.scene.sh_constants import SH_C0
 _STEPS = 10
 
 
-def match_photo(
-    gaussians: Gaussians, camera: Camera, photo: Tensor, steps: int = _STEPS
-) -> Gaussians:
+def match_photo(gaussians: Gaussians, camera: Camera, photo: Tensor) -> Gaussians:
     """Gaussians with the same geometry and opacity, whose colours reproduce the photo.
 
     Discs of neighbouring pixels overlap, so an image of discs in the colours of the photo is
@@ -35,7 +33,7 @@ def match_photo(
     # The scaling bounds the step by the mean of a row of Wᵀ W, which its largest row may exceed.
     weights = _transposed(gaussians, camera, torch.full_like(colors, 0.5), None).clamp_min(1e-3)
     ahead, momentum = colors, 1.0
-    for _ in range(steps):
+    for _ in range(_STEPS):
         step = _transposed(gaussians, camera, ahead, photo) / weights
         following = (ahead + step).clamp(0.0, 1.0)
         grown = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * momentum * momentum))

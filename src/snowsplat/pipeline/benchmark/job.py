@@ -54,7 +54,7 @@ class Job:
     recipe: str
     settings: dict[str, Any] = field(default_factory=dict)
     resolution: int | None = None
-    hold_out: int = 8
+    hold_out: int = 8  # unless the dataset has a split of its own
     lpips: str | None = None
 
     @property

@@ -137,8 +137,7 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
         options.recipe,
         {**suite.settings, **options.settings},
         options.resolution or suite.resolutions.get(dataset.name),
-        suite.hold_out,
-        None if options.lpips is None else _lpips(options.lpips),
+        lpips=None if options.lpips is None else _lpips(options.lpips),
     )
 
 

@@ -31,8 +31,6 @@ class Suite:
     # as images_4) are used if the dataset has them. Scenes that are not listed have their full
     # size.
     resolutions: Mapping[str, int] = field(default_factory=dict)
-    # Every ``hold_out``-th photo is a test photo, unless the dataset has a split of its own.
-    hold_out: int = 8
     # Settings of the training that the protocol fixes.
     settings: Mapping[str, Any] = field(default_factory=dict)
     published: Mapping[str, Figures] = field(default_factory=dict)  # figures of each scene
