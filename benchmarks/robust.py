@@ -33,6 +33,7 @@ from snowsplat.synthetic.still_life import still_life
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.scenes.passer_by import chosen_photos, passers_by
+from tests.scenes.shutter import shooting
 
 COUNT = 48
 SIZE = (400, 300)
@@ -52,7 +53,9 @@ def write_dataset(
 ) -> None:
     """A dataset of COLMAP with the true poses."""
     images = folder / "images"
-    truth = take_photos(images, lambda: scene, lens, poses, seed, passing=passing)
+    truth = take_photos(
+        images, lambda: scene, lens, poses, seed, shoot=shooting(lens, poses, passing or {})
+    )
     random = np.random.default_rng(seed)
     found = [
         _points(images / name, scene, lens, pose, random) for name, pose in truth.poses.items()

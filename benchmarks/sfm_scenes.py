@@ -45,9 +45,9 @@ from torch import Tensor
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic import textures as paint
-from snowsplat.synthetic.lens import AnyLens, Equirectangular
+from snowsplat.synthetic.lens import CentredLens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import fisheye_lens, phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum
 from snowsplat.synthetic.still_life import still_life
@@ -55,6 +55,7 @@ from snowsplat.trajectory.video_file import video_writer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.scenes.lenses import Equirectangular, fisheye_lens
 from tests.scenes.street import street
 
 #: Part of the folder names of the photos. Increase it with every change that affects the photos.
@@ -81,7 +82,7 @@ class Kind:
 
     build: Callable[[int, int], Scene]  # arguments: the seed, the number of photos
     path: Callable[[int, int], list[Tensor]]  # arguments: the number of photos, the seed
-    lens: Callable[[int, int], AnyLens] = phone_lens  # arguments: width, height
+    lens: Callable[[int, int], CentredLens] = phone_lens  # arguments: width, height
 
 
 def cache_folder() -> Path:

@@ -23,11 +23,12 @@ from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import textures as paint
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import Shutter, depth_map, rolled, take_photos
+from snowsplat.synthetic.photographer import depth_map, rolled, take_photos
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
 from .passer_by import figure
+from .shutter import Shutter, shooting
 from .street_dataset import DATASET_FROM_SCENE
 
 _HALL, _HEIGHT = (11.0, 9.0), 4.0
@@ -82,7 +83,8 @@ def write_museum_dataset(
     passing = {i: visitors(pose, i, seed) for i, pose in enumerate(poses) if kind.people}
     shutter = Shutter(_APERTURE if kind.defocus else 0.0, _AWAY, (_STRIDE, 0.0, 0.0))
     used = shutter if kind.defocus or kind.people else None
-    truth = take_photos(folder / "images", lambda: scene, lens, poses, seed, report, passing, used)
+    shoot = shooting(lens, poses, passing, used)
+    truth = take_photos(folder / "images", lambda: scene, lens, poses, seed, report, shoot)
     random = np.random.default_rng(seed)
     found, images = [], []
     for i, (name, pose) in enumerate(truth.poses.items()):

@@ -13,8 +13,9 @@ from snowsplat.sfm.coverage import measure_coverage
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent
 from snowsplat.sfm.undistort import undistort
-from snowsplat.synthetic.lens import Equirectangular
 from snowsplat.util.errors import UserError
+
+from ..scenes.lenses import Equirectangular
 
 WIDTH, COUNT = 128, 10
 FACES = ("front", "back", "left", "right", "up", "down")

@@ -9,11 +9,11 @@ from snowsplat import load_dataset
 from snowsplat.synthetic import light
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import Shutter, photograph
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
 
 from ..scenes.museum import Museum, write_museum_dataset
+from ..scenes.shutter import Shutter, photograph
 
 LENS = Lens(120, 90, 150.0, (0.0, 0.0, 0.0, 0.0))
 AHEAD = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], dtype=torch.float64)

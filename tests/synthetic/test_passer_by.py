@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import depth_map, phone_lens, photograph, walk
+from snowsplat.synthetic.photographer import depth_map, phone_lens, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box
 
 from ..scenes.passer_by import chosen_photos, passers_by
+from ..scenes.shutter import photograph
 
 LENS = phone_lens(80, 60, distortion=(0.0, 0.0, 0.0, 0.0))
 

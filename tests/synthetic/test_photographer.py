@@ -8,11 +8,13 @@ from PIL import Image
 from snowsplat.data.colmap import read_model
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
 from snowsplat.synthetic import light, still_life, write_synthetic_photos
-from snowsplat.synthetic.lens import FisheyeLens, Lens
+from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import photograph, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
+
+from ..scenes.lenses import FisheyeLens
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import torch
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
-from snowsplat.trajectory.swing import swing_path
+from snowsplat.trajectory.orbit import swing_path
 
 
 def test_a_closed_path_around_the_photo():

@@ -58,7 +58,6 @@ class Benchmark(Reports):
     device: Annotated[Literal["cpu", "cuda"] | None, flag("{cpu,cuda}", default="a GPU")] = None
     """Device for the training."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 2 if a scene could not be trained, otherwise 0."""

@@ -17,16 +17,8 @@ from snowsplat.util.errors import UserError
 # The flags of each action; the others have no effect and are rejected.
 _FLAGS = {
     "plan": (
-        "output",
-        "blocks",
-        "margin",
-        "recipe",
-        "iterations",
-        "max_gaussians",
-        "images",
-        "resolution",
-        "eval",
-        "test_list",
+        *("output", "blocks", "margin", "recipe", "iterations", "max_gaussians", "images"),
+        *("resolution", "eval", "test_list"),
     ),
     "train": ("block", "memory", "device", "threads", "quiet"),
     "merge": ("output",),
@@ -55,9 +47,7 @@ class Blocks:
     """
 
     action: Annotated[
-        Literal["plan", "train", "merge"] | None,
-        tyro.conf.Positional,
-        flag("{plan,train,merge}"),
+        Literal["plan", "train", "merge"] | None, tyro.conf.Positional, flag("{plan,train,merge}")
     ] = None
     """plan: cut a dataset into blocks; train: train blocks; merge: join their scenes."""
     path: Annotated[Path | None, tyro.conf.Positional, flag("DATASET|OUT")] = None

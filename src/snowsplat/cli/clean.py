@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Threads, flag, switch
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
@@ -39,15 +39,12 @@ class Clean(Reports):
     """Folder of the dataset: for a scene file, or if it was moved after the training."""
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to compute on."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.scene is None or self.target is None:
             raise UserError("clean needs a scene and the name of a file to write")
         from snowsplat.pipeline.clean import clean

@@ -80,10 +80,8 @@ class Convert(Reports):
     overwrite: Annotated[bool, switch()] = False
     """Replace FILE if it exists already."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if len(self.paths) < 2:
             raise UserError("convert needs a scene and the name of a file to write")
         *sources, target = self.paths

@@ -45,10 +45,8 @@ class Evaluate(SceneFlags, Reports):
     model_paths: Annotated[tuple[Path, ...], flag("OUT [OUT ...]")] = ()
     """Several output folders, one after the other."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         several = [
             replace(self, model_path=path, model_paths=())._evaluate() for path in self.model_paths
         ]

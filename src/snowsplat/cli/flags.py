@@ -1,7 +1,7 @@
 """How a field of a subcommand's dataclass becomes a flag; the flags of settings in messages."""
 
 import re
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import tyro
 
@@ -10,19 +10,29 @@ _SETTING = re.compile(r"`([a-z][a-z0-9_]*)`")
 _OTHER_NAMES = {"hold_out": "--eval"}
 
 
-def flag(metavar: str, *aliases: str, default: str = "") -> Any:
+def flag(metavar: str, *aliases: str, default: str = "", help: str | None = None) -> Any:
     """A flag with the placeholder ``metavar`` for its value.
 
     ``aliases`` are other spellings, and ``default`` describes the default in the help text. tyro
-    accepts hyphens and underscores alike in every spelling.
+    accepts hyphens and underscores alike in every spelling. ``help``: None: the string below the
+    field.
     """
     hint = f"(default: {default})" if default else ""
-    return tyro.conf.arg(metavar=metavar, aliases=list(aliases) or None, help_behavior_hint=hint)
+    return tyro.conf.arg(
+        metavar=metavar, aliases=list(aliases) or None, help_behavior_hint=hint, help=help
+    )
 
 
-def switch(*aliases: str) -> Any:
+def switch(*aliases: str, help: str | None = None) -> Any:
     """A flag without a value."""
-    return tyro.conf.arg(aliases=list(aliases) or None, help_behavior_hint="")
+    return tyro.conf.arg(aliases=list(aliases) or None, help_behavior_hint="", help=help)
+
+
+# Flags that several subcommands have.
+Threads: TypeAlias = Annotated[
+    int | None, flag("N", default="all cores", help="Number of CPU threads.")
+]
+Quiet: TypeAlias = Annotated[bool, switch("-q", help="Print only the result and no progress.")]
 
 
 def with_flags(message: str) -> str:

@@ -80,9 +80,7 @@ def parse(arguments: Sequence[str]) -> Any:
     """Parse the arguments into the dataclass of their subcommand.
 
     Exits the process, as argparse does, after printing a help text.
-
-    Raises:
-        UserError: an unknown subcommand, or invalid or refused flags.
+    Raises: UserError: an unknown subcommand, or invalid or refused flags.
     """
     name, *rest = arguments
     name = _FORMER_NAMES.get(name, name)
@@ -100,10 +98,7 @@ def parse(arguments: Sequence[str]) -> Any:
     try:
         with redirect_stderr(printed):
             return tyro.cli(
-                union,
-                prog="snowsplat",
-                args=[name, *rest],
-                config=(tyro.conf.FlagCreatePairsOff,),
+                union, prog="snowsplat", args=[name, *rest], config=(tyro.conf.FlagCreatePairsOff,)
             )
     except SystemExit as ended:
         if name.startswith("-") or not ended.code:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch, with_flags
+from snowsplat.cli.flags import Threads, flag, switch, with_flags
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
-from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.cli.page_flags import AllowHost, page_at
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.stage_lines import photos_of_last_part
 from snowsplat.util.byte_size import format_bytes
@@ -27,17 +27,8 @@ if TYPE_CHECKING:
 
 # The flags that the command for resuming repeats, in this order.
 _RESUMED_FLAGS = (
-    "output",
-    "quality",
-    "minutes",
-    "hold_out",
-    "title",
-    "exposure",
-    "threads",
-    "device",
-    "memory",
-    "port",
-    "host",
+    *("output", "quality", "minutes", "hold_out", "title", "exposure", "threads", "device"),
+    *("memory", "port", "host"),
 )
 
 
@@ -87,8 +78,7 @@ class Make(Reports):
     ] = None
     """Whether to learn a gain for each photo and colour channel, for photos with different
     exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to train on."""
     memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
@@ -102,9 +92,7 @@ class Make(Reports):
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C."""
@@ -115,12 +103,12 @@ class Make(Reports):
             quality=self.quality,
             minutes=self.minutes,
             memory=self.memory,
-            hold_out=_hold_out(self.hold_out),
             title=self.title,
             exposure=self.exposure or "auto",
             compute=Compute(self.device, self.threads),
+            **({} if self.hold_out is None else {"hold_out": _hold_out(self.hold_out)}),
         )
-        page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
+        page = page_at(self.port, self.host, self.allow_host, self.view)
         with page or nullcontext():
             try:
                 with TerminalObserver() as observer:
@@ -173,10 +161,8 @@ class Make(Reports):
             )
 
 
-def _hold_out(text: str | None) -> int | None:
+def _hold_out(text: str) -> int | None:
     """Raises UserError: the text is neither a number from 2 on nor "none"."""
-    if text is None:
-        return 8
     if text == "none":
         return None
     if not text.isdecimal() or int(text) < 2:

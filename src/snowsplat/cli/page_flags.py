@@ -6,8 +6,7 @@ import getpass
 import os
 import socket
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 from urllib.parse import urlsplit
 
 import tyro
@@ -19,36 +18,27 @@ from snowsplat.viewer.hosts import LOCAL_HOST
 if TYPE_CHECKING:
     from snowsplat.pipeline.run.live_page import LivePage
 
-AllowHost = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, flag("NAME")]
+AllowHost: TypeAlias = Annotated[
+    tuple[str, ...],
+    tyro.conf.UseAppendAction,
+    flag("NAME", help="Name of a proxy through which browsers open the page. Can be repeated."),
+]
 
 
-@dataclass(frozen=True)
-class PageFlags:
-    """The address of the page."""
+def page_at(
+    port: int | None, host: str | None, allow_host: tuple[str, ...], view: bool = True
+) -> LivePage | None:
+    """The page at the address of these flags, not yet open; None without ``view``.
+    Raises: UserError: a port or host without a page, or one that cannot be used.
+    """
+    if view:
+        from snowsplat.pipeline.run.live_page import LivePage
 
-    port: int | None = None
-    host: str | None = None
-    allow_host: tuple[str, ...] = ()
-
-    def page(self, view: bool = True) -> LivePage | None:
-        """The page, not yet open; None without ``view``.
-
-        Raises:
-            UserError: a port or host without a page, or one that cannot be used.
-        """
-        if view:
-            from snowsplat.pipeline.run.live_page import LivePage
-
-            return LivePage(self.port, self.host, self.allow_host)
-        given = {
-            "--port": self.port is not None,
-            "--host": self.host is not None,
-            "--allow-host": bool(self.allow_host),
-        }
-        for name in given:
-            if given[name]:
-                raise UserError(f"{name} sets the address of a page; add --view to open one")
-        return None
+        return LivePage(port, host, allow_host)
+    for name, given in (("port", port), ("host", host), ("allow-host", allow_host or None)):
+        if given is not None:
+            raise UserError(f"--{name} sets the address of a page; add --view to open one")
+    return None
 
 
 def for_other_computers(url: str, others: Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Threads, flag, switch
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
@@ -48,13 +48,10 @@ class Publish(Reports):
     """Replace a web site in FOLDER."""
     iteration: Annotated[int | None, flag("N", default="the last step")] = None
     """If OUT contains several scenes, the step after which the scene was saved."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.scene is None:
             raise UserError("publish needs a scene; use a file or the output folder of a training")
         if self.output is None:

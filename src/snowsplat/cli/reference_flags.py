@@ -17,29 +17,20 @@ from snowsplat.util.errors import UserError
 
 @dataclass(frozen=True)
 class ReferenceFlag:
-    """A flag of the reference implementation.
+    """A flag of the reference implementation."""
 
-    Attributes:
-        spellings: as in its command line, with "_"; here "-" is accepted, too.
-        outcome: own: the subcommand has this flag; becomes: it is replaced by ``new``; ignored: it
-            has no effect here, and the note is printed; refused: the note is the error.
-        note: why it is ignored or refused, and what to use instead; otherwise a remark for the
-            guide: how it differs.
-        new: the flags in its place, before its values.
-        values: number of its values; "+": all up to the next flag.
-        only_with: it is ignored, with the note, without this flag.
-    """
-
-    spellings: tuple[str, ...]
+    spellings: tuple[str, ...]  # as in its command line, with "_"; here "-" is accepted, too
+    # own: the subcommand has this flag; becomes: it is replaced by ``new``; ignored: it has no
+    # effect here, and the note is printed; refused: the note is the error.
     outcome: Literal["own", "becomes", "ignored", "refused"]
-    note: str = ""
-    new: tuple[str, ...] = ()
-    values: int | Literal["+"] = 0
-    only_with: str | None = None
+    note: str = ""  # why, and what to use instead; or a remark for the guide: how it differs
+    new: tuple[str, ...] = ()  # the flags in its place, before its values
+    values: int | Literal["+"] = 0  # number of its values; "+": all up to the next flag
+    only_with: str | None = None  # it is ignored, with the note, without this flag
 
 
-def _own(*spellings: str, note: str = "") -> ReferenceFlag:
-    return ReferenceFlag(spellings, "own", note)
+def _own(spellings: str, note: str = "") -> ReferenceFlag:
+    return ReferenceFlag(tuple(spellings.split()), "own", note)
 
 
 def _becomes(
@@ -64,9 +55,9 @@ _ONE_CAUSE = "a kernel that fails ends the run with its message"
 
 # The flags that train.py and render.py share.
 _SHARED = (
-    _own("--source_path", "-s"),
-    _own("--model_path", "-m"),
-    _own("--resolution", "-r", note="-1 reduces no photo, however wide it is"),
+    _own("--source_path -s"),
+    _own("--model_path -m"),
+    _own("--resolution -r", "-1 reduces no photo, however wide it is"),
     _ignored("--data_device", "photos stay decoded as far as memory suffices, see --memory", 1),
     _ignored("--convert_SHs_python", "it chooses another way to the same image"),
     _ignored("--compute_cov3D_python", "it chooses another way to the same image"),
@@ -80,34 +71,20 @@ PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
         "train.py",
         (
             *_SHARED,
-            _own("--images", "-i"),
-            _own("--eval"),
-            _own("--white_background", "-w"),
+            *map(_own, ("--images -i", "--eval", "--white_background -w")),
             _becomes("--random_background", "--background random"),
-            _own("--sh_degree"),
-            _own("--iterations"),
-            _own("--test_iterations"),
-            _own("--save_iterations"),
-            _own("--quiet"),
-            _own("--feature_lr"),
-            _own("--opacity_lr"),
-            _own("--scaling_lr"),
-            _own("--rotation_lr"),
-            _own("--position_lr_init"),
-            _own("--position_lr_final"),
+            *map(_own, ("--sh_degree", "--iterations", "--test_iterations", "--save_iterations")),
+            *map(_own, ("--quiet", "--feature_lr", "--opacity_lr", "--scaling_lr")),
+            *map(_own, ("--rotation_lr", "--position_lr_init", "--position_lr_final")),
             _own("--position_lr_max_steps"),
             _ignored(
                 "--position_lr_delay_mult",
                 "its delay has 0 steps, in the reference implementation, too",
                 1,
             ),
-            _own("--lambda_dssim"),
-            _own("--percent_dense"),
-            _own("--densification_interval"),
-            _own("--densify_from_iter"),
-            _own("--densify_until_iter"),
-            _own("--densify_grad_threshold"),
-            _own("--opacity_reset_interval"),
+            *map(_own, ("--lambda_dssim", "--percent_dense", "--densification_interval")),
+            *map(_own, ("--densify_from_iter", "--densify_until_iter")),
+            *map(_own, ("--densify_grad_threshold", "--opacity_reset_interval")),
             _ignored("--optimizer_type", "the recipe chooses the optimiser", 1),
             _refused(
                 "--checkpoint_iterations",
@@ -146,9 +123,7 @@ PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
         "render.py",
         (
             *_SHARED,
-            _own("--iteration"),
-            _own("--skip_train"),
-            _own("--skip_test"),
+            *map(_own, ("--iteration", "--skip_train", "--skip_test")),
             _becomes("--quiet", "", "no progress is printed"),
             _ignored(
                 "--images -i", "the photos are those of the training; -r changes their size", 1
@@ -164,10 +139,7 @@ PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
     "sfm": (
         "convert.py",
         (
-            _own("--source_path", "-s"),
-            _own("--camera"),
-            _own("--skip_matching"),
-            _own("--resize"),
+            *map(_own, ("--source_path -s", "--camera", "--skip_matching", "--resize")),
             _ignored("--no_gpu", "photos are matched on the CPU in any case"),
             _ignored("--colmap_executable", "COLMAP is part of the installation", 1),
             _ignored("--magick_executable", "ImageMagick is not needed", 1),
@@ -179,8 +151,7 @@ PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
 def translated(subcommand: str, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """The arguments for a subcommand without the flags that it does not have, and notes on these.
 
-    Raises:
-        UserError: a flag is refused; the message names what to use instead.
+    Raises: UserError: a flag is refused; the message names what to use instead.
     """
     _, flags = PROGRAMS.get(subcommand, ("", ()))
     known = {s.replace("_", "-"): flag for flag in flags for s in flag.spellings}

@@ -60,8 +60,7 @@ class Render(SceneFlags, Reports):
     rendered. Use it if a scene file from another program lacks this mark."""
 
     projection: Annotated[
-        Literal["pinhole", "equirectangular"],
-        flag("{pinhole,equirectangular}", default="pinhole"),
+        Literal["pinhole", "equirectangular"], flag("{pinhole,equirectangular}", default="pinhole")
     ] = "pinhole"
     """equirectangular: 360° pictures of all directions, level, from the places of the photos or
     along --path: images to OUT/SPLIT/ours_N/panoramas, or a 360° video; --size is their width."""
@@ -84,10 +83,8 @@ class Render(SceneFlags, Reports):
     video: Annotated[Path | None, flag("FILE.mp4", "--film", default="in OUT/videos")] = None
     """File to which the video is written."""
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.path is not None:
             self._render_video(self.path)
             return 0

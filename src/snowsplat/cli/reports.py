@@ -13,7 +13,9 @@ from typing import Annotated, Any, TypeAlias
 
 from snowsplat.cli.flags import switch
 
-JsonFlag: TypeAlias = Annotated[bool, switch()]
+JsonFlag: TypeAlias = Annotated[
+    bool, switch(help="Print the result as JSON on stdout, and everything else on stderr.")
+]
 
 
 class Reports:

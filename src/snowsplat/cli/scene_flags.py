@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from snowsplat.cli.flags import flag
+from snowsplat.cli.flags import Threads, flag
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -33,8 +33,7 @@ class SceneFlags:
     resolution: Annotated[int | None, flag("N", "-r", default="as trained")] = None
     """With 1, 2, 4 or 8, the width and height of the photos are divided by this number. Any other
     number is the new width in pixels."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to compute on."""
 

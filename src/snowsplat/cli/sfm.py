@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Quiet, Threads, flag, switch
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
@@ -71,17 +71,13 @@ class Sfm(Reports):
     """With -s, do not estimate camera poses; use the COLMAP model in LOCATION/distorted/sparse/0
     and only undistort the photos."""
 
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     overwrite: Annotated[bool, switch()] = False
     """Replace the dataset in DATASET even if it was made from other photos."""
-    quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result and no progress."""
+    quiet: Quiet = False
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         inputs, folder = self._inputs_and_folder()
         from snowsplat.data.placement import placement_of
         from snowsplat.evaluation.verdict import Verdict

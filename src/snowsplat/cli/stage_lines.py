@@ -13,10 +13,6 @@ def described(stage: str, result: dict[str, Any]) -> list[str]:
     return _LINES[stage](result)
 
 
-def _demo(taken: dict[str, Any]) -> list[str]:
-    return [f"{taken['photos']} photos of a synthetic scene"]
-
-
 def _photos(gathered: dict[str, Any]) -> list[str]:
     photos, skipped = gathered["photos"], gathered["skipped"]
     masks = sum(bool(photo.get("mask")) for photo in photos)
@@ -59,18 +55,10 @@ def _images(undistorted: dict[str, Any]) -> list[str]:
     return [line + (f", {undistorted['masks']} masks" if undistorted["masks"] else "")]
 
 
-def _report(written: dict[str, Any]) -> list[str]:
-    return [written["file"]]
-
-
 def _scene(trained: dict[str, Any]) -> list[str]:
     size = f" at {trained['size']}" if "size" in trained else ""  # earlier versions did not say it
     quality = f", PSNR {trained['psnr']:.2f} dB{size}" if "psnr" in trained else ""
     return [f"{trained['iteration']} steps{quality}"]
-
-
-def _pictures(rendered: dict[str, Any]) -> list[str]:
-    return ["test views rendered"]
 
 
 def _all(trained: dict[str, Any]) -> list[str]:
@@ -105,13 +93,13 @@ def _listed(lines: list[str]) -> list[str]:
 
 
 _LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {
-    "demo": _demo,
+    "demo": lambda taken: [f"{taken['photos']} photos of a synthetic scene"],
     "photos": _photos,
     "poses": _poses,
     "images": _images,
-    "report": _report,
+    "report": lambda written: [written["file"]],
     "scene": _scene,
-    "pictures": _pictures,
+    "pictures": lambda rendered: ["test views rendered"],
     "all": _all,
     "video": _video,
     "levels": _levels,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from snowsplat.cli.step_progress import print_above
 from snowsplat.util.duration import duration
 
 if TYPE_CHECKING:
@@ -67,12 +68,8 @@ class StageProgress:
 
     def say(self, line: str) -> None:
         """Print a line, above the bar."""
-        if self.quiet:
-            return
-        if self._bar is not None:
-            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
-        else:
-            print(line, file=self.stream, flush=True)
+        if not self.quiet:
+            print_above(self._bar, line, self.stream)
 
     def _report(self, done: int, total: int, what: str = "", left: float | None = None) -> None:
         now = time.monotonic()

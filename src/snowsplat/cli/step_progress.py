@@ -81,14 +81,11 @@ class StepProgress:
             self._last_line = now
             percent = 100 * progress.step // self.total
             counted = f"step {progress.step}/{self.total} ({percent}%)"
-            print(f"{counted}  {self._text(progress)}", file=self.stream, flush=True)
+            self.say(f"{counted}  {self._text(progress)}")
 
     def say(self, line: str) -> None:
         """Print a line, above the bar."""
-        if self._bar is not None:
-            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
-        else:
-            print(line, file=self.stream, flush=True)
+        print_above(self._bar, line, self.stream)
 
     def _update_rate(self, step: int, now: float) -> None:
         elapsed = now - self._last_time
@@ -110,6 +107,14 @@ class StepProgress:
             f"{rate:.1f} it/s  loss {self._loss:.4f}  {progress.gaussians:,} Gaussians"
             f"{self._psnr}  {resident_bytes() / 1e6:.0f} MB  {remaining}"
         )
+
+
+def print_above(bar: Progress | None, line: str, stream: TextIO) -> None:
+    """Print a line above the bar, or to ``stream`` if there is none."""
+    if bar is not None:
+        bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+    else:
+        print(line, file=stream, flush=True)
 
 
 def _whole(total: int) -> Column:

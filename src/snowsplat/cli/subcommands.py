@@ -17,29 +17,26 @@ class Subcommand:
     module: str  # defines its dataclass; ``Train`` for the subcommand ``train``
 
 
-def _own(name: str, usage: str, result: str) -> tuple[str, Subcommand]:
-    return name, Subcommand(usage, result, f"snowsplat.cli.{name}")
-
-
-SUBCOMMANDS: dict[str, Subcommand] = dict(
-    (
-        _own("demo", "", "try it, without own photos"),
-        _own("make", "PHOTOS", "photos or a video -> a scene"),
-        _own("sfm", "PHOTOS -o DATASET", "photos or a video -> a dataset"),
-        _own("train", "DATASET -o OUT --eval", "a dataset -> a scene in OUT"),
-        _own("evaluate", "OUT", "PSNR and SSIM on the held-out photos"),
-        _own("render", "OUT", "images and videos of the scene"),
-        _own("view", "FILE|OUT", "show a finished scene in the browser"),
-        _own("watch", "OUT", "show the training in the browser"),
-        _own("convert", "SCENE [MORE …] FILE", "another format; crop, decimate, merge"),
-        _own("clean", "SCENE FILE", "the scene without floaters"),
-        _own("publish", "SCENE -o FOLDER", "a web site, for any host"),
-        _own("benchmark", "FOLDER -o OUT", "all scenes of a folder, and a table"),
-        _own("blocks", "plan DATASET -o OUT", "a scene larger than the memory"),
-        _own("info", "PATH", "describe a file or a folder"),
-        _own("doctor", "", "is everything installed? which GPU?"),
+SUBCOMMANDS = {
+    name: Subcommand(usage, result, f"snowsplat.cli.{name}")
+    for name, usage, result in (
+        ("demo", "", "try it, without own photos"),
+        ("make", "PHOTOS", "photos or a video -> a scene"),
+        ("sfm", "PHOTOS -o DATASET", "photos or a video -> a dataset"),
+        ("train", "DATASET -o OUT --eval", "a dataset -> a scene in OUT"),
+        ("evaluate", "OUT", "PSNR and SSIM on the held-out photos"),
+        ("render", "OUT", "images and videos of the scene"),
+        ("view", "FILE|OUT", "show a finished scene in the browser"),
+        ("watch", "OUT", "show the training in the browser"),
+        ("convert", "SCENE [MORE …] FILE", "another format; crop, decimate, merge"),
+        ("clean", "SCENE FILE", "the scene without floaters"),
+        ("publish", "SCENE -o FOLDER", "a web site, for any host"),
+        ("benchmark", "FOLDER -o OUT", "all scenes of a folder, and a table"),
+        ("blocks", "plan DATASET -o OUT", "a scene larger than the memory"),
+        ("info", "PATH", "describe a file or a folder"),
+        ("doctor", "", "is everything installed? which GPU?"),
     )
-)
+}
 
 
 def register(name: str, subcommand: Subcommand) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.page_flags import PageFlags
+from snowsplat.cli.page_flags import page_at
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.train_flags import TrainFlags
 from snowsplat.util.errors import UserError
@@ -38,7 +38,6 @@ class Train(TrainFlags, Reports):
     """
 
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
         """Returns the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
@@ -68,7 +67,7 @@ class Train(TrainFlags, Reports):
         from snowsplat.pipeline.train import resume, train
 
         logs = [LOGS[name](self.output) for name in self.log]
-        page = PageFlags(self.port, self.host, self.allow_host).page(self.view)
+        page = page_at(self.port, self.host, self.allow_host, self.view)
         with TerminalObserver(self.quiet) as terminal, page or nullcontext():
             observer = Observers(terminal, *logs)
             try:

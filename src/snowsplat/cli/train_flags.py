@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -10,12 +11,14 @@ import tyro
 
 from snowsplat.cli.config_file import training_in
 from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, ConfigFlags, RecipeName
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Quiet, flag, switch
 from snowsplat.cli.page_flags import AllowHost
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
+    from snowsplat.pipeline.output.output_folder import DatasetSettings
     from snowsplat.pipeline.train import TrainOptions
+    from snowsplat.training.settings.config import TrainConfig
 
 
 @dataclass
@@ -63,7 +66,6 @@ class JobFlags:
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
     """Memory limit of the training, for example 4GB. On a GPU, this is memory of the GPU; on the
@@ -97,8 +99,7 @@ class JobFlags:
     ] = ()
     """Also write loss, number of Gaussians and metrics of the steps: csv: to OUT/log.csv;
     tensorboard: to OUT/tensorboard, which needs the package snowsplat[tensorboard]."""
-    quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result and no progress."""
+    quiet: Quiet = False
 
 
 @dataclass
@@ -111,16 +112,22 @@ class TrainFlags(ConfigFlags, JobFlags):
             raise UserError("the dataset is named twice; leave out DATASET or -s")
         given = self.dataset or self.source_path
         if given is None and self.config is not None and not self.resume:
-            earlier = training_in(self.config)[1].path
+            earlier = self._earlier[1].path
             given = Path(earlier) if earlier else None
         return given
+
+    @cached_property
+    def _earlier(self) -> tuple[TrainConfig, DatasetSettings]:
+        """The configuration and the dataset of the earlier training that is the configuration."""
+        assert self.config is not None
+        return training_in(self.config)
 
     def options(self) -> TrainOptions:
         """The options of `pipeline.train.train`. Raises: UserError: contradictory flags."""
         from snowsplat.pipeline.compute import Compute
         from snowsplat.pipeline.train import TrainOptions
 
-        config, earlier = (None, None) if self.config is None else training_in(self.config)
+        config, earlier = (None, None) if self.config is None else self._earlier
         before = {} if earlier is None else asdict(earlier)
         if self.eval or self.test_list is not None:
             before |= dict.fromkeys(("hold_out", "first_held_out", "test_list"))
@@ -145,8 +152,5 @@ class TrainFlags(ConfigFlags, JobFlags):
         if self.white_background and settings.setdefault("background", "white") != "white":
             raise UserError("-w and --background set different colours; use one of them")
         if self.feature_lr is not None:
-            settings = {
-                "lr_sh_dc": self.feature_lr,
-                "lr_sh_rest": self.feature_lr / 20,
-            } | settings
+            settings = {"lr_sh_dc": self.feature_lr, "lr_sh_rest": self.feature_lr / 20} | settings
         return settings

@@ -51,7 +51,6 @@ class View:
     port: Annotated[int, flag("N", default="a free one")] = 0
     """Port to listen on."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
     no_browser: Annotated[bool, switch()] = False
     """Print the URL, but do not open a browser."""
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from snowsplat.cli.flags import flag
 from snowsplat.cli.observer import WatchObserver
-from snowsplat.cli.page_flags import AllowHost, PageFlags
+from snowsplat.cli.page_flags import AllowHost, page_at
 from snowsplat.cli.scene_flags import SceneFlags
 
 
@@ -32,14 +32,13 @@ class Watch(SceneFlags):
     host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
     allow_host: AllowHost = ()
-    """Name of a proxy through which browsers open the page. Can be repeated."""
 
     def run(self) -> int:
         """Runs until Ctrl-C; returns the exit code, 0."""
         path = self.output_path()
         from snowsplat.pipeline.watch import watch
 
-        page = PageFlags(self.port, self.host, self.allow_host).page()
+        page = page_at(self.port, self.host, self.allow_host)
         assert page is not None
         with WatchObserver() as observer, page:
             watch(

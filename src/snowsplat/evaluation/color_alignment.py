@@ -11,16 +11,10 @@ def color_fit(
 ) -> tuple[Tensor, Tensor] | None:
     """The gain and the offset of each channel with which an image is most similar to a photo.
 
-    They minimise Σ (gain · image + offset − photo)² over the pixels. A negative gain would invert
-    the image, so it is at least 0.
+    They minimise Σ (gain · image + offset − photo)² over the pixels of the images (H, W, 3) where
+    ``mask`` (H, W) is True. A negative gain would invert the image, so it is at least 0.
 
-    Args:
-        image: (H, W, 3).
-        photo: (H, W, 3).
-        mask: (H, W) bool, False for pixels to ignore.
-
-    Returns:
-        Gain (3,) and offset (3,), float64; None if the mask leaves no pixel.
+    Returns gain (3,) and offset (3,), float64; None if the mask leaves no pixel.
     """
     if mask is None:
         x, y = image.flatten(0, 1).double(), photo.flatten(0, 1).double()

@@ -68,13 +68,10 @@ class Coverage:
 
 
 def coverage(gaussians: Gaussians, cameras: Sequence[Camera], report: Report = _silent) -> Coverage:
-    """Render each view, and find out which Gaussians it shows, and which are in front.
+    """Render the views of the photos, and find out which Gaussians they show, and which in front.
 
-    Args:
-        gaussians: N Gaussians.
-        cameras: those of the photos.
-        report: called with the number of rendered views, of all, and the word "views"; each view
-            is rendered several times.
+    ``report`` is called with the number of rendered views, of all, and the word "views"; each view
+    is rendered several times.
     """
     small = [reduced(camera) for camera in cameras]
     solid = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
@@ -138,10 +135,8 @@ def clean(
     the group is tried.
 
     Args:
-        gaussians: N Gaussians.
         cameras: those of the photos with which the scene was trained.
         quality: the larger, the better; for example the PSNR of held-out photos.
-        enough: see above.
         report: as in `coverage`; then with the number of floaters that are kept or removed, of
             all, and the word "floaters".
     """

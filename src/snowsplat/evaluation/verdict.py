@@ -18,11 +18,7 @@ Grade = Literal["good", "usable", "poor"]
 GRADES: tuple[Grade, ...] = ("poor", "usable", "good")
 #: At most this number of reasons is told, and as many kinds of advice: more are not read.
 _TOLD = 3
-_MEANING = {
-    "good": "",
-    "usable": ", with limits",
-    "poor": "; expect blurred or wrong parts",
-}
+_MEANING = {"good": "", "usable": ", with limits", "poor": "; expect blurred or wrong parts"}
 
 #: The style of `Verdict.html`.
 STYLE = """

@@ -6,27 +6,9 @@ import of this package registers their subcommands.
 
 from snowsplat.cli.subcommands import Subcommand, register
 
-register(
-    "lift",
-    Subcommand(
-        "PHOTO --depth MAP -o OUT",
-        "one photo and its depth -> a scene",
-        "snowsplat.extras.lift.command",
-    ),
-)
-register(
-    "image",
-    Subcommand(
-        "PHOTO -o OUT",
-        "a photo as 1000 Gaussians",
-        "snowsplat.extras.image.command",
-    ),
-)
-register(
-    "globe",
-    Subcommand(
-        "SCENE",
-        "a snow globe, as a web page",
-        "snowsplat.extras.globe.command",
-    ),
-)
+for _name, _usage, _result in (
+    ("lift", "PHOTO --depth MAP -o OUT", "one photo and its depth -> a scene"),
+    ("image", "PHOTO -o OUT", "a photo as 1000 Gaussians"),
+    ("globe", "SCENE", "a snow globe, as a web page"),
+):
+    register(_name, Subcommand(_usage, _result, f"snowsplat.extras.{_name}.command"))

@@ -16,7 +16,7 @@ from snowsplat.data import ImageLoader
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.pipeline.output.scene_source import load_trained
+from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
 from snowsplat.training.core.step_schedule import Schedule
@@ -40,20 +40,13 @@ _LAST_STRETCHES = 10
 
 @dataclass(frozen=True)
 class LastPart:
-    """The result of `train_on_all`.
+    """The result of `train_on_all`."""
 
-    Attributes:
-        gaussians: the scene; None if there was no last part.
-        steps, photos: numbers of steps and of photos.
-        left_out: the number of photos that are left out, because the scene does not explain them.
-        why_not: why there was no last part; "" if there was one.
-    """
-
-    gaussians: Gaussians | None
-    steps: int
-    photos: int
-    left_out: int = 0
-    why_not: str = ""
+    gaussians: Gaussians | None = None  # the scene; None if there was no last part
+    steps: int = 0
+    photos: int = 0  # their number
+    left_out: int = 0  # the number of photos that the scene does not explain
+    why_not: str = ""  # why there was no last part; "" if there was one
 
 
 def train_on_all(
@@ -67,16 +60,14 @@ def train_on_all(
     or little time, the last part would change little.
 
     Args:
-        folder: of the training run.
         iteration: of the scene to begin with.
         seconds: the time that is left; infinite if there is no limit.
 
     Raises:
         UserError: scene, settings, dataset or a photo are missing or damaged.
-        KeyboardInterrupt: Ctrl-C.
     """
     if (folder.path / "masks").is_dir():
-        return LastPart(None, 0, 0, why_not="something moves in the photos")
+        return LastPart(why_not="something moves in the photos")
     scene = load_trained(folder.path, iteration=iteration, compute=compute)
     left_out = set(read_json(folder.path / "metrics.json").get("left_out", []))
     used = [view for view in scene.dataset.train if view.name not in left_out]
@@ -87,7 +78,7 @@ def train_on_all(
         pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
         steps = min(steps, int(seconds / pace)) if pace > 0 else 0
     if steps < _LOOKS * len(views):
-        return LastPart(None, 0, 0, why_not="it would use each photo less than twice")
+        return LastPart(why_not="it would use each photo less than twice")
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
     with ImageLoader(views, device=background.device) as images:
         wrong = unexplained_views(
@@ -99,13 +90,8 @@ def train_on_all(
         )
     views = [view for i, view in enumerate(views) if i < len(used) or i not in wrong]
     exposures = folder.exposures()
-    config = _last_config(
-        config_from_json(read_json(folder.path / "config.json")["training"]),
-        scene.gaussians,
-        (iteration, steps),
-        (scene.dataset.extent, len(scene.dataset.train)),
-        exposures=bool(exposures),
-    )
+    config = config_from_json(read_json(folder.path / "config.json")["training"])
+    config = _last_config(config, scene, steps, exposures=bool(exposures))
     trainer = Trainer(
         replace(scene.dataset, train=views, test=[]),
         config,
@@ -115,34 +101,21 @@ def train_on_all(
     exposure = trainer.part(Exposure)
     if exposure is not None:
         exposure.continue_with(torch.tensor([exposures[view.name] for view in used]))
-    observer.steps_begin(0, steps)
-    try:
+    with observer.stepping(0, steps):
         trainer.run(observer.step)
-    finally:
-        observer.steps_end()
     photos = len(scene.dataset.train) + len(scene.dataset.test)
     return LastPart(trainer.gaussians.detach(), steps, len(views), photos - len(views))
 
 
 def _last_config(
-    config: TrainConfig,
-    gaussians: Gaussians,
-    steps: tuple[int, int],
-    scene: tuple[float, int],
-    *,
-    exposures: bool,
+    config: TrainConfig, scene: TrainedScene, last: int, *, exposures: bool
 ) -> TrainConfig:
-    """The configuration of the last part.
+    """The configuration of the training, changed for ``last`` more steps.
 
-    Args:
-        config: that of the training.
-        steps: those of the training, and those of the last part.
-        scene: the extent, and the number of training photos.
-        exposures: whether gains of exposure are learnt.
+    ``exposures``: whether gains of exposure are learnt.
     """
-    iterations, last = steps
-    extent, views = scene
-    ends = config.learning_rates.at(iterations, Schedule(iterations), extent, views)
+    iteration, extent, views = scene.iteration, scene.dataset.extent, len(scene.dataset.train)
+    ends = config.learning_rates.at(iteration, Schedule(iteration), extent, views)
     ends["means"] /= extent
     rates = replace(
         config.learning_rates,
@@ -157,7 +130,9 @@ def _last_config(
         config,
         iterations=last,
         learning_rates=rates,
-        density=replace(config.density, densify_until=0, max_gaussians=max(1, len(gaussians))),
+        density=replace(
+            config.density, densify_until=0, max_gaussians=max(1, len(scene.gaussians))
+        ),
         gaussians_per_pixel=0.0,
         decay=DecayRates(),
         exposure="on" if exposures else "off",

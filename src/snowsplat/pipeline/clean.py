@@ -28,31 +28,23 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
 from snowsplat.util.process import single_threaded
 
-#: At most this number of photos is compared, evenly chosen.
-_VIEWS = 24
+_VIEWS = 24  # at most so many photos are compared, evenly chosen
 #: The PSNR of the training photos may fall by this number of dB, and that of the renderings of the
 #: whole scene to the second number: the difference is not visible.
 _LOST, _SAME = 0.02, 40.0
-#: The PSNR of identical renderings.
-_SAME_IMAGE = 100.0
+_SAME_IMAGE = 100.0  # the PSNR of identical renderings
 
 _Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What `clean` has done.
+    """What `clean` has done."""
 
-    Attributes:
-        before, after: the numbers of Gaussians.
-        compared: what was compared with the renderings, such as "7 held-out photos".
-        psnr: PSNR of the renderings in dB, before and after.
-    """
-
-    before: int
-    after: int
-    compared: str
-    psnr: tuple[float, float]
+    before: int  # number of Gaussians
+    after: int  # number of Gaussians
+    compared: str  # what was compared with the renderings, such as "7 held-out photos"
+    psnr: tuple[float, float]  # of the renderings in dB, before and after
 
 
 def clean(
@@ -126,14 +118,13 @@ def _judge(
 ) -> _Judge:
     if photos is None:
         return _judge_of_renderings(gaussians, cameras, background)
-    held_out = bool(photos.test)
     views = _evenly(photos.test or photos.train)
 
     def psnr(scene: Gaussians) -> float:
         return evaluate_views(scene, views, background=background).psnr
 
     size = size_text((view.camera.width, view.camera.height) for view in views)
-    if held_out:
+    if photos.test:
         return _Judge(f"{len(views)} held-out photos of {size}", psnr, lambda before: math.inf)
     return _Judge(f"{len(views)} training photos of {size}", psnr, lambda before: before - _LOST)
 
@@ -157,11 +148,7 @@ def _judge_of_renderings(
 
 
 def _photos(scene: Path, dataset: Path | None) -> Dataset | None:
-    """The photos of a scene; None: they are unknown, or not there any more.
-
-    Raises:
-        UserError: ``dataset`` is not a dataset.
-    """
+    """The photos of a scene; None: they are unknown, or not there any more. Raises UserError."""
     if dataset is None:
         folder = folder_around(scene)
         if not folder.scenes():

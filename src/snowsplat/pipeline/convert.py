@@ -225,8 +225,7 @@ def _decimation(
 ) -> Decimation:
     """The decimation, with the cameras or photos that are known for these scene files.
 
-    Raises:
-        UserError: the photos of ``dataset`` do not show the edited scene.
+    Raises: UserError: the photos of ``dataset`` do not show the edited scene.
     """
     if dataset is None:
         if len(scenes) != 1:  # the cameras of one of several scenes do not show the others

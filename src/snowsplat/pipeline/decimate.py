@@ -28,13 +28,9 @@ _STEPS = 60
 
 
 def gaussians_to_keep(decimate: int | str, count: int) -> int:
-    """How many of ``count`` Gaussians ``decimate`` keeps.
+    """How many of ``count`` Gaussians a number (5000, "5000") or a percentage ("50%") keeps.
 
-    Args:
-        decimate: a number such as 5000 or "5000", or a percentage such as "50%".
-
-    Raises:
-        SettingError: ``decimate`` is neither.
+    Raises: SettingError: ``decimate`` is neither.
     """
     text = str(decimate)
     if re.fullmatch(r"\d+", text):
@@ -82,13 +78,10 @@ class Decimation:
         def report(step: int, loss: float) -> None:
             self.observer.step(Progress(step, loss, len(smaller), _STEPS, downscale=1))
 
-        self.observer.steps_begin(0, _STEPS)
-        try:
+        with self.observer.stepping(0, _STEPS):
             whole = seen_from_dataset(scene, self.origin).select(scene.usable_rows())
             color = torch.tensor(self.background)
             return distill(smaller, whole, self.cameras, color, _STEPS, report)
-        finally:
-            self.observer.steps_end()
 
 
 def write_within(
@@ -100,11 +93,7 @@ def write_within(
 ) -> None:
     """Write ``scene`` with so many Gaussians that the file ``target`` has at most ``size`` bytes.
 
-    Args:
-        write: writes a scene to a path.
-
-    Raises:
-        SettingError: even one Gaussian needs more.
+    Raises: SettingError: even one Gaussian needs more.
     """
     count = len(scene)
     with atomic_path(target) as temporary:

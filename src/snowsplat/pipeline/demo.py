@@ -18,10 +18,8 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Outcome
 
 PHOTOS, TRUTH, MADE = "photos", "truth", "made"
-MAX_DEGREES = 0.1  # largest accepted rotation error of a photo
-MAX_SHARE = (
-    0.002  # largest accepted position error of a photo, relative to the extent of the cameras
-)
+# Largest accepted errors of a photo: rotation, and position relative to the extent of the cameras.
+MAX_DEGREES, MAX_SHARE = 0.1, 0.002
 _OPTIONS = MakeOptions(quality="normal", minutes=2.2)
 
 
@@ -86,8 +84,7 @@ def _take_photos(folder: Path, observer: Observer) -> Truth:
 def compare_with_truth(dataset: Path, poses: Mapping[str, Tensor]) -> PoseErrors:
     """The errors of the poses of a dataset; ``poses`` are the true ones, as in `Truth`.
 
-    Raises:
-        ValueError: fewer than three photos have poses.
+    Raises: ValueError: fewer than three photos have poses.
     """
     model = read_model(dataset / "sparse" / "0")
     found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}

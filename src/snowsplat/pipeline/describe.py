@@ -42,8 +42,7 @@ def describe(path: Path | str) -> dict[str, Any]:
       what is impossible or doubtful about the cameras.
 
     Bounds and lengths are in world units, in the frame of the file, relative to the "origin" of a
-    scene or dataset that has one (`scene.origin`). torch is imported only for datasets, photos and
-    videos.
+    scene or dataset that has one (`scene.origin`). torch is imported only where it is needed.
 
     Raises:
         UserError: ``path`` is missing, damaged, or of an unknown kind.

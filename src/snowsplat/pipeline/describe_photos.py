@@ -28,9 +28,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
 
     Reads headers, and decodes up to 16 masks: the frames of videos and the pixels of photos are not
     decoded, unless two photos may be copies.
-
-    Raises:
-        UserError: a video is not readable.
+    Raises: UserError: a video is not readable.
     """
     path = sources.inputs[0]
     headers, left_out = _headers(sources.photos), list(sources.left_out)
@@ -58,8 +56,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
 def describe_zip(path: Path) -> dict[str, Any]:
     """What a zip file contains; it is not unpacked.
 
-    Raises:
-        UserError: see `snowsplat.sfm.ingest.archive.unpack`.
+    Raises: UserError: see `snowsplat.sfm.ingest.archive.unpack`.
     """
     suffixes = [PurePosixPath(name).suffix.lower() for name in files_in(path)]
     return {

@@ -24,12 +24,7 @@ from typing import Any
 
 from snowsplat._version import __version__
 from snowsplat.util.byte_size import format_bytes
-from snowsplat.util.machine import (
-    available_memory_bytes,
-    memory_bytes,
-    processor_name,
-    system_name,
-)
+from snowsplat.util.machine import available_memory_bytes, memory_bytes, processor_name, system_name
 
 #: Seconds for importing a package; a slow disk needs most of a minute for PyTorch.
 _TIMEOUT = 180.0
@@ -37,21 +32,13 @@ _TIMEOUT = 180.0
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the result.
+    """A line of the result."""
 
-    Attributes:
-        name: what it is about.
-        text: for people. If something is missing, the text says what this means, and what to do.
-        values: for programs; the values are those of JSON.
-        problem: whether something is missing or broken.
-        essential: whether nothing works without it.
-    """
-
-    name: str
-    text: str
-    values: dict[str, Any]
-    problem: bool = False
-    essential: bool = False
+    name: str  # what it is about
+    text: str  # for people; if something is missing, what this means, and what to do
+    values: dict[str, Any]  # for programs: values of JSON
+    problem: bool = False  # whether something is missing or broken
+    essential: bool = False  # whether nothing works without it
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,9 @@ _LEAST_SHARE = 0.5
 
 
 def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer) -> Dataset | None:
-    """The dataset in the folder ``sources.posed``; None if its poses must be estimated.
-
-    A line says whether the poses are used, and if not, why. Photos without a pose are named.
-
-    Args:
-        settings: how to read the dataset.
+    """The dataset in the folder ``sources.posed``, read with ``settings``; None if its poses must
+    be estimated. A line says whether the poses are used, and if not, why. Photos without a pose are
+    named.
     """
     name = shown(settings.path)
     try:

@@ -6,7 +6,6 @@ If the input is a dataset, its camera poses are used, unless they are impossible
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import shutil
 import time
@@ -56,17 +55,12 @@ from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.run_lock import LOCK, one_run
+from snowsplat.util.safe_json import read_json
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures", "all")  # `make_dataset` records its own stages
 # The fields of a preset that affect the training.
-_TRAINING_FIELDS = (
-    "side",
-    "iterations",
-    "max_gaussians",
-    "densify_interval",
-    "stop_overfitting",
-)
+_TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval", "stop_overfitting")
 # Photos that the scene does not explain after this fraction of the steps are left out of the
 # training: see docs/cameras.md.
 _LEAVE_OUT_AFTER = 0.2
@@ -158,8 +152,7 @@ class MakeResult:
 def scene_name(inputs: Sequence[Path]) -> str:
     """The name of a scene: the name of the first input, without its suffix.
 
-    Raises:
-        UserError: no inputs.
+    Raises: UserError: no inputs.
     """
     if not inputs:
         raise UserError("make needs photos; add a folder of photos, or a video")
@@ -283,7 +276,7 @@ class _Job:
                 (self.out / RECORD).unlink(missing_ok=True)
 
     def _plan(self) -> MakePlan:
-        """The plan for the requested quality. If a time is requested, it is made for this time.
+        """The plan for the requested quality or time.
 
         The poses depend on the plan. Therefore it is recorded, and later runs use the recorded
         plan.
@@ -297,9 +290,8 @@ class _Job:
         before = self.stages.about.get("plan", {})
         if {key: before.get(key) for key in about} != about:
             threads = self.options.compute.threads or ops.get_num_threads()
-            plan = choose_plan(
-                60.0 * minutes - self._elapsed(), photos, measure_speed(threads), quality
-            )
+            left = 60.0 * minutes - self._elapsed()
+            plan = choose_plan(left, photos, measure_speed(threads), quality)
             self.stages.about["plan"] = about | {"chosen": asdict(plan)}
             self.observer.note(described(plan, photos, 60.0 * minutes))
         return MakePlan(**self.stages.about["plan"]["chosen"])
@@ -314,13 +306,9 @@ class _Job:
                 seconds=self.options.minutes and POSES_SHARE * 60.0 * self.options.minutes,
             ),
         )
+        observer, later = self.observer, self._later()
         outcomes = make_dataset(
-            self.sources,
-            self.dataset,
-            options,
-            self.observer,
-            overwrite=self.overwrite,
-            later=self._later(),
+            self.sources, self.dataset, options, observer, overwrite=self.overwrite, later=later
         )
         before = self.stages.about.get("name")
         if outcomes["photos"].again and isinstance(before, str) and Path(before).name == before:
@@ -336,16 +324,17 @@ class _Job:
         return Later(work=PRESETS[self.plan.quality].training)
 
     def _make_scene(self) -> MakeResult:
-        settings: dict[str, Any] = {}
-        if self.given is not None:
-            settings["given"] = _fingerprint_of(self.given, self.dataset)
-        else:  # The key is the name of the folder, also if version 0.1.0 has recorded it.
-            settings[self.dataset.name] = _fingerprint(self.dataset)
+        # The key is the name of the folder, also if version 0.1.0 has recorded it.
+        settings: dict[str, Any] = (
+            {self.dataset.name: _fingerprint(self.dataset)}
+            if self.given is None
+            else {"given": _fingerprint_of(self.given, self.dataset)}
+        )
         if self.options.minutes is None:
             preset = PRESETS[self.plan.quality]
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
         else:
-            settings |= {"minutes": self.options.minutes}
+            settings["minutes"] = self.options.minutes
         settings |= {**self._split, "exposure": self.options.exposure}
         folder = OutputFolder(self.out / SCENE)
         outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
@@ -430,7 +419,7 @@ class _Job:
         self.stages.about["file"] = self.file.name
         result: dict[str, Any] = {"iteration": trained.step, "views": 0}
         if trained.evaluation is not None:
-            metrics = json.loads((folder.path / "metrics.json").read_text(encoding="utf-8"))
+            metrics = read_json(folder.path / "metrics.json")
             result |= {key: metrics[key] for key in ("psnr", "ssim", "psnr_aligned", "size")}
             result["views"] = len(metrics["views"])
         return result | {

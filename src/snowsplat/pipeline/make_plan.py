@@ -13,9 +13,8 @@ of this list that is fast enough:
 At the smaller size of a quality, the poses are as accurate as at the larger one, and a short
 training uses even smaller photos.
 
-The prediction may be too low, because the number of features and the load of the machine vary. The
-training then has less time. If structure from motion takes 45% longer than predicted, a third of
-the time is still left for the training.
+The prediction may be too low; the training then has less time. If structure from motion takes 45%
+longer than predicted, a third of the time is still left for the training.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
@@ -64,6 +64,15 @@ class Observer:
     def steps_end(self) -> None:
         """The last step is finished, or the training was interrupted."""
 
+    @contextmanager
+    def stepping(self, step: int, iterations: int) -> Iterator[None]:
+        """A context of the steps of a training run; see `steps_begin` and `steps_end`."""
+        self.steps_begin(step, iterations)
+        try:
+            yield
+        finally:
+            self.steps_end()
+
     def trained(self, result: TrainResult) -> None:
         """The training has finished; its files are written."""
 
@@ -77,10 +86,6 @@ class Observers(Observer):
     def __init__(self, *observers: Observer) -> None:
         self.all = observers
 
-    def note(self, line: str) -> None:
-        for each in self.all:
-            each.note(line)
-
     def begin(self, stage: str) -> Report:
         reports = [each.begin(stage) for each in self.all]
 
@@ -90,34 +95,17 @@ class Observers(Observer):
 
         return report
 
-    def end(self, stage: str, outcome: Outcome) -> None:
-        for each in self.all:
-            each.end(stage, outcome)
 
-    def leave(self) -> None:
-        for each in self.all:
-            each.leave()
+def _passed_on(name: str) -> Callable[..., None]:
+    def call(observers: Observers, *arguments: object) -> None:
+        for each in observers.all:
+            getattr(each, name)(*arguments)
 
-    def steps_begin(self, step: int, iterations: int) -> None:
-        for each in self.all:
-            each.steps_begin(step, iterations)
+    return call
 
-    def step(self, progress: Progress) -> None:
-        for each in self.all:
-            each.step(progress)
 
-    def steps_end(self) -> None:
-        for each in self.all:
-            each.steps_end()
-
-    def trained(self, result: TrainResult) -> None:
-        for each in self.all:
-            each.trained(result)
-
-    def page_opened(self, page: Page) -> None:
-        for each in self.all:
-            each.page_opened(page)
-
+for _name in ("note", "end", "leave", "steps_begin", "step", "steps_end", "trained", "page_opened"):
+    setattr(Observers, _name, _passed_on(_name))
 
 #: An observer that does nothing.
 SILENT = Observer()

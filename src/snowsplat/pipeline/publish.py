@@ -46,16 +46,11 @@ class PublishOptions:
 
 @dataclass(frozen=True)
 class PublishResult:
-    """A web site.
-
-    Attributes:
-        gaussians: the number of Gaussians of the scene.
-        bytes: the size of all files.
-    """
+    """A web site."""
 
     folder: Path
-    gaussians: int
-    bytes: int
+    gaussians: int  # the number of Gaussians of the scene
+    bytes: int  # the size of all files
 
 
 def publish(

@@ -26,9 +26,7 @@ def photos_of(scene: Path, dataset: Path) -> tuple[Dataset, str]:
 
     If ``scene`` is in an output folder, the photos have the size of its training, those that it
     held out are held out, and the cameras are those that it has refined.
-
-    Raises:
-        UserError: ``dataset`` is not a dataset.
+    Raises: UserError: ``dataset`` is not a dataset.
     """
     folder, background = folder_around(scene), "black"
     settings = DatasetSettings(str(dataset.absolute()))
@@ -58,11 +56,7 @@ def refine(
         max_gaussians=max(1, len(gaussians)),
         antialias=gaussians.antialiased,
     )
-    config = replace(config, learning_rates=_RATES)
-    trainer = Trainer(dataset, config, initial=gaussians.clone())
-    observer.steps_begin(0, _STEPS)
-    try:
+    trainer = Trainer(dataset, replace(config, learning_rates=_RATES), initial=gaussians.clone())
+    with observer.stepping(0, _STEPS):
         trainer.run(observer.step)
-    finally:
-        observer.steps_end()
     return trainer.gaussians.detach()

@@ -103,11 +103,7 @@ class CsvLog(_StepLog):
 
 
 class TensorBoardLog(_StepLog):
-    """A folder for TensorBoard.
-
-    Raises:
-        UserError: TensorBoard is not installed.
-    """
+    """A folder for TensorBoard. Raises: UserError: TensorBoard is not installed."""
 
     def __init__(self, folder: Path | str) -> None:
         super().__init__()

@@ -125,13 +125,12 @@ class TrainOptions(Settings):
         self, dataset: Path | str | None, before: DatasetSettings | None = None
     ) -> DatasetSettings:
         """How to read the dataset: ``before`` with the changes of these options."""
+        every = 8 if self.hold_out is None and self.test_list is not None else self.hold_out
         changes: dict[str, Any] = {
             "path": None if dataset is None else str(Path(dataset).absolute()),
             "images": self.images,
             "resolution": self.resolution,
-            "hold_out": 8
-            if self.hold_out is None and self.test_list is not None
-            else self.hold_out,
+            "hold_out": every,
             "first_held_out": self.first_held_out,
             "test_list": None if self.test_list is None else str(Path(self.test_list).absolute()),
         }
@@ -226,41 +225,35 @@ def resume(
 def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | None = None) -> None:
     """Take part in the training of process 0; for the other processes. Returns at its end.
 
-    Args:
-        parts, loss: as those of process 0.
-
-    Raises:
-        ProcessLost: process 0 or another process has ended with an error.
+    ``parts`` and ``loss`` are as those of process 0.
+    Raises: ProcessLost: process 0 or another process has ended with an error.
     """
     device = compute.apply()
     with joined(device) as shards:
         follow(shards, device, parts, loss)
 
 
+@dataclass
 class _Job:
     """One call of `train` or `resume`: prepares a `TrainingRun` and runs it."""
 
-    def __init__(
-        self,
-        out: OutputFolder,
-        options: TrainOptions,
-        observer: Observer,
-        page: LivePage | None,
-        started: float,
-        parts: Sequence[Part],
-        loss: Loss | None,
-    ) -> None:
-        self.out, self.options, self.observer, self.page = out, options, observer, page
-        self.started = started
-        self.parts, self.loss = parts, loss
-        self.shards: Shards = ALONE
-        if page is not None and count() > 1:
+    out: OutputFolder
+    options: TrainOptions
+    observer: Observer
+    page: LivePage | None
+    started: float
+    parts: Sequence[Part]
+    loss: Loss | None
+    shards: Shards = ALONE
+    doubts: tuple[str, ...] = ()  # about the dataset
+    photos: dict[str, Stamp] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.page is not None and count() > 1:
             raise UserError("the page needs one process; leave out `view`, and use snowsplat watch")
-        self.device = options.compute.apply()
+        self.device = self.options.compute.apply()
         reset_peak()
         self.memory_before = resident_bytes()
-        self.doubts: tuple[str, ...] = ()  # about the dataset
-        self.photos: dict[str, Stamp] = {}
 
     def train(self, path: Path | str) -> TrainResult:
         options = self.options
@@ -320,9 +313,8 @@ class _Job:
         settings = _resumed_dataset(options, path, start, meta)
         config = _resumed_config(options, start, meta)
         dataset = settings.load()
-        self.doubts = check_cameras(
-            dataset, settings.path, trusted=True
-        )  # the first run has refused, or not
+        # The first run has refused impossible cameras, or not.
+        self.doubts = check_cameras(dataset, settings.path, trusted=True)
         self._compare_photos(dataset, settings.path, meta)
         memory = self._memory(dataset, config, _gaussians_in(start))
         self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
@@ -481,11 +473,8 @@ def _described(dataset: Dataset) -> str:
     camera = dataset.train[0].camera
     points = "no points" if dataset.points is None else f"{len(dataset.points):,} points"
     masks = sum(view.mask is not None for view in dataset.train)
+    with_masks = f" ({masks} with masks)" if masks else ""
     return (
-        f"{dataset.description}: {len(dataset.train)} photos to train on{_with_masks(masks)}, "
+        f"{dataset.description}: {len(dataset.train)} photos to train on{with_masks}, "
         f"{len(dataset.test)} held out, {camera.width}x{camera.height}, {points}"
     )
-
-
-def _with_masks(count: int) -> str:
-    return f" ({count} with masks)" if count else ""

@@ -46,19 +46,14 @@ _RANGE_FRAMES = 8  # number of frames that determine the range of the depth colo
 
 @dataclass(frozen=True)
 class VideoSize:
-    """The requested size of a video."""
+    """The requested size of a video, in pixels; None if a side was not requested."""
 
-    # width, height: pixels; None if not requested.
     width: int | None = None
     height: int | None = None
 
     @classmethod
     def parse(cls, text: str | None) -> VideoSize:
-        """Parse "1280x720", "1280" or None.
-
-        Raises:
-            UserError: ``text`` is not a size, or the size is too small or too large.
-        """
+        """Parse "1280x720", "1280" or None. Raises: UserError: ``text`` is no possible size."""
         if text is None:
             return cls()
         match = re.fullmatch(r"(\d{1,6})(?:[xX×](\d{1,6}))?", text)
@@ -87,11 +82,7 @@ class VideoSize:
 
 
 def panorama_width(size: str | None) -> int:
-    """The width of a panorama of the requested size, in pixels.
-
-    Raises:
-        UserError: ``size`` is no size of a panorama.
-    """
+    """The width of a panorama of the requested size, in pixels. Raises UserError."""
     wanted = VideoSize.parse(size)
     width = wanted.width or _PANORAMA_WIDTH
     if width % 4 or wanted.height not in (None, width // 2):
@@ -273,9 +264,8 @@ def cameras_along(
     if path not in CAMERA_PATHS:
         if Path(path).suffix.lower() != ".json":
             known = ", ".join(CAMERA_PATHS)
-            raise SettingError(
-                "path", f"{path} is unknown; use {known} or a file of cameras (.json)"
-            )
+            what = f"{path} is unknown; use {known} or a file of cameras (.json)"
+            raise SettingError("path", what)
         _, keys = read_cameras(Path(path))
         keys = _in_frame_of(gaussians, keys)
         distance = trajectory.viewing_distance(keys, gaussians.means)
@@ -315,8 +305,7 @@ class Video:
     """A video to be rendered."""
 
     gaussians: Gaussians
-    # One per frame. All have the same size, with even width and height.
-    cameras: Sequence[Camera]
+    cameras: Sequence[Camera]  # one per frame, all of the same size; width and height are even
     # Renders all directions from the places of the cameras; None: what the cameras see.
     around: PanoramaRenderer | None
     background: tuple[float, float, float]
@@ -326,12 +315,7 @@ class Video:
     side_by_side: bool  # one video instead, with colour on the left and depth on the right
 
     def write(self, observer: Observer = SILENT) -> list[Path]:
-        """Render and write; returns the files.
-
-        Raises:
-            UserError: a file cannot be written.
-            KeyboardInterrupt: Ctrl-C; no file is left.
-        """
+        """Render and write; returns the files. Raises: UserError: a file cannot be written."""
         first = self.around or self.cameras[0]
         width, height = first.width, first.height
         files = self._files()
@@ -341,15 +325,10 @@ class Video:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             remove_temporaries(self.file.parent, [file.name for file, _ in files])
             near, far = self._depth_range()
+            around = self.around is not None
             adds = [
                 stack.enter_context(
-                    video_writer(
-                        file,
-                        factor * width,
-                        height,
-                        self.fps,
-                        panorama=self.around is not None,
-                    )
+                    video_writer(file, factor * width, height, self.fps, panorama=around)
                 )
                 for file, factor in files
             ]
@@ -384,7 +363,7 @@ class Video:
         if not (self.depth or self.side_by_side):
             return 1.0, 2.0
         sample = self.cameras[:: -(-len(self.cameras) // _RANGE_FRAMES)]
-        depths = [self._render(camera)[1] for camera in sample]
+        depths = (self._render(camera)[1] for camera in sample)
         return image_files.depth_range([depth for depth in depths if depth is not None])
 
     def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:

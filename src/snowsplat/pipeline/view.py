@@ -44,9 +44,7 @@ def viewed_scene(
     Of levels of detail, only the coarsest is read, so their page is ready at once. For other
     scenes of more than 4 million Gaussians, levels of detail are written to a temporary folder,
     which is removed at the end.
-
-    Raises:
-        UserError: the scene is missing or damaged, or has no Gaussians.
+    Raises: UserError: the scene is missing or damaged, or has no Gaussians.
     """
     path = Path(path)
     title = scene_name(path)

@@ -137,9 +137,8 @@ class NewestScene:
 
     def __call__(self) -> Scene:
         """The newest scene or checkpoint; the previous one if a newer one cannot be read.
+        Raises: UserError: the first one cannot be read.
 
-        Raises:
-            UserError: the first scene or checkpoint cannot be read.
         """
         try:
             step, path = self._newest()
@@ -151,10 +150,8 @@ class NewestScene:
                 name = path.relative_to(self._folder.path).as_posix()
                 about = [f"After {step:,} steps", f"{len(gaussians):,} Gaussians", name]
                 self._scene, self._read = Scene(gaussians, found[1], about), found
-        except (
-            OSError,
-            UserError,
-        ):  # the file was replaced or removed: read again at the next call
+        except (OSError, UserError):
+            # The file was replaced or removed: it is read again at the next call.
             if self._scene is None:
                 raise
         return self._scene
@@ -174,7 +171,7 @@ class NewestScene:
         saved = checkpoint.load(path)
         part = "gaussians."
         own: dict[str, Any] = {
-            n[len(part) :]: t for n, t in saved.tensors.items() if n.startswith(part)
+            n.removeprefix(part): t for n, t in saved.tensors.items() if n.startswith(part)
         }
         try:
             antialiased = saved.meta.get("training", {}).get("antialias", False)

@@ -69,15 +69,8 @@ class Camera:
     def scaled(self, width: int, height: int) -> Camera:
         """The same view at another image size: intrinsics are scaled by the ratio of each axis."""
         sx, sy = width / self.width, height / self.height
-        return dataclasses.replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
+        lens = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return Camera(width, height, *lens, self.cam_from_world, self.near)
 
     def to(self, device: torch.device) -> Camera:
         """This camera with its pose on ``device``, as rendering on that device needs it."""
@@ -91,9 +84,8 @@ class Camera:
     def seen_from(self, origin: Origin) -> Camera:
         """The same camera in a world frame whose 0 is at ``origin`` in this one."""
         pose = self.cam_from_world
-        moved = pose[:, 3] + pose[:, :3] @ torch.tensor(
-            origin, dtype=pose.dtype, device=pose.device
-        )
+        by = torch.tensor(origin, dtype=pose.dtype, device=pose.device)
+        moved = pose[:, 3] + pose[:, :3] @ by
         return dataclasses.replace(self, cam_from_world=torch.cat([pose[:, :3], moved[:, None]], 1))
 
     def downscaled(self, factor: int) -> Camera:

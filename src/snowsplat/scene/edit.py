@@ -64,10 +64,8 @@ def seen_from(gaussians: Gaussians, origin: Origin) -> Gaussians:
     """The same Gaussians in the world, with positions relative to another origin."""
     if gaussians.origin == origin:
         return gaussians
-    means = (_world(gaussians) - torch.tensor(origin, dtype=torch.float64)).to(
-        gaussians.means.dtype
-    )
-    return replace(gaussians, means=means, origin=origin)
+    means = _world(gaussians) - torch.tensor(origin, dtype=torch.float64)
+    return replace(gaussians, means=means.to(gaussians.means.dtype), origin=origin)
 
 
 def seen_from_dataset(gaussians: Gaussians, origin: Origin | None) -> Gaussians:
@@ -95,9 +93,7 @@ def sh_rotation(rotation: Tensor, degree: int) -> list[Tensor]:
     Y_l(R d) M_l = Y_l(d). It is computed by least squares over directions d that are evenly
     distributed on the sphere. The basis Y is that of the renderer.
 
-    Args:
-        rotation: R, (3, 3).
-        degree: 0 to 3.
+    ``rotation``: R, (3, 3); ``degree``: 0 to 3.
     """
     rotation = rotation.to(torch.float64)
     # The Fibonacci lattice: heights are evenly spaced, azimuths differ by the golden angle.
@@ -115,9 +111,7 @@ def sh_rotation(rotation: Tensor, degree: int) -> list[Tensor]:
 def crop(gaussians: Gaussians, box: Tensor) -> Gaussians:
     """The Gaussians whose centre is in ``box``, including its border.
 
-    Args:
-        gaussians: N Gaussians.
-        box: (2, 3) lower and upper corner in the world.
+    ``box``: (2, 3) lower and upper corner in the world.
     """
     origin = torch.tensor(gaussians.origin, dtype=torch.float64)
     low, high = (box.to(torch.float64) - origin).to(gaussians.means.dtype)

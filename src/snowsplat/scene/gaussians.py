@@ -73,9 +73,8 @@ class Gaussians:
         }
         for name, tensor in self.parameters().items():
             if tuple(tensor.shape) != expected[name]:
-                raise ValueError(
-                    f"{name} has shape {tuple(tensor.shape)}, expected {expected[name]}"
-                )
+                shapes = f"shape {tuple(tensor.shape)}, expected {expected[name]}"
+                raise ValueError(f"{name} has {shapes}")
             if not tensor.is_floating_point() or tensor.dtype != self.means.dtype:
                 raise ValueError(f"{name} is {tensor.dtype}, means is {self.means.dtype}")
             if tensor.device != self.means.device:

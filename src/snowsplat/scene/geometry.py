@@ -138,9 +138,8 @@ class Similarity:
     def __post_init__(self) -> None:
         shapes = tuple(self.rotation.shape), tuple(self.translation.shape)
         if shapes != ((3, 3), (3,)):
-            raise ValueError(
-                f"a similarity needs shapes (3, 3) and (3,), not {shapes[0]} and {shapes[1]}"
-            )
+            found = f"{shapes[0]} and {shapes[1]}"
+            raise ValueError(f"a similarity needs shapes (3, 3) and (3,), not {found}")
         if not 0 < self.scale < math.inf:
             raise ValueError(f"the scale of a similarity must be positive, not {self.scale}")
         # Convert the fields, so that all computations below are in double precision.
@@ -188,12 +187,10 @@ class Similarity:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Similarity:
         """The inverse of `to_json`."""
-        rotation, translation = value["rotation"], value["translation"]
-        return cls(
-            float(value["scale"]),
-            torch.tensor(rotation, dtype=torch.float64),
-            torch.tensor(translation, dtype=torch.float64),
+        rotation, translation = (
+            torch.tensor(value[name], dtype=torch.float64) for name in ("rotation", "translation")
         )
+        return cls(float(value["scale"]), rotation, translation)
 
 
 def similarity_from_points(source: Tensor, target: Tensor) -> Similarity:

@@ -72,12 +72,8 @@ def level_of_cameras(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     front of a wall, the mean pitch decides. Photos whose roll is much larger than `_ROLL` have a
     small weight (Cauchy weights). The covariance includes `_HABIT`.
 
-    Args:
-        rotations: (N, 3, 3) rotations of cam_from_world.
-
-    Returns:
-        (3,) unit vector in the world frame, and the inverse (3, 3) of its covariance, in 1/rad²,
-        perpendicular to it.
+    ``rotations``: (N, 3, 3) of cam_from_world. Returns a unit vector (3,) in the world frame, and
+    the inverse (3, 3) of its covariance, in 1/rad², perpendicular to it.
     """
     x, upper, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
     # If the upper edges of the photos point in all directions, the photos look straight down (not
@@ -110,15 +106,13 @@ def up_of_surfaces(
 
     It is the direction within `_LARGEST_TILT` of −y, the usual up direction of files, to which most
     surfaces are perpendicular. If there is none, but the scene stands on ground at its lowest z, it
-    is z, the up direction of many synthetic scenes.
+    is z, the up direction of many synthetic scenes; otherwise None. The result is a unit vector
+    (3,) in the world frame.
 
     Args:
         normals: (N, 3) unit vectors in the world frame; their signs are not used.
         areas: (N,) of the surfaces, in any unit.
         positions: (N, 3) of the surfaces in the world frame.
-
-    Returns:
-        (3,) unit vector in the world frame; None if there is no such direction.
     """
     if float(areas.sum()) <= 0:
         return None

@@ -83,9 +83,8 @@ class PanoramaRenderer:
     ) -> Tensor:
         """(H, W, 3) in [0, ∞): the Gaussians seen from a place, on the device of the Gaussians.
 
-        Args:
-            cam_from_world: (3, 4) float64; the camera's z is the direction ahead, y is down.
-            background: (3,) RGB; None is black.
+        ``cam_from_world``: (3, 4) float64; its z is the direction ahead, y is down. ``background``:
+        (3,) RGB; None is black.
         """
         image = gaussians.means.new_zeros(self.height, self.width, 3)
         middle = self._size / 2

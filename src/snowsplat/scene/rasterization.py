@@ -157,13 +157,7 @@ def rasterization(
         if skew != 0:
             raise UserError(f"rasterization: Ks has the skew {skew:g}; undistort the photos")
         view = View(
-            pose[:3],
-            width,
-            height,
-            fx,
-            fy,
-            cx,
-            cy,
+            *(pose[:3], width, height, fx, fy, cx, cy),
             sh_degree=0 if sh_degree is None else sh_degree,
             near=near_plane,
             antialiased=rasterize_mode == "antialiased",
@@ -221,15 +215,11 @@ def _refuse_unsupported(
         if value is not only and value != only:
             raise UserError(f"rasterization: {name} is not supported; {remedy}")
     if render_mode not in _RENDER_MODES:
-        raise UserError(
-            f"rasterization: render_mode={render_mode!r} is not supported; "
-            f"use {', '.join(_RENDER_MODES)}"
-        )
+        what = f"render_mode={render_mode!r} is not supported; use {', '.join(_RENDER_MODES)}"
+        raise UserError(f"rasterization: {what}")
     if rasterize_mode not in _EPS2D:
-        raise UserError(
-            f"rasterization: rasterize_mode={rasterize_mode!r} is not supported; "
-            f"use {' or '.join(_EPS2D)}"
-        )
+        what = f"rasterize_mode={rasterize_mode!r} is not supported; use {' or '.join(_EPS2D)}"
+        raise UserError(f"rasterization: {what}")
     if eps2d != _EPS2D[rasterize_mode]:
         raise UserError(
             f"rasterization: eps2d={eps2d:g} is not supported with rasterize_mode="

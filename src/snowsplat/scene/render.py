@@ -34,18 +34,12 @@ Renderer = Callable[[Gaussians, Camera, Tensor, int | None], RenderOutput]
 def view_of(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) -> View:
     """The camera as an argument of the numerical operations on these Gaussians.
 
-    Args:
-        sh_degree: the largest SH degree to use; None uses all degrees of the Gaussians.
+    ``sh_degree``: the largest SH degree to use; None uses all degrees of the Gaussians.
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     return View(
-        camera.cam_from_world,
-        camera.width,
-        camera.height,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
+        *(camera.cam_from_world, camera.width, camera.height),
+        *(camera.fx, camera.fy, camera.cx, camera.cy),
         sh_degree=degree,
         near=camera.near,
         antialiased=gaussians.antialiased,

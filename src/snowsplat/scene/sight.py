@@ -52,8 +52,7 @@ def reduced(camera: Camera) -> Camera:
 def blended(gaussians: Gaussians, camera: Camera, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The ids (M,) of the Gaussians in a view, their depths (M,), and (M, 3) Σ w(p) g(p).
 
-    Args:
-        values: (H, W, 3) g for three sums.
+    ``values``: (H, W, 3) g for three sums.
     """
     with torch.no_grad():
         splats = project(gaussians, camera)

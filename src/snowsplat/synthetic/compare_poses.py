@@ -26,8 +26,7 @@ class PoseErrors:
 def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> PoseErrors:
     """Compare poses by name; each is a ``cam_from_world`` (3, 4), in two different world frames.
 
-    Raises:
-        ValueError: fewer than three common names, or all camera centres on one line.
+    Raises: ValueError: fewer than three common names, or all camera centres on one line.
     """
     names = sorted(found.keys() & true.keys())
     if len(names) < 3:
@@ -39,14 +38,9 @@ def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> Po
     aligned = similarity.apply_to_poses(found_poses)
     extent = float(torch.cdist(true_centres, true_centres).max())
     distances = (invert_rigid(aligned)[..., 3] - true_centres).norm(dim=1)
-    return PoseErrors(
-        names=names,
-        missing=sorted(true.keys() - found.keys()),
-        rotations=_angles(aligned[..., :3], true_poses[..., :3]),
-        centres=distances / extent,
-        extent=extent,
-        true_from_found=similarity,
-    )
+    missing = sorted(true.keys() - found.keys())
+    rotations = _angles(aligned[..., :3], true_poses[..., :3])
+    return PoseErrors(names, missing, rotations, distances / extent, extent, similarity)
 
 
 def _angles(a: Tensor, b: Tensor) -> Tensor:

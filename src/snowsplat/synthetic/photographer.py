@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,33 +15,30 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
-from snowsplat.data.panorama import panorama_xmp
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
-from snowsplat.synthetic.lens import AnyLens, Equirectangular, FisheyeLens, Lens
+from snowsplat.synthetic.lens import CentredLens, Lens
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
 
-_RAYS = 2  # along each side of a pixel
+RAYS = 2  # along each side of a pixel
 _TILE = 64  # pixels along each side; the rays of a tile hit few shapes
 _FOCAL_35MM = 28  # in EXIF, mm; typical of a phone
 _FOCAL_TRUE = 1.013  # the true focal length divided by the one in EXIF, which is inexact
 _DISTORTION = (-0.062, 0.021, 0.00015, -0.0001)  # of COLMAP's model OPENCV: k1, k2, p1, p2
-_FISHEYE_DISTORTION = (0.03, -0.008, 0.001, 0.0)  # OPENCV_FISHEYE: k1 … k4; of an action camera
 _WALK_RADIUS = 1.42  # metres, around the centre of the table
 _WALK_HEIGHTS = (0.46, 0.92)  # metres above the table, first and second round
 _FULL_WELL = 15000.0  # electrons of a white pixel; the shot noise is their square root
 _READ_NOISE = 6.0  # electrons
 _JPEG_QUALITY = 92
-_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples are evenly distributed in time
 
 
 @dataclass(frozen=True)
 class Truth:
     """The true lens and poses of the photos."""
 
-    lens: AnyLens
+    lens: CentredLens
     poses: dict[str, Tensor]  # photo name -> cam_from_world (3, 4) float64, metres, z up
 
     def write(self, folder: Path) -> None:
@@ -55,82 +52,41 @@ class Truth:
         write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
 
 
-@dataclass(frozen=True)
-class Shutter:
-    """A thin lens, and an exposure that takes time.
-
-    A point at the distance z is a disc in the photo, with a diameter of
-    aperture · focal · |1 / focus − 1 / z| pixels.
-    """
-
-    aperture: float  # diameter of the lens, metres
-    focus: float  # distance of the plane that is sharp, along the optical axis, metres
-    motion: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of what passes, metres per exposure
-    samples: int = 16  # positions on the lens; a pixel has one ray from each
-
-    def positions(self) -> np.ndarray:
-        """(samples, 2) float32 on the lens, evenly distributed, in metres from its middle."""
-        i = np.arange(self.samples) + 0.5
-        radius, angle = np.sqrt(i / self.samples), i * (math.pi * (3 - math.sqrt(5)))
-        disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-        return (0.5 * self.aperture * disc).astype(np.float32)
-
-
 def write_synthetic_photos(
     folder: Path | str,
     n_views: int = 40,
     width: int = 640,
     height: int = 480,
     seed: int = 0,
-    distortion: tuple[float, float, float, float] = _DISTORTION,
     report: Report = silent,
 ) -> Truth:
     """Render photos ``IMG_0001.jpg`` … of a still life into ``folder``, in two rounds around it.
 
-    Equal arguments produce equal photos. Existing photos are kept.
-
-    Args:
-        seed: seed of the scene and of the path.
-        distortion: k1, k2, p1, p2 of COLMAP's model OPENCV.
-        report: progress callback.
+    Equal arguments produce equal photos. Existing photos are kept. ``seed``: of scene and path.
     """
-    lens = phone_lens(width, height, distortion)
+    lens = phone_lens(width, height)
     return take_photos(folder, lambda: still_life(seed), lens, walk(n_views, seed), seed, report)
 
 
 def phone_lens(
-    width: int,
-    height: int,
-    distortion: tuple[float, float, float, float] = _DISTORTION,
+    width: int, height: int, distortion: tuple[float, float, float, float] = _DISTORTION
 ) -> Lens:
-    """A wide-angle lens like a phone's. Its focal length differs slightly from that in EXIF."""
+    """A wide-angle lens like a phone's. Its focal length differs slightly from that in EXIF.
+
+    ``distortion``: k1, k2, p1, p2 of COLMAP's model OPENCV.
+    """
     focal = _FOCAL_TRUE * _FOCAL_35MM * math.hypot(width, height) / math.hypot(36, 24)
     return Lens(width, height, focal, distortion)
-
-
-def fisheye_lens(
-    width: int,
-    height: int,
-    angle: float,
-    distortion: tuple[float, float, float, float] = _FISHEYE_DISTORTION,
-) -> FisheyeLens:
-    """A fisheye lens that fills the frame.
-
-    ``angle``: the field of view in degrees from corner to corner; without distortion.
-    """
-    focal = math.hypot(width, height) / 2 / math.radians(angle / 2)
-    return FisheyeLens(width, height, focal, distortion)
 
 
 def take_photos(
     folder: Path | str,
     build: Callable[[], Scene],
-    lens: AnyLens,
+    lens: CentredLens,
     poses: Sequence[Tensor],
     seed: int = 0,
     report: Report = silent,
-    passing: Mapping[int, Scene] | None = None,
-    shutter: Shutter | None = None,
+    shoot: Callable[[Scene, int, np.random.Generator], np.ndarray] | None = None,
 ) -> Truth:
     """Render photos ``IMG_0001.jpg`` … of a scene into ``folder``; existing photos are kept.
 
@@ -139,9 +95,7 @@ def take_photos(
         poses: ``cam_from_world`` (3, 4) float64 of each photo, metres.
         seed: seed of the noise of the image sensor.
         report: progress callback.
-        passing: what is in front of the camera in only one photo, by the index of its pose. It
-            casts no shadow on the scene.
-        shutter: None: everything is sharp.
+        shoot: takes the photo of a scene with this index, with this noise; default: `photograph`.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -151,11 +105,11 @@ def take_photos(
     if not missing:
         return truth
     report(0, len(missing), "building the scene")
-    scene, passing = build(), passing or {}
+    scene = build()
 
     def take(i: int) -> None:
         random = np.random.default_rng([seed, i])
-        pixels = photograph(scene, lens, poses[i], random, passing.get(i), shutter)
+        pixels = shoot(scene, i, random) if shoot else photograph(scene, lens, poses[i], random)
         with atomic_path(folder / names[i]) as temporary:
             _save(temporary, pixels, lens)
 
@@ -196,51 +150,23 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 
 
 def photograph(
-    scene: Scene,
-    lens: AnyLens,
-    cam_from_world: Tensor,
-    random: np.random.Generator,
-    passing: Scene | None = None,
-    shutter: Shutter | None = None,
+    scene: Scene, lens: CentredLens, cam_from_world: Tensor, random: np.random.Generator
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB, with the noise of a small image sensor.
-
-    Args:
-        random: draws the noise.
-        passing: more objects, which cast no shadow on the scene.
-        shutter: None: everything is sharp.
-    """
+    """(H, W, 3) uint8 sRGB: the photo from a pose, see `developed`."""
     world_from_cam = invert_rigid(cam_from_world).numpy()
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
-    spread = 1 / (lens.focal * _RAYS)
+    spread = 1 / (lens.focal * RAYS)
     light = np.empty((lens.height, lens.width, 3), np.float32)
-
-    def seen(origin: np.ndarray, rays: np.ndarray, moved: np.ndarray | float = 0.0) -> np.ndarray:
-        directions = rotation @ rays
-        found = scene.radiance(origin, directions, spread)
-        if passing is not None:
-            start = origin - moved
-            near = passing.distances(start, directions) < scene.distances(origin, directions)
-            found = np.where(near, passing.radiance(start, directions, spread), found)
+    for rows, columns, rays in tiles(lens):
+        shape = (3, rows.stop - rows.start, RAYS, columns.stop - columns.start, RAYS)
         # A sensor saturates: values above white are clipped before a pixel is averaged.
-        return found.clip(0, 1)
+        seen = scene.radiance(origin, rotation @ rays, spread).clip(0, 1)
+        light[rows, columns] = seen.reshape(shape).mean(axis=(2, 4)).transpose(1, 2, 0)
+    return developed(light, random)
 
-    for rows, columns, rays in _tiles(lens):
-        shape = (3, rows.stop - rows.start, _RAYS, columns.stop - columns.start, _RAYS)
-        if shutter is None:
-            pixels = seen(origin, rays).reshape(shape).mean(axis=(2, 4))
-        else:
-            # All rays through one position on the lens have one origin, as those of a pinhole.
-            total = np.zeros((3, shape[1] * shape[3]), np.float32)
-            for i, position in enumerate(shutter.positions()):
-                own = rays.reshape(shape)[:, :, i // _RAYS % _RAYS, :, i % _RAYS].reshape(3, -1)
-                offset = np.array([[*position, 0.0]], np.float32).T
-                own = own * (shutter.focus / own[2]) - offset
-                moved = np.array([shutter.motion], np.float32).T * (i * _GOLDEN % 1 - 0.5)
-                own = own / np.sqrt((own * own).sum(axis=0))
-                total += seen(origin + rotation @ offset, own, moved)
-            pixels = (total / shutter.samples).reshape(3, shape[1], shape[3])
-        light[rows, columns] = pixels.transpose(1, 2, 0)
+
+def developed(light: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """(H, W, 3) linear light -> uint8 sRGB, with the noise of a small image sensor."""
     electrons = _FULL_WELL * light
     electrons += np.sqrt(electrons + _READ_NOISE**2) * random.standard_normal(
         light.shape, np.float32
@@ -259,14 +185,14 @@ def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
 
 
 @functools.lru_cache(1)
-def _tiles(lens: AnyLens) -> list[tuple[slice, slice, np.ndarray]]:
+def tiles(lens: CentredLens) -> list[tuple[slice, slice, np.ndarray]]:
     """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""
     tiles = []
     for top in range(0, lens.height, _TILE):
         for left in range(0, lens.width, _TILE):
             bottom, right = min(top + _TILE, lens.height), min(left + _TILE, lens.width)
-            x = left + (np.arange((right - left) * _RAYS) + 0.5) / _RAYS
-            y = top + (np.arange((bottom - top) * _RAYS) + 0.5) / _RAYS
+            x = left + (np.arange((right - left) * RAYS) + 0.5) / RAYS
+            y = top + (np.arange((bottom - top) * RAYS) + 0.5) / RAYS
             rays = lens.directions(np.stack(np.meshgrid(x, y)).reshape(2, -1))
             tiles.append((slice(top, bottom), slice(left, right), rays.astype(np.float32)))
     return tiles
@@ -278,7 +204,7 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
     return np.rint(255 * srgb).astype(np.uint8)
 
 
-def _save(path: Path, pixels: np.ndarray, lens: AnyLens) -> None:
+def _save(path: Path, pixels: np.ndarray, lens: CentredLens) -> None:
     """Save a JPEG. Frames of an action camera, which has a fisheye lens, have no focal length."""
     image = Image.fromarray(pixels)
     exif = Image.Exif()
@@ -286,6 +212,5 @@ def _save(path: Path, pixels: np.ndarray, lens: AnyLens) -> None:
     exif[0x0112] = 1  # Orientation: as stored
     if isinstance(lens, Lens):
         exif.get_ifd(0x8769)[0xA405] = _FOCAL_35MM  # FocalLengthIn35mmFilm
-    around = isinstance(lens, Equirectangular)
-    xmp = {"xmp": panorama_xmp(*image.size)} if around else {}
+    xmp = {"xmp": lens.xmp} if lens.xmp else {}
     image.save(path, format="JPEG", quality=_JPEG_QUALITY, exif=exif, **xmp)

@@ -77,32 +77,25 @@ class Scene:
         self._all = np.concatenate(texels).astype(np.float32)
         self._starts, self._widths, self._heights = starts, widths, heights
 
-    def radiance(
-        self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool = True
-    ) -> np.ndarray:
+    def radiance(self, origins: np.ndarray, directions: np.ndarray, spread: float) -> np.ndarray:
         """Linear colours (3, R) along rays; black where they hit nothing.
 
         Args:
             origins: (3, 1) or (3, R) float32, metres.
             directions: (3, R) float32, of length 1.
             spread: width of a ray at distance 1, which selects the texture level.
-            mirrored: whether to trace one reflected ray at glossy objects.
         """
         result = np.zeros_like(directions)
         for start in range(0, directions.shape[1], _BLOCK):
             block = slice(start, start + _BLOCK)
             own = origins if origins.shape[1] == 1 else origins[:, block]
-            result[:, block] = self._block(own, directions[:, block], spread, mirrored)
+            result[:, block] = self._block(own, directions[:, block], spread, mirrored=True)
         return result
 
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distances (R,) float32 to the first hits along rays, in metres; infinite without a hit.
 
-        Glass is no hit.
-
-        Args:
-            origins: (3, 1) or (3, R) float32, metres.
-            directions: (3, R) float32, of length 1.
+        Glass is no hit. ``origins`` and ``directions``: see `radiance`.
         """
         candidates = self._candidates(origins, directions)
         solid = [i for i in candidates if i not in self._panes]
@@ -168,12 +161,8 @@ class Scene:
     ) -> None:
         """Add the light that surfaces reflect to ``colours`` (3, R), in place.
 
-        Args:
-            rays: (M,) indices of the rays that hit the surfaces.
-            owner: (M,) indices of their shapes.
-            positions: (3, M).
-            normals: (3, R).
-            directions: (3, R).
+        ``rays`` (M,) are the indices of the rays that hit the surfaces, at ``positions`` (3, M),
+        and ``owner`` (M,) those of their shapes; ``normals`` and ``directions`` (3, R) of all rays.
         """
         if not len(rays):
             return

@@ -197,8 +197,7 @@ class Frustum:
             for level, radius_there in ((0.0, self.bottom), (self.height, self.top)):
                 distance = (level - z) / dz
                 take(
-                    distance,
-                    (x + distance * dx) ** 2 + (y + distance * dy) ** 2 <= radius_there**2,
+                    distance, (x + distance * dx) ** 2 + (y + distance * dy) ** 2 <= radius_there**2
                 )
         return nearest
 

@@ -76,24 +76,16 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
     shelf = paint.spines(_size((1.7, 1.5), 0.004), 4, random)
     side = paint.wood(_size((0.3, 1.5), 0.005), 2, _DARK, random)
     top = paint.wood(_size((1.7, 0.3), 0.005), 2, _DARK, random)
-    objects.append(
-        SceneObject(
-            Box((-0.7, 2.24, FLOOR + 0.75), (1.7, 0.3, 1.5)), [side, side, shelf, shelf, top, top]
-        )
-    )
+    shelf_faces = [side, side, shelf, shelf, top, top]
+    objects.append(SceneObject(Box((-0.7, 2.24, FLOOR + 0.75), (1.7, 0.3, 1.5)), shelf_faces))
     front = paint.wood(_size((1.3, 0.75), 0.004), 3, _PINE, random)
     side = paint.wood(_size((0.4, 0.75), 0.004), 3, _PINE, random)
     top = paint.wood(_size((1.3, 0.4), 0.004), 2, _PINE, random)
-    objects.append(
-        SceneObject(
-            Box((0.9, -2.15, FLOOR + 0.375), (1.3, 0.4, 0.75)),
-            [side, side, front, front, top, top],
-        )
-    )
+    chest_faces = [side, side, front, front, top, top]
+    objects.append(SceneObject(Box((0.9, -2.15, FLOOR + 0.375), (1.3, 0.4, 0.75)), chest_faces))
     vase = paint.marble((256, 160), (0.25, 0.42, 0.45), (0.85, 0.85, 0.75), random)
-    objects.append(
-        SceneObject(Ellipsoid((1.2, -2.15, 0.22), (0.15, 0.15, 0.2)), [vase], gloss=0.04)
-    )
+    bulb = Ellipsoid((1.2, -2.15, 0.22), (0.15, 0.15, 0.2))
+    objects.append(SceneObject(bulb, [vase], gloss=0.04))
     for x, y, z, side_length, angle in (
         (2.05, 1.75, FLOOR, 0.62, 0.2),
         (2.10, 1.80, FLOOR + 0.62, 0.45, 0.6),
@@ -160,9 +152,8 @@ def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
     for x, y, height, radius in ((-0.10, -0.42, 0.17, 0.055), (0.03, -0.50, 0.11, 0.06)):
         label = paint.printed(_size((2 * math.pi * radius, height), 0.0012), random, lines=9)
         lid = paint.plain((64, 64), (0.6, 0.6, 0.62), random)
-        objects.append(
-            SceneObject(Frustum((x, y, 0), height, radius, radius), [label, lid, lid], 0.03)
-        )
+        can = Frustum((x, y, 0), height, radius, radius)
+        objects.append(SceneObject(can, [label, lid, lid], 0.03))
     for x, y, z, side, angle in (
         (-0.40, -0.18, 0.0, 0.11, 0.5),
         (-0.29, -0.28, 0.0, 0.11, -0.2),
@@ -172,9 +163,8 @@ def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
         objects.append(SceneObject(Box((x, y, z + side / 2), (side,) * 3, angle), faces))
 
     glaze = paint.plain((384, 192), (0.50, 0.07, 0.06), random, stains=0.4)
-    objects.append(
-        SceneObject(Ellipsoid((0.40, -0.16, 0.10), (0.10, 0.10, 0.10)), [glaze], gloss=0.10)
-    )
+    ball = Ellipsoid((0.40, -0.16, 0.10), (0.10, 0.10, 0.10))
+    objects.append(SceneObject(ball, [glaze], gloss=0.10))
     stone = paint.marble((512, 256), (0.80, 0.78, 0.70), (0.28, 0.34, 0.42), random)
     objects += [
         SceneObject(Ellipsoid((-0.02, 0.48, 0.12), (0.11, 0.11, 0.12)), [stone], gloss=0.05),

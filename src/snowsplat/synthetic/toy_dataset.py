@@ -76,14 +76,9 @@ def _cameras(n: int, width: int, height: int) -> list[Camera]:
     for i in range(n):
         azimuth = i * math.pi * (3 - math.sqrt(5))
         elevation = math.radians((10, 30, 50)[i % 3])
-        position = torch.tensor(
-            [
-                math.cos(elevation) * math.cos(azimuth),
-                math.cos(elevation) * math.sin(azimuth),
-                math.sin(elevation),
-            ],
-            dtype=torch.float64,
-        )
+        level = math.cos(elevation)
+        place = [level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)]
+        position = torch.tensor(place, dtype=torch.float64)
         middle, up = torch.zeros_like(position), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         pose = look_at(_RING * position, middle, up)
         cameras.append(Camera(width, height, focal, focal, width / 2, height / 2, pose))
@@ -146,8 +141,7 @@ def write_toy_dataset(
     ``transforms_train.json`` and ``transforms_test.json`` (every 8th view), RGBA images with a
     transparent background, no points.
 
-    Returns:
-        the folder.
+    Returns the folder.
     """
     folder = Path(folder)
     scene = _Scene(seed, surroundings=format != "blender")

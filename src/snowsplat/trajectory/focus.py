@@ -45,17 +45,10 @@ def up_of(cameras: Sequence[Camera]) -> Tensor:
 
 
 def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:
-    """The median over cameras of the median depth of the points that a camera sees.
+    """The median over cameras of the median depth of the points that a camera sees, world units.
 
-    If no camera sees a point, it is the distance between the median camera centre and the median
-    point. Without points it is 1.
-
-    Args:
-        cameras: at least one.
-        points: (P, 3) in the world frame.
-
-    Returns:
-        The distance in world units.
+    If none of the cameras (at least one) sees one of the ``points`` (P, 3), it is the distance
+    between the median camera centre and the median point. Without points it is 1.
     """
     points = points.detach().to(torch.float64)[:: -(-len(points) // _POINTS_SAMPLED) or 1]
     medians = []
@@ -74,12 +67,9 @@ def viewing_distance(cameras: Sequence[Camera], points: Tensor) -> float:
 def focus_of(cameras: Sequence[Camera], distance: float) -> Tensor:
     """The focus: the point (3,) that is nearest to the optical axes, in the world frame.
 
-    If the axes are nearly parallel or intersect behind the cameras, the focus is ``distance`` in
-    front of the mean camera centre. If the cameras look in all directions, it is the mean centre.
-
-    Args:
-        cameras: at least one.
-        distance: world units from the cameras to what they see.
+    If the axes are nearly parallel or intersect behind the cameras (at least one), the focus is
+    ``distance``, in world units from the cameras to what they see, in front of the mean camera
+    centre. If the cameras look in all directions, it is the mean centre.
     """
     centres, forward = positions_of(cameras), rotations_of(cameras)[:, 2]
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
@@ -101,16 +91,19 @@ def focus_of(cameras: Sequence[Camera], distance: float) -> Tensor:
     return centres.mean(0) + distance * mean / mean.norm()
 
 
+def weighted_quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
+    """The weighted quantile, a scalar, of ``values`` (P,), P > 0."""
+    order = values.argsort()
+    sums = weights[order].cumsum(0)
+    index = torch.searchsorted(sums, share * sums[-1]).clamp_max(len(values) - 1)
+    return values[order[int(index)]]
+
+
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with another image size and aspect ratio, and with square pixels.
+    """The camera with another image size in pixels and aspect ratio, and with square pixels.
 
     The area of the field of view does not change: a wider image shows more at the sides and less
     above and below.
-
-    Args:
-        camera: the original camera.
-        width: pixels.
-        height: pixels.
     """
     # Keep the ratio of the focal length to the geometric mean of width and height.
     focal = math.sqrt(camera.fx * camera.fy * (width * height) / (camera.width * camera.height))

@@ -12,31 +12,24 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 from snowsplat.trajectory.focus import positions_of, rotations_of, typical, up_of
-from snowsplat.trajectory.spline import Spline
+from snowsplat.trajectory.spline import SAMPLES_PER_FRAME, Spline, interpolate
 from snowsplat.trajectory.tour import in_order
 from snowsplat.util.errors import UserError
 
 # Oscillations with this period, in photos, are considered hand shake. The spline halves them.
 _SMOOTHED_PHOTOS = 10
 _SMOOTHING = (_SMOOTHED_PHOTOS / (2 * math.pi)) ** 4
-# Samples per frame for measuring the length of a path.
-_SAMPLES_PER_FRAME = 20
 
 
 def training_path(
     cameras: Sequence[Camera], names: Sequence[str], frames: int, distance: float
 ) -> list[Camera]:
-    """The smoothed path of the photographer.
+    """The smoothed path of the photographer, in ``frames`` frames.
 
     Photos that were taken in portrait format are rotated to match their neighbours. All frames have
-    the field of view of the median photo.
-
-    Args:
-        cameras: the training cameras.
-        names: the names of the photos. If they are not in the order of a path, a short tour
-            through the cameras is used.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    the field of view of the median photo. If the ``names`` of the photos are not in the order of a
+    path, a short tour through the cameras is used. ``distance``: world units from the cameras to
+    what they see.
 
     Raises:
         UserError: all cameras have the same position and direction.
@@ -53,26 +46,16 @@ def key_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Ca
     """A smooth path through key cameras, in their order and with their fields of view.
 
     If the last key is the same as the first, the path is a closed loop without a corner. The frames
-    have the image size of the first camera.
-
-    Args:
-        cameras: the keys.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    have the image size of the first camera. ``distance``: world units from the cameras to what they
+    see.
 
     Raises:
         UserError: fewer than two keys differ.
     """
     lens = cameras[0]
-    zooms = [[math.log(camera.fx / camera.width)] for camera in cameras]
-    return _path(
-        lens,
-        positions_of(cameras),
-        rotations_of(cameras),
-        torch.tensor(zooms, dtype=torch.float64),
-        frames,
-        distance,
-    )
+    logs = [[math.log(camera.fx / camera.width)] for camera in cameras]
+    zooms = torch.tensor(logs, dtype=torch.float64)
+    return _path(lens, positions_of(cameras), rotations_of(cameras), zooms, frames, distance)
 
 
 def _same_roll(rotations: Tensor, up: Tensor) -> Tensor:
@@ -136,11 +119,11 @@ def _path(
     quats = torch.cat([quats[:1], quats[1:] * signs[:, None].to(quats.dtype)])
     spline = Spline(times, torch.cat([positions, quats, zooms], 1), smoothing)
 
-    dense = torch.linspace(start, end, _SAMPLES_PER_FRAME * max(frames, 50), dtype=torch.float64)
+    dense = torch.linspace(start, end, SAMPLES_PER_FRAME * max(frames, 50), dtype=torch.float64)
     rows = spline(dense)
     length = torch.cat([rows.new_zeros(1), _steps(rows[:, :3], rows[:, 3:7], distance).cumsum(0)])
     shares = torch.arange(frames, dtype=torch.float64) / max(1, frames if closed else frames - 1)
-    at = spline(_interpolate(shares * length[-1], length, dense))
+    at = spline(interpolate(shares * length[-1], length, dense))
     return [_camera(lens, *row.split([3, 4, 1])) for row in at]
 
 
@@ -153,13 +136,6 @@ def _steps(positions: Tensor, quats: Tensor, distance: float) -> Tensor:
     chords = torch.minimum((unit[1:] - unit[:-1]).norm(dim=1), (unit[1:] + unit[:-1]).norm(dim=1))
     turned = 4 * torch.asin((chords / 2).clamp_max(1.0))
     return (moved.square() + turned.square()).sqrt()
-
-
-def _interpolate(x: Tensor, xs: Tensor, ys: Tensor) -> Tensor:
-    """Linear interpolation of the samples (xs, ys) at x; xs is ascending."""
-    i = torch.searchsorted(xs, x).clamp(1, len(xs) - 1)
-    share = (x - xs[i - 1]) / (xs[i] - xs[i - 1]).clamp_min(1e-300)
-    return ys[i - 1] + share * (ys[i] - ys[i - 1])
 
 
 def _camera(lens: Camera, position: Tensor, quat: Tensor, zoom: Tensor) -> Camera:

@@ -1,4 +1,4 @@
-"""Closed paths around the focus of the cameras; all frames look at the focus."""
+"""Closed paths around one point, such as the focus of the cameras; all frames look at it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import look_at
+from snowsplat.scene.geometry import compose_rigid, look_at
 from snowsplat.scene.near_plane import near_of_overview
 from snowsplat.trajectory.focus import (
     DEFAULT_UP,
@@ -19,11 +19,13 @@ from snowsplat.trajectory.focus import (
     rotations_of,
     typical,
     up_of,
+    weighted_quantile,
 )
+from snowsplat.trajectory.spline import SAMPLES_PER_FRAME, interpolate
 from snowsplat.util.errors import UserError
 
-# Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
-_WIDEST_GAP = math.radians(110)
+#: Cameras surround the focus if no gap between the azimuths of neighbours is wider than this.
+WIDEST_GAP = math.radians(110)
 # Largest elevation. Near the vertical, the image would rotate quickly.
 _STEEPEST = math.radians(80)
 # Cameras look in one direction if the mean of their unit forward vectors is at least this long.
@@ -33,8 +35,8 @@ _ONE_DIRECTION = 0.75
 _LEAST_SWING = math.radians(2)
 # Smallest ratio of the shorter to the longer axis of an oval.
 _FLATTEST = 0.25
-# Samples per frame for measuring the length of a path.
-_SAMPLES_PER_FRAME = 20
+# Largest angle between the optical axes of a frame of a swing and of the photo.
+_SWING = math.radians(4)
 # Values outside of these quantiles are considered outliers.
 _OUTERMOST = torch.tensor([0.1, 0.9], dtype=torch.float64)
 
@@ -43,16 +45,11 @@ _Path = Callable[[Tensor], Tensor]
 
 
 def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Camera]:
-    """An ellipse near the training cameras, around their focus.
+    """An ellipse near the training cameras, around their focus, in ``frames`` frames.
 
     If the cameras surround the focus, the ellipse is horizontal, at their median height. Otherwise
     it is a vertical oval in front of the focus. Its width and height are the ranges of azimuth and
-    elevation that the cameras cover.
-
-    Args:
-        cameras: the training cameras.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    elevation that the cameras cover. ``distance``: world units from the cameras to what they see.
     """
     up, focus = up_of(cameras), focus_of(cameras, distance)
     from_focus = positions_of(cameras) - focus
@@ -60,8 +57,8 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
     level = from_focus - heights[:, None] * up
     east, north = _level_axes(level, up)
     azimuths = torch.atan2(level @ north, level @ east)
-    gap, middle = _widest_gap(azimuths)
-    if gap < _WIDEST_GAP:
+    gap, middle = widest_gap(azimuths)
+    if gap < WIDEST_GAP:
         radii = level.norm(dim=1)
         low, high = torch.quantile(radii, _OUTERMOST)
         # On a circle the mean square of a coordinate is half the squared radius.
@@ -87,9 +84,8 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
         azimuth = middle + mid_azimuth + swing * angle.sin()
         elevation = (mid_elevation + rise * angle.cos()).clamp(-_STEEPEST, _STEEPEST)
         x, y = elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin()
-        return focus + radius * (
-            x[:, None] * east + y[:, None] * north + elevation.sin()[:, None] * up
-        )
+        flat = x[:, None] * east + y[:, None] * north
+        return focus + radius * (flat + elevation.sin()[:, None] * up)
 
     return _looking_at(focus, up, oval, typical(cameras), frames)
 
@@ -97,10 +93,7 @@ def ellipse_path(cameras: Sequence[Camera], frames: int, distance: float) -> lis
 def spiral_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Camera]:
     """A spiral for cameras that look in one direction: from their middle outwards and back.
 
-    Args:
-        cameras: the training cameras.
-        frames: number of frames.
-        distance: world units from the cameras to what they see.
+    ``distance``: world units from the cameras to what they see.
 
     Raises:
         UserError: the cameras look in different directions.
@@ -134,12 +127,8 @@ def orbit_path(
 ) -> list[Camera]:
     """A horizontal circle around a scene whose cameras are not known; −y is up.
 
-    Args:
-        points: (P, 3) means of the Gaussians.
-        weights: (P,) their opacities.
-        frames: number of frames.
-        width: width of the images in pixels.
-        height: height of the images in pixels.
+    ``points`` (P, 3) are the means of the Gaussians, ``weights`` (P,) their opacities. The images
+    have ``width`` × ``height`` pixels.
 
     Raises:
         UserError: there are no points.
@@ -147,9 +136,10 @@ def orbit_path(
     if not len(points):
         raise UserError("the scene has no Gaussians to orbit")
     points, weights = points.detach().to(torch.float64), weights.detach().to(torch.float64)
-    focus = torch.stack([_weighted_median(column, weights) for column in points.T])
+    focus = torch.stack([weighted_quantile(column, weights, 0.5) for column in points.T])
     # At this distance, half of the Gaussians fill half of the image.
-    radius = 3.0 * (float(_weighted_median((points - focus).norm(dim=1), weights)) or 1.0)
+    distances = (points - focus).norm(dim=1)
+    radius = 3.0 * (float(weighted_quantile(distances, weights, 0.5)) or 1.0)
     elevation = math.radians(15)
     focal = 1.2 * min(width, height)
     pose = look_at(focus - torch.tensor([0.0, 0.0, radius]), focus, DEFAULT_UP)
@@ -165,14 +155,30 @@ def orbit_path(
     return _looking_at(focus, DEFAULT_UP, circle, lens, frames)
 
 
+def swing_path(camera: Camera, distance: float, frames: int) -> list[Camera]:
+    """``frames`` cameras on an ellipse around the position of ``camera``, in its image plane.
+
+    All look at the point at ``distance`` (world units) on its optical axis, so that this point does
+    not move in the image. The ellipse is half as high as it is wide.
+    """
+    angles = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / frames
+    radius = distance * math.tan(_SWING)
+    positions = torch.stack(
+        [radius * angles.cos(), 0.5 * radius * angles.sin(), torch.zeros_like(angles)], dim=1
+    )
+    # In the frame of the camera; its y axis points down.
+    target = torch.tensor([0.0, 0.0, distance], dtype=torch.float64).expand_as(positions)
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    poses = compose_rigid(look_at(positions, target, up), camera.cam_from_world.double())
+    return [dataclasses.replace(camera, cam_from_world=pose) for pose in poses]
+
+
 def _looking_at(focus: Tensor, up: Tensor, path: _Path, lens: Camera, frames: int) -> list[Camera]:
     """Cameras that look at the focus, at equal distances along a closed path."""
-    t = torch.linspace(0, 1, _SAMPLES_PER_FRAME * max(frames, 50) + 1, dtype=torch.float64)
+    t = torch.linspace(0, 1, SAMPLES_PER_FRAME * max(frames, 50) + 1, dtype=torch.float64)
     length = torch.cat([t.new_zeros(1), path(t).diff(dim=0).norm(dim=1).cumsum(0)])
     wanted = torch.arange(frames, dtype=torch.float64) / frames * length[-1]
-    i = torch.searchsorted(length, wanted).clamp(1, len(t) - 1)
-    share = (wanted - length[i - 1]) / (length[i] - length[i - 1]).clamp_min(1e-300)
-    positions = path(t[i - 1] + share * (t[i] - t[i - 1]))
+    positions = path(interpolate(wanted, length, t))
     poses = look_at(positions, focus.expand_as(positions), up)
     return [dataclasses.replace(lens, cam_from_world=pose) for pose in poses]
 
@@ -193,7 +199,7 @@ def _level_axes(level: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     return east, torch.linalg.cross(up, east)
 
 
-def _widest_gap(azimuths: Tensor) -> tuple[float, float]:
+def widest_gap(azimuths: Tensor) -> tuple[float, float]:
     """The width of the widest sector without a camera, and the middle of the remaining sector.
 
     All angles are in radians.
@@ -209,9 +215,3 @@ def _range(angles: Tensor) -> tuple[float, float]:
     """The middle and half the width of the range between the 10% and the 90% quantile."""
     low, high = torch.quantile(angles, _OUTERMOST).tolist()
     return (low + high) / 2, max((high - low) / 2, _LEAST_SWING)
-
-
-def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    order = values.argsort()
-    sums = weights[order].cumsum(0)
-    return values[order[int(torch.searchsorted(sums, sums[-1] / 2).clamp_max(len(values) - 1))]]

@@ -6,6 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+#: Samples per frame for measuring the length of a path.
+SAMPLES_PER_FRAME = 20
+
 
 class Spline:
     """The curve g that minimises Σ |yᵢ − g(tᵢ)|² + smoothing · ∫ |g″|².
@@ -92,3 +95,10 @@ def _solve(diagonal: Tensor, beside: Tensor, beyond: Tensor, right: Tensor) -> T
         if i + 2 < len(pivots):
             rows[i] -= far[i] * rows[i + 2]
     return torch.from_numpy(rows)
+
+
+def interpolate(x: Tensor, xs: Tensor, ys: Tensor) -> Tensor:
+    """Linear interpolation of the samples (xs, ys) at x; xs is ascending."""
+    i = torch.searchsorted(xs, x).clamp(1, len(xs) - 1)
+    share = (x - xs[i - 1]) / (xs[i] - xs[i - 1]).clamp_min(1e-300)
+    return ys[i - 1] + share * (ys[i] - ys[i - 1])

@@ -23,12 +23,7 @@ def in_order(cameras: Sequence[Camera], names: Sequence[str], distance: float) -
 
     Photos of a walk and frames of a video are named in the order in which they were taken. Other
     cameras are visited by a tour with small changes of position and direction. Of the views of a
-    panorama, only one is visited.
-
-    Args:
-        cameras: the cameras.
-        names: their names.
-        distance: world units from the cameras to what they see.
+    panorama, only one is visited. ``distance``: world units from the cameras to what they see.
     """
     by_name = sorted(range(len(names)), key=lambda i: natural_key(names[i]))
     by_name = _one_per_place(cameras, by_name)

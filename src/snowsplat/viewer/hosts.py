@@ -1,8 +1,7 @@
 """Checks of the Host and Origin headers of requests, for both servers.
 
 The owner of a domain can make its name resolve to this machine (DNS rebinding), and any web page
-can make a browser connect to this machine. A page cannot change the Host and Origin headers, which
-the browser writes. So these headers reveal both attacks.
+can make a browser connect to this machine. The browser writes these headers, so they reveal both.
 """
 
 from __future__ import annotations
@@ -33,14 +32,8 @@ class KnownHosts:
     """The names at which a server may be asked for."""
 
     def __init__(self, listening: str, allowed: Sequence[str] = ()) -> None:
-        """
-        Args:
-            listening: the address at which the server listens.
-            allowed: further names, such as that of a proxy; each may be several ones, separated by
-                commas.
-
-        Raises:
-            UserError: an allowed name is none.
+        """``listening``: the address of the server. ``allowed``: further names, such as that of a
+        proxy; each may be several ones, separated by commas. Raises: UserError: one is no name.
         """
         self._listening = listening
         self.allowed = [_valid(name) for names in allowed for name in names.split(",")]
@@ -67,8 +60,7 @@ class KnownHosts:
     def include_page(self, origin: str, host: str) -> bool:
         """Whether, by the Origin and Host headers, the requesting page comes from this server.
 
-        A proxy may replace the Host header, but not the Origin header. So the page also comes from
-        this server if its origin is an allowed name.
+        A proxy may replace the Host header, but not the Origin header: an allowed name is enough.
         """
         scheme, _, place = origin.lower().partition("://")
         if scheme not in ("http", "https"):

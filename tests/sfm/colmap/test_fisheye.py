@@ -16,9 +16,9 @@ from snowsplat.sfm.colmap.mapping import Mapping
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.progress import silent
-from snowsplat.synthetic.lens import FisheyeLens
 from snowsplat.synthetic.lens import Lens as PhoneLens
 
+from ...scenes.lenses import FisheyeLens
 from . import walks
 
 pytestmark = pytest.mark.sfm

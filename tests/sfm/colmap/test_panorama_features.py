@@ -6,7 +6,8 @@ from PIL import Image
 from snowsplat.data.lens.project import LensModel, directions
 from snowsplat.sfm.colmap.matching import match_descriptors
 from snowsplat.sfm.colmap.panorama_features import detect_in_panorama
-from snowsplat.synthetic.lens import Equirectangular
+
+from ...scenes.lenses import Equirectangular
 
 WIDTH = 640
 LENS = LensModel("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (float(WIDTH), WIDTH / 2))

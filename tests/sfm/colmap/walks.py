@@ -12,8 +12,9 @@ import pycolmap
 from snowsplat.sfm.colmap.database import closing_database, open_database
 from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.synthetic.lens import FisheyeLens
 from snowsplat.synthetic.lens import Lens as PhoneLens
+
+from ...scenes.lenses import FisheyeLens
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
 ORDINARY = PhoneLens(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, 0.0, 0.0))

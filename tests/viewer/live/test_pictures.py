@@ -9,9 +9,8 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import SH_C0, Gaussians
 from snowsplat.scene.render import render
-from snowsplat.viewer.live import palette
 from snowsplat.viewer.live.display import DisplaySettings, PhotoRectangle
-from snowsplat.viewer.live.pictures import Photo, draw
+from snowsplat.viewer.live.pictures import DEPTH, HEAT, Photo, draw
 
 WIDTH, HEIGHT = 90, 60
 CAMERA = Camera(WIDTH, HEIGHT, 80.0, 80.0, 45.0, 30.0, torch.eye(3, 4, dtype=torch.float64))
@@ -56,7 +55,7 @@ def test_depth_grows_from_yellow_to_violet():
     row.log_scales = torch.log(0.04 * torch.tensor(far))[:, None].repeat(1, 3)
     picture = draw(row, CAMERA, DisplaySettings("depth"))
     # The place of each colour in the palette.
-    table = palette.DEPTH.numpy().astype(int)
+    table = DEPTH.numpy().astype(int)
     places = [
         int(np.abs(table - picture[30, 45 + 12 * (i - 2)].astype(int)).sum(1).argmin())
         for i in range(5)
@@ -119,7 +118,7 @@ def test_ellipsoids_are_opaque_discs_with_an_edge():
 
 def test_cost_counts_gaussians():
     place = (0.0, 0.0, 2.0)
-    heat = palette.HEAT.numpy().astype(int)
+    heat = HEAT.numpy().astype(int)
     places = []
     for n in (1, 2, 8):
         picture = draw(

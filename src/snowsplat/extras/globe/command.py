@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from snowsplat.cli.flags import flag
+from snowsplat.cli.flags import Threads, flag
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
@@ -50,13 +50,10 @@ class Globe(Reports):
     """Frames per second of the video."""
     iteration: Annotated[int | None, flag("N", default="the last step")] = None
     """If OUT contains several scenes, the step after which the scene was saved."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.scene is None:
             raise UserError("globe needs a scene; use a file or the output folder of a training")
         if self.video is None and self.size is not None:

@@ -26,11 +26,8 @@ OPAQUE = 0.9
 
 
 def appearance(gaussians: Gaussians, snow: Snow) -> Gaussians:
-    """The Gaussians as they look in a state of the simulation.
-
-    Args:
-        gaussians: the Gaussians of the scene, in the frame of the globe.
-        snow: their motion, in the same order. If they all stand, the result equals ``gaussians``.
+    """The Gaussians of the scene, in the frame of the globe, in a state of the simulation ``snow``,
+    which has them in the same order. If they all stand, the result equals ``gaussians``.
     """
     morph = torch.from_numpy(snow.morph)
     low, high = (math.log(radius) for radius in FLAKE)

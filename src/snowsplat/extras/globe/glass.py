@@ -47,14 +47,9 @@ class Backdrop:
     add: np.ndarray  # (H, W, 3) linear light that reflections or the base add
 
     def around(self, color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-        """The complete picture.
+        """(H, W, 3) uint8: the complete picture, with the Gaussians over black.
 
-        Args:
-            color: (H, W, 3) the Gaussians over black.
-            alpha: (H, W) their opacity.
-
-        Returns:
-            (H, W, 3) uint8.
+        ``color``: (H, W, 3) of the Gaussians, and ``alpha``: (H, W) their opacity.
         """
         # Gaussians are blended in sRGB, as they were trained; light is added in linear light.
         inside = color + (1.0 - alpha[:, :, None]) * self.behind
@@ -63,12 +58,10 @@ class Backdrop:
 
 
 def draw(camera: Camera, plate: np.ndarray | None = None, samples: int = 2) -> Backdrop:
-    """The backdrop of the globe.
+    """The backdrop of the globe for a camera outside of the glass, in the frame of the globe.
 
-    Args:
-        camera: outside of the glass, in the frame of the globe.
-        plate: (h, w) in 0..1: the text on the plate, 1 where it is engraved; None: no plate.
-        samples: rays along each side of a pixel.
+    ``plate``: (h, w) in 0..1, 1 where the text on the plate is engraved; None: no plate.
+    ``samples``: rays along each side of a pixel.
     """
     parts = [
         _draw_rows(camera, plate, samples, first, min(first + 64, camera.height))

@@ -37,15 +37,9 @@ _SHADERS = {
 
 
 def write_page(path: Path | str, arrangement: Arrangement, name: str) -> None:
-    """Write the page atomically.
+    """Write the page of at least one Gaussian atomically. ``name``: on the plate, and the title.
 
-    Args:
-        path: the HTML file.
-        arrangement: the Gaussians; at least one.
-        name: on the plate of the base, and in the title.
-
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full.
+    Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
     columns, data = encode(arrangement.gaussians)
     simulation = _source("simulation.js")
@@ -81,29 +75,23 @@ def write_page(path: Path | str, arrangement: Arrangement, name: str) -> None:
 
 def constants() -> dict[str, Any]:
     """The constants of this package that the script of the page uses."""
+    of_video = ("DISTANCE", "ELEVATION", "FOCAL", "MIDDLE", "SHAKE_DIRECTION")
     return physics.constants() | {
         "BASE": [[ring.y, ring.half, ring.radius, ring.edge] for ring in dimensions.BASE],
         "PLATE": glass.PLATE,
-        "DISTANCE": video.DISTANCE,
-        "ELEVATION": video.ELEVATION,
-        "FOCAL": video.FOCAL,
-        "MIDDLE": video.MIDDLE,
-        "SHAKE_DIRECTION": video.SHAKE_DIRECTION,
+        **{name: getattr(video, name) for name in of_video},
     }
 
 
 def glsl_constants(antialiased: bool) -> str:
     """The constants of this package that the shaders use, as GLSL declarations."""
-    numbers = {
-        name: getattr(module, name)
-        for module, names in (
-            (dimensions, ("FLOOR", "FLOOR_RADIUS", "BLEND", "GROUND")),
-            (glass, ("PLATE_Y", "FRESNEL")),
-            (flakes, ("BRIGHTER", "WHITE", "OPAQUE")),
-            (reference, ("C1",)),
-        )
-        for name in names
+    modules: dict[Any, tuple[str, ...]] = {
+        dimensions: ("FLOOR", "FLOOR_RADIUS", "BLEND", "GROUND"),
+        glass: ("PLATE_Y", "FRESNEL"),
+        flakes: ("BRIGHTER", "WHITE", "OPAQUE"),
+        reference: ("C1",),
     }
+    numbers = {name: getattr(m, name) for m, names in modules.items() for name in names}
     lines = [f"const float {name} = {value!r};" for name, value in numbers.items()]
     lines.append(f"const bool ANTIALIASED = {str(antialiased).lower()};")
     vectors = {name: getattr(glass, name) for name in ("SNOW", "BRASS", "LIGHT", "PLATE")}
@@ -144,16 +132,8 @@ def encode(gaussians: Gaussians) -> tuple[list[dict[str, Any]], bytes]:
             low = float(column.min())
         scale = max(float(np.abs(column - low).max()), 1e-6) / levels
         quantised = np.rint((column - low) / scale).astype(kind)
-        columns.append(
-            {
-                "name": name,
-                "kind": kind,
-                "offset": len(data),
-                "length": len(column),
-                "scale": scale,
-                "low": low,
-            }
-        )
+        where = {"name": name, "kind": kind, "offset": len(data), "length": len(column)}
+        columns.append(where | {"scale": scale, "low": low})
         data += quantised.astype(f"<{kind}").tobytes()
     return columns, data
 

@@ -49,9 +49,8 @@ class GlobeVideo:
 
     arrangement: Arrangement  # the Gaussians
     plate: np.ndarray | None  # (h, w) in 0..1: the text on the plate of the base; None: no plate
-    # width, height: pixels.
-    width: int
-    height: int
+    width: int  # pixels
+    height: int  # pixels
     fps: float  # frames per second
 
     @property
@@ -95,13 +94,10 @@ class GlobeVideo:
 def orbit_camera(azimuth: float, width: int, height: int) -> Camera:
     """A camera that looks at the globe; at azimuth 0, from the direction of the first photo."""
     level = DISTANCE * math.cos(ELEVATION)
-    position = [
-        level * math.sin(azimuth),
-        MIDDLE - DISTANCE * math.sin(ELEVATION),
-        -level * math.cos(azimuth),
-    ]
-    target, up = [0.0, MIDDLE, 0.0], [0.0, -1.0, 0.0]
-    pose = look_at(*(torch.tensor(p, dtype=torch.float64) for p in (position, target, up)))
+    y = MIDDLE - DISTANCE * math.sin(ELEVATION)
+    position = [level * math.sin(azimuth), y, -level * math.cos(azimuth)]
+    points = (position, [0.0, MIDDLE, 0.0], [0.0, -1.0, 0.0])  # position, target, up
+    pose = look_at(*(torch.tensor(point, dtype=torch.float64) for point in points))
     focal = FOCAL * min(width, height)
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 

@@ -5,7 +5,6 @@ The frame is that of `snowsplat.extras.globe.dimensions`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,7 +26,9 @@ from snowsplat.trajectory.focus import (
     rotations_of,
     up_of,
     viewing_distance,
+    weighted_quantile,
 )
+from snowsplat.trajectory.orbit import WIDEST_GAP, widest_gap
 from snowsplat.util.errors import UserError
 
 # Gaussians with a lower opacity are left out: as snow, they would be invisible.
@@ -50,7 +51,6 @@ _FADE = (0.84, 0.97)
 _ISOLATED = 8.0
 # How far the scene may extend below the floor. A table top is not perfectly flat.
 _SUNK = 0.03
-_WIDEST_GAP = math.radians(110)
 
 
 @dataclass(frozen=True)
@@ -66,19 +66,12 @@ class Arrangement:
 def arrange(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> Arrangement:
     """At most ``count`` Gaussians of the subject of a scene, in the frame of the globe.
 
-    The subject is at the focus of the cameras. Without cameras, it is at the median of the
-    Gaussians, and −y is up. It is scaled so that it fills the globe. It stands on the floor of the
-    globe: the largest horizontal surface near the focus becomes the floor or, without such a
+    The subject is at the focus of the cameras of the photos. Without cameras, it is at the median
+    of the Gaussians, and −y is up. It is scaled so that it fills the globe. It stands on the floor
+    of the globe: the largest horizontal surface near the focus becomes the floor or, without such a
     surface, the lowest Gaussians do. What is outside of the glass or below the floor is left out,
     as are isolated Gaussians. Opacities decrease towards the glass.
-
-    Args:
-        gaussians: the scene.
-        cameras: the cameras of its photos; may be empty.
-        count: maximum number of Gaussians.
-
-    Raises:
-        UserError: no Gaussians are left.
+    Raises: UserError: no Gaussians are left.
     """
     gaussians = gaussians.detach()
     usable = gaussians.usable_rows() & (gaussians.opacities > _MIN_OPACITY)
@@ -132,8 +125,8 @@ def _globe_frame(gaussians: Gaussians, cameras: Sequence[Camera]) -> Similarity:
     near = (level_distance < radius) & (around[:, 1] <= floor)
     weights = gaussians.opacities.double()
     if bool(near.any()):
-        height = floor - _quantile(around[near, 1], weights[near], 0.01)
-        width = _quantile(level_distance[near], weights[near], 0.98)
+        height = floor - float(weighted_quantile(around[near, 1], weights[near], 0.01))
+        width = float(weighted_quantile(level_distance[near], weights[near], 0.98))
     else:
         height = width = radius
     # A slim subject is not enlarged until it touches the glass.
@@ -159,7 +152,7 @@ def _floor_height(gaussians: Gaussians, rotation: Tensor, around: Tensor, radius
     weights = near_gaussians.opacities.double()
     flat = (normals[:, 1].abs() > _HORIZONTAL) & (scales[:, 0] < 0.5 * scales[:, 1])
     areas = weights * scales[:, 1] * scales[:, 2] * flat
-    lowest = _quantile(heights, weights, 0.995)
+    lowest = float(weighted_quantile(heights, weights, 0.995))
     cells = ((heights + radius) / (2 * radius) * _HEIGHT_CELLS).long().clamp(0, _HEIGHT_CELLS - 1)
     histogram = torch.zeros(_HEIGHT_CELLS + 2, dtype=torch.float64).index_add_(0, cells + 1, areas)
     # Three cells at a time, so that a surface at the border of two cells is found.
@@ -168,17 +161,15 @@ def _floor_height(gaussians: Gaussians, rotation: Tensor, around: Tensor, radius
     if float(sums[best]) < _FLOOR_SHARE * float(areas.sum()) or not float(areas.sum()) > 0:
         return lowest
     surface = (cells - best).abs() <= 1
-    return _quantile(heights[surface], areas[surface], 0.5)
+    return float(weighted_quantile(heights[surface], areas[surface], 0.5))
 
 
 def _surrounded(frame: Similarity, cameras: Sequence[Camera]) -> bool:
-    """Whether no sector around the globe that is wider than `_WIDEST_GAP` is without a camera."""
+    """Whether no sector around the globe that is wider than `WIDEST_GAP` is without a camera."""
     if not cameras:
         return True
     x, _, z = frame.apply(positions_of(cameras)).T
-    azimuths = torch.atan2(x, z).sort().values
-    gaps = torch.cat([azimuths[1:], azimuths[:1] + 2 * math.pi]) - azimuths
-    return float(gaps.max()) < _WIDEST_GAP
+    return widest_gap(torch.atan2(x, z))[0] < WIDEST_GAP
 
 
 def _inside(gaussians: Gaussians) -> Gaussians:
@@ -195,11 +186,3 @@ def _inside(gaussians: Gaussians) -> Gaussians:
     keep = (opacities > _MIN_OPACITY) & (means[:, 1] < FLOOR + _SUNK) & (lowest < FLOOR + 2 * _SUNK)
     faded = replace(gaussians, opacity_logits=opacities.logit(1e-6))
     return faded.select(keep)
-
-
-def _quantile(values: Tensor, weights: Tensor, share: float) -> float:
-    """The weighted quantile of ``values`` (P,), P > 0."""
-    order = values.argsort()
-    sums = weights[order].cumsum(0)
-    index = int(torch.searchsorted(sums, share * sums[-1]).clamp_max(len(values) - 1))
-    return float(values[order[index]])

@@ -46,13 +46,11 @@ class GlobeOptions:
 
     def __post_init__(self) -> None:
         if not 1 <= self.gaussians <= _LARGEST:
-            raise SettingError(
-                "gaussians", f"{self.gaussians} is out of range; use 1 to {_LARGEST:,}"
-            )
+            problem = f"{self.gaussians} is out of range; use 1 to {_LARGEST:,}"
+            raise SettingError("gaussians", problem)
         if self.name is not None and len(self.name) > _LONGEST_NAME:
-            raise SettingError(
-                "name", f"{len(self.name)} letters are too many; use at most {_LONGEST_NAME}"
-            )
+            problem = f"{len(self.name)} letters are too many; use at most {_LONGEST_NAME}"
+            raise SettingError("name", problem)
         if not _FPS[0] <= self.fps <= _FPS[1]:
             raise SettingError("fps", f"{self.fps:g} is out of range; use 1 to 120")
         VideoSize.parse(self.size)
@@ -67,17 +65,11 @@ class GlobeOptions:
 
 @dataclass(frozen=True)
 class GlobeResult:
-    """A globe.
+    """A globe."""
 
-    Attributes:
-        page: the HTML file.
-        video: the video; None if none was requested.
-        gaussians: the number of Gaussians in the globe.
-    """
-
-    page: Path
-    video: Path | None
-    gaussians: int
+    page: Path  # the HTML file
+    video: Path | None  # None if none was requested
+    gaussians: int  # the number of Gaussians in the globe
 
 
 def make_globe(

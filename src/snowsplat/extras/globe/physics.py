@@ -196,8 +196,7 @@ class Snow:
     ) -> None:
         """Advance by ``seconds``, during which the globe has this acceleration (units/s²).
 
-        Raises:
-            ValueError: the step is longer than `LONGEST_STEP`.
+        Raises: ValueError: the step is longer than `LONGEST_STEP`.
         """
         if not 0 < seconds <= LONGEST_STEP * 1.0001:
             raise ValueError(f"a step has at most {LONGEST_STEP:.4f} s, not {seconds}")
@@ -240,14 +239,8 @@ class Snow:
     def pile(self) -> np.ndarray:
         """(cells, cells) float32: the height of the pile in each cell, by row z and column x."""
         cells = self._cells
-        x, z = (
-            np.clip(
-                ((self.position[axis, self.resting] + FLOOR_RADIUS) * self._per_unit).astype(int),
-                0,
-                cells - 1,
-            )
-            for axis in (0, 2)
-        )
+        places = (self.position[::2, self.resting] + FLOOR_RADIUS) * self._per_unit
+        x, z = np.clip(places.astype(int), 0, cells - 1)
         counts = np.bincount(z * cells + x, minlength=cells * cells).astype(np.float32)
         # The mean height is PILE_DEPTH if all flakes rest on the disc.
         height = PILE_DEPTH * math.pi * (cells / 2) ** 2 / len(self.angle)

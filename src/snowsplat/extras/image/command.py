@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Quiet, Threads, flag, switch
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
@@ -51,17 +51,13 @@ class Image(Reports):
     """Pixels along the longer side. A larger photo is scaled down."""
     seed: Annotated[int, flag("N", default="0")] = 0
     """Seed of the random positions of the Gaussians."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     overwrite: Annotated[bool, switch()] = False
     """Replace an earlier fit in OUT."""
-    quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result and no progress."""
+    quiet: Quiet = False
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.photo is None or self.output is None:
             raise UserError(
                 "image needs a photo and an output folder: snowsplat image PHOTO -o OUT"

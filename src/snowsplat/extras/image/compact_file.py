@@ -52,9 +52,7 @@ _MOST_PIXELS = 1 << 26
 
 
 def write_compact(path: Path, gaussians: ImageGaussians) -> ImageGaussians:
-    """Write the Gaussians as a compact file, atomically.
-
-    Returns what `read_compact` reads from the file: the quantised Gaussians.
+    """Write the Gaussians as a compact file, atomically; returns what `read_compact` reads from it.
 
     Raises:
         ValueError: there are no Gaussians, or a value is not finite.
@@ -67,11 +65,7 @@ def write_compact(path: Path, gaussians: ImageGaussians) -> ImageGaussians:
 
 
 def read_compact(path: Path) -> ImageGaussians:
-    """Read a compact file.
-
-    Raises:
-        UserError: the file is missing, is not a compact file, or is damaged.
-    """
+    """Read a compact file. Raises: UserError: it is missing or damaged, or of another kind."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -129,9 +123,8 @@ def decode(data: bytes) -> ImageGaussians:
     columns = column_count(_BLENDINGS[blending])
     scales_end = _HEADER.size + 8 * columns
     scales = np.frombuffer(body[_HEADER.size : scales_end], "<f4")
-    if len(scales) != 2 * columns or not np.isfinite([*scales, *background]).all():
-        raise ValueError("the header of the file is damaged")
-    if not 1 <= count <= MOST_GAUSSIANS:
+    valid = len(scales) == 2 * columns and np.isfinite([*scales, *background]).all()
+    if not (valid and 1 <= count <= MOST_GAUSSIANS):
         raise ValueError("the header of the file is damaged")
     levels = _levels(body[scales_end:], count, columns)
     if _BLENDINGS[blending] == "additive":
@@ -152,9 +145,7 @@ def decode(data: bytes) -> ImageGaussians:
 
 def _byte_planes(levels: np.ndarray) -> bytes:
     """(N, C) uint16 as bytes: for each column, the low bytes and then the high bytes."""
-    return np.ascontiguousarray(
-        levels.astype("<u2").view(np.uint8).reshape(len(levels), -1).T
-    ).tobytes()
+    return levels.astype("<u2").view(np.uint8).reshape(len(levels), -1).T.tobytes()
 
 
 def _levels(payload: bytes, count: int, columns: int) -> np.ndarray:
@@ -174,9 +165,8 @@ def _levels(payload: bytes, count: int, columns: int) -> np.ndarray:
 def _z_order(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(N,) uint64: the bits of two 16-bit numbers, alternating."""
     code = np.zeros(len(x), np.uint64)
+    one = np.uint64(1)
     for bit in range(16):
-        for shift, values in ((0, x), (1, y)):
-            code |= (values.astype(np.uint64) >> np.uint64(bit) & np.uint64(1)) << np.uint64(
-                2 * bit + shift
-            )
+        for shift, values in enumerate((x, y)):
+            code |= (values.astype(np.uint64) >> np.uint64(bit) & one) << np.uint64(2 * bit + shift)
     return code

@@ -69,9 +69,8 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         if not 1 <= self.gaussians <= MOST_GAUSSIANS:
-            raise SettingError(
-                "gaussians", f"{self.gaussians} is out of range; use 1 to {MOST_GAUSSIANS}"
-            )
+            problem = f"{self.gaussians} is out of range; use 1 to {MOST_GAUSSIANS}"
+            raise SettingError("gaussians", problem)
         if self.steps < 1:
             raise SettingError("steps", f"{self.steps} is too small; use at least 1")
 
@@ -86,7 +85,6 @@ class Fitter:
 
     Args:
         target: the image (H, W, 3) in 0..1, float32.
-        options: the settings.
 
     Attributes:
         steps_done: number of steps so far.

@@ -172,9 +172,7 @@ def load_photo(photo: Path, size: int) -> Tensor:
     """A photo, scaled down so that its longer side has at most `size` pixels.
 
     Returns (H, W, 3) float32 in 0..1. A transparent photo is composited over white.
-
-    Raises:
-        UserError: the file is missing or damaged.
+    Raises: UserError: the file is missing or damaged.
     """
     header = read_header(photo)
     width, height = header.width, header.height
@@ -195,25 +193,24 @@ def _run(fitter: Fitter, target: Tensor, video: Path, observer: Observer) -> lis
     frame_width, frame_height = (2 * max(1, side * scale // 2) for side in (width, height))
     moments: list[Moment] = []
     seconds = 0.0
-    observer.steps_begin(0, steps)
-    try:
-        with video_writer(video, frame_width, frame_height, _VIDEO_FPS) as add_frame:
-            while not fitter.finished:
-                start = time.perf_counter()
-                fitter.step()
-                seconds += time.perf_counter() - start
-                step, gaussians = fitter.steps_done, fitter.gaussian_count
-                observer.step(Progress(step, fitter.mse, gaussians, steps, downscale=1))
-                if step in recorded:
-                    model = fitter.gaussians
-                    metrics = compare(model.render(), target)
-                    moments.append(Moment(step, seconds, gaussians, metrics.psnr, metrics.ssim))
-                    frame = _frame(model, scale, frame_width, frame_height)
-                    add_frame(frame)
-            for _ in range(_VIDEO_HOLD):
+    with (
+        observer.stepping(0, steps),
+        video_writer(video, frame_width, frame_height, _VIDEO_FPS) as add_frame,
+    ):
+        while not fitter.finished:
+            start = time.perf_counter()
+            fitter.step()
+            seconds += time.perf_counter() - start
+            step, gaussians = fitter.steps_done, fitter.gaussian_count
+            observer.step(Progress(step, fitter.mse, gaussians, steps, downscale=1))
+            if step in recorded:
+                model = fitter.gaussians
+                metrics = compare(model.render(), target)
+                moments.append(Moment(step, seconds, gaussians, metrics.psnr, metrics.ssim))
+                frame = _frame(model, scale, frame_width, frame_height)
                 add_frame(frame)
-    finally:
-        observer.steps_end()
+        for _ in range(_VIDEO_HOLD):
+            add_frame(frame)
     return moments
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.extras.image.model import COLORS, LOG_SIGMAS, OPACITY_LOGIT, ImageGaussians
+from snowsplat.pipeline.output.image_files import to_8bit
 from snowsplat.util import charts
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
@@ -112,22 +113,17 @@ def _pictures(fitted: Fitted) -> str:
     gaussians, photo = fitted.gaussians, Image.fromarray(fitted.photo.numpy())
     scale = max(1, -(-_LEAST_SIDE // max(photo.size)))
     image = gaussians.render().clamp(0, 1)
-    ellipses = shrunk(gaussians, image).render(scale)
+    large, ellipses = gaussians.render(scale), shrunk(gaussians, image).render(scale)
     video = base64.b64encode(fitted.video.read_bytes()).decode("ascii")
+    player = (
+        '<video controls="" autoplay="" loop="" muted="" '
+        f'src="data:video/mp4;base64,{video}"></video>'
+    )
     figures = [
         ("photo", picture(photo, "photo", 95), "The photo"),
-        ("", picture(_pixels(gaussians.render(scale)), "the Gaussians", 92), "The Gaussians"),
-        (
-            "",
-            picture(_pixels(ellipses), "ellipses", 92),
-            "The Gaussians at half their size",
-        ),
-        (
-            "",
-            '<video controls="" autoplay="" loop="" muted="" '
-            f'src="data:video/mp4;base64,{video}"></video>',
-            "The fit; the video becomes faster towards the end",
-        ),
+        ("", picture(_pixels(large), "the Gaussians", 92), "The Gaussians"),
+        ("", picture(_pixels(ellipses), "ellipses", 92), "The Gaussians at half their size"),
+        ("", player, "The fit; the video becomes faster towards the end"),
     ]
     inner = "\n".join(
         f'<figure class="{kind}">{html}<figcaption>{caption}</figcaption></figure>'
@@ -138,7 +134,7 @@ def _pictures(fitted: Fitted) -> str:
 
 def _pixels(image: Tensor) -> Image.Image:
     """(H, W, 3) in 0..1 as an 8-bit image."""
-    return Image.fromarray((image.clamp(0, 1) * 255 + 0.5).byte().contiguous().numpy())
+    return Image.fromarray(to_8bit(image))
 
 
 def _curves(moments: list[Moment]) -> str:

@@ -48,11 +48,8 @@ def merge_pixels(depth: Tensor, photo: Tensor, links: Links, most: int) -> Block
     block is divided into four if its error is above a limit, or if two neighbouring pixels in it
     are not linked. The limit is found by bisection.
 
-    Args:
-        depth: (H, W) positive; NaN where it is unknown.
-        photo: (H, W, 3) in 0..1.
-        links: see `find_links`.
-        most: if too many pixels are not linked, the result has more blocks than that.
+    ``depth`` (H, W) is positive, NaN where it is unknown, ``photo`` (H, W, 3) in 0..1. If too many
+    pixels are not linked, the result has more than ``most`` blocks.
     """
     known = depth.isfinite()
     if int(known.sum()) <= most:
@@ -117,13 +114,14 @@ def _leaves(errors: dict[int, Tensor], limit: float, known: Tensor) -> dict[int,
     covered = torch.zeros_like(chosen[_LARGEST])
     for side, accepted in chosen.items():
         chosen[side] = accepted & ~covered
-        covered = _doubled(accepted | covered)
+        covered = _enlarged(accepted | covered, 2)
     height, width = known.shape
     return chosen | {1: known & ~covered[:height, :width]}
 
 
-def _doubled(mask: Tensor) -> Tensor:
-    return mask.repeat_interleave(2, 0).repeat_interleave(2, 1)
+def _enlarged(blocks: Tensor, side: int) -> Tensor:
+    """(h, w) -> (h · side, w · side): a value for each pixel of the blocks."""
+    return blocks.repeat_interleave(side, 0).repeat_interleave(side, 1)
 
 
 def _numbered(chosen: dict[int, Tensor]) -> Blocks:
@@ -134,7 +132,7 @@ def _numbered(chosen: dict[int, Tensor]) -> Blocks:
     for side, mask in chosen.items():
         ids = torch.full(mask.shape, -1, dtype=torch.int64)
         ids[mask] = torch.arange(int(mask.sum())) + count
-        ids = ids.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width]
+        ids = _enlarged(ids, side)[:height, :width]
         owner = torch.where(ids >= 0, ids, owner)
         sizes += [float(side)] * int(mask.sum())
         count = len(sizes)

@@ -18,9 +18,7 @@ from snowsplat.scene.sh_constants import SH_C0
 _STEPS = 10
 
 
-def match_photo(
-    gaussians: Gaussians, camera: Camera, photo: Tensor, steps: int = _STEPS
-) -> Gaussians:
+def match_photo(gaussians: Gaussians, camera: Camera, photo: Tensor) -> Gaussians:
     """Gaussians with the same geometry and opacity, whose colours reproduce the photo.
 
     Discs of neighbouring pixels overlap, so an image of discs in the colours of the photo is
@@ -29,17 +27,13 @@ def match_photo(
     Nesterov's momentum (Beck and Teboulle 2009). The backward pass of the rasterizer computes
     Wᵀ x. Gaussians that are not visible keep their colours.
 
-    Args:
-        gaussians: of SH degree 0.
-        camera: the camera of the photo.
-        photo: (H, W, 3) in 0..1.
-        steps: number of gradient steps.
+    ``gaussians`` have the SH degree 0; ``photo`` (H, W, 3) is in 0..1.
     """
     colors = gaussians.base_colors.clamp(0.0, 1.0)
     # The scaling bounds the step by the mean of a row of Wᵀ W, which its largest row may exceed.
     weights = _transposed(gaussians, camera, torch.full_like(colors, 0.5), None).clamp_min(1e-3)
     ahead, momentum = colors, 1.0
-    for _ in range(steps):
+    for _ in range(_STEPS):
         step = _transposed(gaussians, camera, ahead, photo) / weights
         following = (ahead + step).clamp(0.0, 1.0)
         grown = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * momentum * momentum))

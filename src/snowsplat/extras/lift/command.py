@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.flags import Quiet, Threads, flag, switch
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
@@ -73,17 +73,13 @@ class Lift(Reports):
     """Number of training steps with --refine."""
     eval: Annotated[bool, switch()] = False
     """With --refine: hold out every 8th photo, and evaluate the scene on these photos."""
-    threads: Annotated[int | None, flag("N", default="all cores")] = None
-    """Number of CPU threads."""
+    threads: Threads = None
     overwrite: Annotated[bool, switch()] = False
     """Replace an earlier scene in OUT."""
-    quiet: Annotated[bool, switch("-q")] = False
-    """Print only the result and no progress."""
+    quiet: Quiet = False
     json: JsonFlag = False
-    """Print the result as JSON on stdout, and everything else on stderr."""
 
     def run(self) -> int:
-        """Returns the exit code, 0."""
         if self.photo is None or self.output is None:
             raise UserError(
                 "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"

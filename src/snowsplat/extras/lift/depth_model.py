@@ -29,12 +29,8 @@ _SHORTER_SIDE, _MULTIPLE = 518, 14
 def estimate_depth(model: Path, photo: Tensor) -> np.ndarray:
     """The output of a model for a photo, (h, w) float32, at the resolution of the model.
 
-    Args:
-        model: an ONNX file, or a folder that transformers reads.
-        photo: (H, W, 3) float32 in 0..1.
-
-    Raises:
-        UserError: the model is missing, damaged or of another kind, or a package is missing.
+    ``model``: an ONNX file, or a folder that transformers reads. ``photo``: (H, W, 3) in 0..1.
+    Raises: UserError: the model is missing, damaged or of another kind, or a package is missing.
     """
     if model.is_dir():
         values = _run_transformers(model, photo)
@@ -93,9 +89,8 @@ def _run_transformers(model: Path, photo: Tensor) -> Any:
     try:
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
     except ImportError:
-        raise UserError(
-            f"{model}: this model needs a package; run pip install transformers"
-        ) from None
+        what = "this model needs a package; run pip install transformers"
+        raise UserError(f"{model}: {what}") from None
     try:
         # Only files of this folder are read, and no code in it is executed.
         processor = AutoImageProcessor.from_pretrained(model, local_files_only=True)

@@ -81,12 +81,9 @@ def _axes(tangents: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def sigma_of_block(size: Tensor) -> Tensor:
-    """The standard deviations of the discs of square blocks of pixels, in pixels.
+    """The standard deviations of the discs of square blocks of ``size`` (N,) ≥ 1 pixels, in pixels.
 
     After the rasterizer has added its variance, neighbouring discs of any size overlap as those of
     pixels do.
-
-    Args:
-        size: (N,) the widths of the blocks in pixels, at least 1.
     """
     return ((SIGMA**2 + _DILATION) * size.square() - _DILATION).sqrt()

@@ -31,8 +31,7 @@ class Links:
 def find_links(depth: Tensor, threshold: float = EDGE_THRESHOLD) -> Links:
     """Link neighbours whose depths differ by at most ``threshold`` of the larger one.
 
-    Args:
-        depth: (H, W) positive; NaN where the depth is unknown. Such pixels have no links.
+    ``depth``: (H, W) positive; NaN where it is unknown. Such pixels have no links.
     """
 
     def similar(a: Tensor, b: Tensor) -> Tensor:
@@ -48,11 +47,7 @@ def snap_to_surfaces(depth: Tensor, threshold: float = EDGE_THRESHOLD) -> Tensor
     object and that of the background, where there is no surface. A pixel is moved if it is linked
     to neither of its neighbours in a row or a column, and its depth is between theirs.
 
-    Args:
-        depth: (H, W) positive; NaN where it is unknown.
-
-    Returns:
-        (H, W). Pixels on surfaces have their old depth.
+    ``depth``: (H, W) positive; NaN where it is unknown. Pixels on surfaces keep their depth.
     """
     links = find_links(depth, threshold)
     between = _between(depth, links.right) | _between(depth.T, links.down.T).T
@@ -79,13 +74,8 @@ def _between(depth: Tensor, right: Tensor) -> Tensor:
 def resize_depth(
     depth: Tensor, width: int, height: int, threshold: float = EDGE_THRESHOLD
 ) -> Tensor:
-    """The depth map at another size: bilinear on surfaces, the nearest value at discontinuities.
-
-    Args:
-        depth: (H, W) positive; NaN where it is unknown.
-
-    Returns:
-        (height, width).
+    """(height, width): the depth map (H, W) at another size: bilinear on surfaces, the nearest
+    value at discontinuities. Depths are positive; NaN where they are unknown.
     """
     if depth.shape == (height, width):
         return depth

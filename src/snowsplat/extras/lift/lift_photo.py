@@ -19,15 +19,14 @@ from snowsplat.extras.lift.depth_model import estimate_depth
 from snowsplat.extras.lift.edges import resize_depth
 from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.output import image_files
-from snowsplat.pipeline.output.image_files import to_8bit, write_png
+from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit, write_png
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.trajectory.swing import swing_path
+from snowsplat.trajectory.orbit import swing_path
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
@@ -170,9 +169,7 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     """An upright photo (H, W, 3) in 0..1, its camera, and where the focal length is from.
 
     Transparent photos are composited over white. The pose is the identity.
-
-    Raises:
-        UserError: see `lift_photo`.
+    Raises: UserError: see `lift_photo`.
     """
     least, most = _SIDES
     if not least <= size <= most:
@@ -235,12 +232,11 @@ def finish(
         image = render(gaussians, camera).image
     metrics = compare(image, pixels, name="photo")
     out.write_metrics(step, "train", Evaluation([metrics]))
-    image_files.write_png(out.path / "rendered.png", image_files.to_8bit(image))
+    write_png(out.path / "rendered.png", to_8bit(image))
     known = z[z.isfinite()].numpy()
     near, far = (float(value) for value in np.percentile(known, [1, 99]))
     depth = torch.nan_to_num(z, nan=0.0).numpy()
-    colored = image_files.depth_in_color(depth, near, max(far, 1.001 * near))
-    image_files.write_png(out.path / "depth.png", colored)
+    write_png(out.path / "depth.png", depth_in_color(depth, near, max(far, 1.001 * near)))
     seconds = time.monotonic() - started
     video = out.path / "swing.mp4"
     video.unlink(missing_ok=True)  # of an earlier run

@@ -14,10 +14,9 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
 
@@ -65,7 +64,9 @@ def refine_photo(
     view = _view_of(posed, Path(photo))
     if posed.points is None:
         raise UserError(f"{dataset}: has no points, which the depth is aligned to; use lift alone")
-    config = _capped(recipe("default", iterations=iterations, init="points"), posed)
+    sizes = sorted(view.camera.width * view.camera.height for view in posed.train)
+    config = recipe("default", iterations=iterations, init="points")
+    config = config.capped(sizes[len(sizes) // 2], len(sizes))  # as in the training
     Compute("cpu", threads).apply()
     with ImageLoader([view], background=(1.0, 1.0, 1.0)) as loader:
         pixels = loader.get(view).rgb.float().div(255).contiguous()
@@ -76,35 +77,18 @@ def refine_photo(
     options = replace(options, max_gaussians=min(options.max_gaussians or limit, limit))
     lifted = replace(lift(pixels, z, view.camera, options), origin=posed.origin)
     out.begin(posed, settings, config)
-    source = "of the dataset"
-    finish(out, 0, lifted, pixels, z, view.camera, source, swing=False, started=started)
+    what = pixels, z, view.camera, "of the dataset"
+    finish(out, 0, lifted, *what, swing=False, started=started)
     seconds = time.monotonic() - started
     initial = _with_unseen_points(lifted, posed.points, view.camera, config.initial_opacity)
-    trainer = Trainer(posed, config, initial=_with_degree(initial, config.sh_degree))
-    _train(trainer, observer)
-    result = finish(
-        out,
-        trainer.step,
-        trainer.gaussians,
-        pixels,
-        z,
-        view.camera,
-        source,
-        swing=swing,
-        started=started,
-    )
+    trainer = Trainer(posed, config, initial=with_sh_degree(initial, config.sh_degree))
+    with observer.stepping(0, trainer.schedule.iterations):
+        trainer.run(observer.step)
+    result = finish(out, trainer.step, trainer.gaussians, *what, swing=swing, started=started)
     evaluation = trainer.evaluate() if posed.test else None
     if evaluation is not None:
         out.write_metrics(trainer.step, "test", evaluation)
     return replace(result, seconds=seconds, alignment=alignment, evaluation=evaluation)
-
-
-def _train(trainer: Trainer, observer: Observer) -> None:
-    observer.steps_begin(0, trainer.schedule.iterations)
-    try:
-        trainer.run(observer.step)
-    finally:
-        observer.steps_end()
 
 
 def _view_of(dataset: Dataset, photo: Path) -> View:
@@ -122,12 +106,6 @@ def _view_of(dataset: Dataset, photo: Path) -> View:
     raise UserError(f"{photo}: {problem}; use one of its training photos, for example {names}")
 
 
-def _capped(config: TrainConfig, dataset: Dataset) -> TrainConfig:
-    """The configuration with its limit of Gaussians, as the trainer sets it."""
-    sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
-    return config.capped(sizes[len(sizes) // 2], len(sizes))
-
-
 def _with_unseen_points(
     lifted: Gaussians, points: Points, camera: Camera, opacity: float
 ) -> Gaussians:
@@ -141,9 +119,3 @@ def _with_unseen_points(
         Points(points.xyz[unseen], points.rgb[unseen]), sh_degree=0, initial_opacity=opacity
     )
     return lifted.append(replace(others, origin=lifted.origin))
-
-
-def _with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians with coefficients of 0 up to an SH degree."""
-    rest = gaussians.means.new_zeros(len(gaussians), SH_REST_COUNTS[degree], 3)
-    return replace(gaussians, sh_rest=rest)

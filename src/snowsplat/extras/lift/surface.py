@@ -37,10 +37,7 @@ def surface_of(depth: Tensor, camera: Camera, links: Links) -> Surface:
     z are computed from linked neighbours, in disparity 1/z, which is linear on planes. A pixel
     without a linked neighbour in a row (column) is parallel to the image plane in that direction.
 
-    Args:
-        depth: (H, W) camera z in world units, positive; NaN where it is unknown.
-        camera: of size (W, H).
-        links: see `find_links`.
+    ``depth``: (H, W) camera z in world units, positive; NaN where it is unknown.
     """
     height, width = depth.shape
     u = (torch.arange(width, dtype=depth.dtype) + 0.5 - camera.cx) / camera.fx

@@ -29,16 +29,11 @@ _STYLE = """
 
 @dataclass(frozen=True)
 class BenchmarkReport:
-    """The results of a benchmark.
+    """The results of a benchmark."""
 
-    Attributes:
-        suite: a name of `suites.SUITES`.
-        failures: the errors of scenes that could not be trained, by scene.
-    """
-
-    suite: str
+    suite: str  # a name of `suites.SUITES`
     results: list[SceneResult]
-    failures: dict[str, str] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)  # the errors of scenes, by scene
 
     def as_json(self) -> dict[str, Any]:
         return {

@@ -35,12 +35,9 @@ from snowsplat.util.process_memory import peak_bytes
 from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, read_json
 
-#: A file in the output folder of a scene.
-RESULT = "benchmark.json"
-#: The exit code if another process trains the scene.
-TAKEN = 75
-# A process whose benchmark was killed ends within this time.
-_WAIT_SECONDS = 15.0
+RESULT = "benchmark.json"  # in the output folder of a scene
+TAKEN = 75  # the exit code if another process trains the scene
+_WAIT_SECONDS = 15.0  # a process whose benchmark was killed ends within this time
 #: A picture of the view with the lowest PSNR: the photo, and its rendering to the right.
 WORST = "worst.jpg"
 _SIDE = 480  # pixels of the longer side of an image in it
@@ -57,7 +54,7 @@ class Job:
     recipe: str
     settings: dict[str, Any] = field(default_factory=dict)
     resolution: int | None = None
-    hold_out: int = 8
+    hold_out: int = 8  # unless the dataset has a split of its own
     lpips: str | None = None
 
     @property
@@ -85,8 +82,7 @@ class SceneResult:
     def read(job: Job) -> SceneResult | None:
         """The result of an earlier run, if there is one.
 
-        Raises:
-            UserError: it is damaged, or was made with other settings.
+        Raises: UserError: it is damaged, or was made with other settings.
         """
         if not job.result.is_file():
             return None

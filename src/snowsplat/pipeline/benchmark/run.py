@@ -110,8 +110,7 @@ def benchmark(
 def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
     """The folders of scenes in ``folder``.
 
-    Raises:
-        UserError: there are none, or one of ``only`` is missing.
+    Raises: UserError: there are none, or one of ``only`` is missing.
     """
 
     def is_dataset(path: Path) -> bool:
@@ -138,8 +137,7 @@ def _job(dataset: Path, output: Path, name: str, options: BenchmarkOptions) -> J
         options.recipe,
         {**suite.settings, **options.settings},
         options.resolution or suite.resolutions.get(dataset.name),
-        suite.hold_out,
-        None if options.lpips is None else _lpips(options.lpips),
+        lpips=None if options.lpips is None else _lpips(options.lpips),
     )
 
 

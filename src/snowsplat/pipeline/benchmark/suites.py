@@ -31,8 +31,6 @@ class Suite:
     # as images_4) are used if the dataset has them. Scenes that are not listed have their full
     # size.
     resolutions: Mapping[str, int] = field(default_factory=dict)
-    # Every ``hold_out``-th photo is a test photo, unless the dataset has a split of its own.
-    hold_out: int = 8
     # Settings of the training that the protocol fixes.
     settings: Mapping[str, Any] = field(default_factory=dict)
     published: Mapping[str, Figures] = field(default_factory=dict)  # figures of each scene
@@ -65,10 +63,7 @@ SUITES = {
         "Tanks and Temples",
         "The two scenes truck and train, as distributed with the paper, at their full size. Every "
         "8th photo is a test photo.",
-        published={
-            "truck": Figures(25.187, 0.879, 0.148),
-            "train": Figures(21.097, 0.802, 0.218),
-        },
+        published={"truck": Figures(25.187, 0.879, 0.148), "train": Figures(21.097, 0.802, 0.218)},
         source=_PAPER,
     ),
     "db": Suite(
@@ -99,8 +94,7 @@ SUITES = {
         source=_PAPER,
     ),
     "custom": Suite(
-        "Own scenes",
-        "Every 8th photo is a test photo, unless the dataset has a split of its own.",
+        "Own scenes", "Every 8th photo is a test photo, unless the dataset has a split of its own."
     ),
 }
 

@@ -30,14 +30,12 @@ def write_block_dataset(
     """Write a COLMAP model of some views and points, and link their photos, masks and depth maps.
 
     The links are relative symbolic links; without the permission to create them, hard links; on
-    another drive, copies. So any program that reads COLMAP models can train it, and ``cp -rL`` or
-    ``rsync -L`` copies it to another computer.
+    another drive, copies. ``cp -rL`` or ``rsync -L`` copies the dataset to another computer.
 
     Args:
         folder: replaced if it exists.
         posed: the images in their original size and, optionally, the same ones from the folders
             ``images_2`` ….
-        points: with colours; None: the model has no points.
         origin: that of poses and points; the model is in the world.
 
     Raises:

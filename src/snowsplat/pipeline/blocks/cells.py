@@ -30,9 +30,7 @@ class Cell:
     def contains(self, ground: Tensor, margin: Sequence[float] | Tensor = (0.0, 0.0)) -> Tensor:
         """(N,) bool: the points (N, 2) of the plane that are in the cell.
 
-        Args:
-            margin: distance by which the cell is expanded, for both directions; or one for each
-                point, (N, 2).
+        ``margin``: by which the cell is expanded in both directions; or one for each point, (N, 2).
         """
         margins = torch.as_tensor(margin, dtype=torch.float64).expand(len(ground), 2)
         inside = torch.ones(len(ground), dtype=torch.bool)
@@ -54,11 +52,7 @@ class Cell:
 
 
 def ground_axes(positions: Tensor) -> Tensor:
-    """(2, 3) float64: the two directions in which the cameras are distributed most widely.
-
-    Args:
-        positions: (C, 3) camera centres in the world frame.
-    """
+    """(2, 3) float64: the two directions in which the camera centres (C, 3) vary most."""
     offsets = positions.to(torch.float64)
     offsets = offsets - offsets.mean(0)
     _, directions = torch.linalg.eigh(offsets.T @ offsets)  # ascending
@@ -75,12 +69,8 @@ def cut(cameras: Tensor, points: Tensor, count: int) -> list[Cell]:
     across the direction in which its content is longer, until there are ``count`` cells.
     """
     ground = torch.cat([cameras, points]).to(torch.float64)
-    weights = torch.cat(
-        [
-            torch.full((len(part),), 1.0 / max(1, len(part)), dtype=torch.float64)
-            for part in (cameras, points)
-        ]
-    )
+    sizes = torch.tensor([len(cameras), len(points)])
+    weights = (1.0 / sizes.clamp(min=1).double()).repeat_interleave(sizes)
     return _cut(Cell(), ground, weights, count)
 
 

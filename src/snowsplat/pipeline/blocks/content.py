@@ -33,18 +33,13 @@ _FAR_VIEWS = 0.2
 
 @dataclass(frozen=True)
 class BlockContent:
-    """A block.
-
-    Attributes:
-        views: training photos of the whole dataset.
-        points: points of the dataset; None if it has none.
-        share: of the Gaussians of the whole scene, those that the training of the block needs,
-            including those outside of its cell.
-    """
+    """A block."""
 
     cell: Cell
-    views: list[View]
-    points: Points | None
+    views: list[View]  # training photos of the whole dataset
+    points: Points | None  # of the dataset; None if it has none
+    # Of the Gaussians of the whole scene, those that the training of the block needs, including
+    # those outside of its cell.
     share: float
 
 
@@ -61,8 +56,7 @@ def block_content(dataset: Dataset, count: int, margin: float) -> tuple[Axes, li
     The points of the block are the points in the expanded cell and, a quarter as many, a random
     selection of the other points that these views show.
 
-    Returns:
-        the axes of the ground plane, and the blocks in the order of `cut`.
+    Returns the axes of the ground plane, and the blocks in the order of `cut`.
     """
     views = dataset.train
     positions = torch.stack([view.camera.position for view in views]).to(torch.float64)

@@ -9,6 +9,7 @@ FOLDER/config.json …      FOLDER is also the output folder of the merged scene
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -40,21 +41,13 @@ MOST_BLOCKS = 10_000
 
 @dataclass(frozen=True)
 class Block:
-    """One block.
+    """One block."""
 
-    Attributes:
-        name: "block_01", …; the name of its folder.
-        cell: its part of the ground plane. The merged scene contains its Gaussians in this part.
-        views: number of training photos.
-        points: number of points.
-        max_gaussians: limit of the training, with the Gaussians outside of the cell; 0: none.
-    """
-
-    name: str
-    cell: Cell
-    views: int
-    points: int
-    max_gaussians: int
+    name: str  # "block_01", …; the name of its folder
+    cell: Cell  # its part of the ground plane, of which the merged scene contains its Gaussians
+    views: int  # number of training photos
+    points: int  # number of points
+    max_gaussians: int  # limit of the training, with those outside of the cell; 0: none
 
 
 @dataclass(frozen=True)
@@ -207,10 +200,8 @@ def _check_free(folder: Path) -> None:
     """Raise `UserError` if ``folder`` contains anything but an unfinished plan."""
     if {entry.name for entry in folder.iterdir()} <= {LOCK}:
         return
-    try:
-        unfinished = read_json(folder / PLAN)["blocks"] == []
-    except (OSError, ValueError, KeyError, TypeError):
-        unfinished = False
-    if not unfinished:
-        what = "a plan" if (folder / PLAN).is_file() else "other files"
-        raise UserError(f"{folder}: already contains {what}; use a new folder, or remove it")
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        if read_json(folder / PLAN)["blocks"] == []:
+            return
+    what = "a plan" if (folder / PLAN).is_file() else "other files"
+    raise UserError(f"{folder}: already contains {what}; use a new folder, or remove it")

@@ -26,8 +26,7 @@ def scene_folder(folder: Path, block: Block) -> OutputFolder:
 def is_finished(out: OutputFolder) -> bool:
     """Whether a training run in an output folder has reached its last step.
 
-    Raises:
-        UserError: its settings are damaged.
+    Raises: UserError: its settings are damaged.
     """
     scenes = out.scenes()
     if not scenes:
@@ -84,9 +83,8 @@ def train_blocks(
             with one_run(folder / block.name):
                 if not is_finished(out):  # by another process, a moment ago
                     on_block(f"{block.name}: {block.views} photos, {block.points:,} points")
-                    results.append(
-                        _train(folder, plan, block, compute or Compute(), memory, observer)
-                    )
+                    compute = compute or Compute()
+                    results.append(_train(folder, plan, block, compute, memory, observer))
         except InUse as error:
             elsewhere.append(error)
             on_block(str(error))

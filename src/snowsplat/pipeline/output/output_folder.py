@@ -62,13 +62,11 @@ DATASET, SCENE = "dataset", "scene"
 #: The name of a dataset in version 0.1.0: of its folder, and of its key in JSON files.
 FORMER_DATASET = "capture"
 # _WORD: a string, a name, a number, or a single character. _LITERAL: a literal whose value is used.
-# _WORD does not match spaces. An expression that matches them would take quadratic time for a file
-# with a million spaces.
+# An expression that matches spaces would take quadratic time for a file with a million of them.
 _WORD = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[\w.+-]+|\S""", re.DOTALL)
 _LITERAL = re.compile(r"""['"].*['"]|True|False|None|-?[\d.]+(?:e[+-]?\d+)?""", re.DOTALL)
 _NAMESPACE_LIMIT = 1 << 20  # characters
-# Maximum number of words that are stored for an argument of Namespace. The arguments that are used
-# have three words, NAME = VALUE; one more word is stored to detect longer arguments.
+# So many words of an argument of Namespace are kept: NAME = VALUE, and one more if it is longer.
 _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
 _TENSORBOARD = "tensorboard"
@@ -104,11 +102,7 @@ class DatasetSettings:
         return self.read_files().dataset(self.resolution)
 
     def read_files(self) -> DatasetFiles:
-        """Read the files of the dataset, to load it at several resolutions.
-
-        Raises:
-            UserError: see `snowsplat.data.load_dataset`.
-        """
+        """Read the files of the dataset, to load it at several resolutions; see `load`."""
         from snowsplat.data import read_files
 
         return read_files(
@@ -224,11 +218,8 @@ class OutputFolder:
 
         remove_temporaries(self.path, _FILES)
         self._remove_unwritten_scenes()
-        whole = {
-            "snowsplat": __version__,
-            "dataset": asdict(settings),
-            "training": config_to_json(config),
-        }
+        training = config_to_json(config)
+        whole = {"snowsplat": __version__, "dataset": asdict(settings), "training": training}
         write_json(self.path / "config.json", whole)
         namespace = argparse.Namespace(
             data_device="cpu",
@@ -253,11 +244,7 @@ class OutputFolder:
         write_json(self.path / "exposure.json", {"unit": "EV", "photos": exposures})
 
     def exposures(self) -> dict[str, list[float]]:
-        """What `write_exposure` has written; empty if no gains were learnt.
-
-        Raises:
-            UserError: the file is damaged.
-        """
+        """What `write_exposure` has written; empty if no gains were learnt. Raises UserError."""
         file = self.path / "exposure.json"
         if not file.is_file():
             return {}
@@ -321,9 +308,8 @@ class OutputFolder:
         chosen = scenes[-1] if iteration in (None, -1) else iteration
         if chosen not in scenes:
             there = ", ".join(map(str, scenes))
-            raise UserError(
-                f"{self.path}: contains no scene of iteration {chosen}; there are {there}"
-            )
+            what = f"contains no scene of iteration {chosen}; there are {there}"
+            raise UserError(f"{self.path}: {what}")
         return chosen, read_gaussians(self.scene_path(chosen))
 
     def write_metrics(
@@ -335,9 +321,8 @@ class OutputFolder:
     ) -> None:
         """Write `metrics.json`: iteration, split, mean metrics, and the metrics of each view.
 
-        Args:
-            left_out: names of the photos that the training has left out. If there are any, they are
-                the list "left_out". None: the list of the existing file is kept.
+        ``left_out``: names of the photos that the training has left out, for the list "left_out";
+        None: the list of the existing file is kept.
         """
         path = self.path / "metrics.json"
         names = _left_out_in(path) if left_out is None else list(left_out)

@@ -50,9 +50,7 @@ def scene_file(path: Path) -> Path:
 
     That is its levels of detail if it has a `lod-meta.json`, its SOG scene if it has a `meta.json`,
     the scene of `make`, else the last scene of the training.
-
-    Raises:
-        UserError: a folder without a scene.
+    Raises: UserError: a folder without a scene.
     """
     if not path.is_dir():
         return path

@@ -87,9 +87,7 @@ def load_dataset_of(
 
 def cameras_of(folder: OutputFolder) -> list[Camera]:
     """The cameras of the photos of the training in ``folder``; empty if they are not stored.
-
-    Raises:
-        UserError: the file is damaged.
+    Raises: UserError: the file is damaged.
     """
     file = folder.path / "cameras.json"
     return read_cameras(file)[1] if file.is_file() else []

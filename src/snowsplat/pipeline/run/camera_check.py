@@ -20,14 +20,11 @@ _SIDE = 64  # pixels of the copies of photos, which are not used
 def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tuple[str, ...]:
     """Judge the cameras of a dataset; see `snowsplat.data.judge.verdict.judge`.
 
-    Logs a warning for each doubt.
-
     Args:
         path: of the dataset, for messages.
         trusted: the user is sure of the cameras: what is impossible is a doubt too.
 
-    Returns:
-        One sentence for each doubt, for the report.
+    Returns one sentence for each doubt, for the report. Each is also logged as a warning.
 
     Raises:
         UserError: the cameras are impossible. The message says why, and what to do.
@@ -43,9 +40,7 @@ def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tupl
 
 def check_test_photos(views: Sequence[View]) -> None:
     """Decode the held-out photos. The training itself decodes the others in its first steps.
-
-    Raises:
-        UserError: a photo cannot be decoded.
+    Raises: UserError: a photo cannot be decoded.
     """
     workers = min(4, os.cpu_count() or 1)
     with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-check") as pool:

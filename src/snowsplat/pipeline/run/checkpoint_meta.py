@@ -32,8 +32,7 @@ class CheckpointMeta:
     def from_checkpoint(cls, start: Checkpoint) -> CheckpointMeta:
         """The checked data of the checkpoint ``start``, from which a training run resumes.
 
-        Raises:
-            UserError: not a checkpoint of a training run, or damaged.
+        Raises: UserError: not a checkpoint of a training run, or damaged.
         """
         try:
             values = dict(start.meta)

@@ -59,13 +59,8 @@ class LivePage:
     ) -> NetworkViewer:
         """Open the page, and report its address to the observer.
 
-        Args:
-            dataset: its cameras and photos are shown.
-            background: red, green, blue in 0..1.
-            label: the title of the page.
-
-        Raises:
-            UserError: another process has opened the port since the constructor checked it.
+        ``background``: red, green, blue in 0..1. ``label``: the title of the page.
+        Raises: UserError: another process has opened the port since the constructor checked it.
         """
         viewer = NetworkViewer(
             dataset,
@@ -80,12 +75,7 @@ class LivePage:
         return viewer
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
-        """Open the page for a training run, as `open` does; then call `after_step` after each step.
-
-        Args:
-            trainer: the training run to show.
-            label: the title of the page.
-        """
+        """Open the page for a training run, as `open`; then call `after_step` after each step."""
         white = trainer.config.background == "white"
         background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
         viewer = self.open(trainer.dataset, background, label, observer)

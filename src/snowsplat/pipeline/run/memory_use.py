@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class MemoryUse:
     """The memory plan of a training run, and its peak memory so far."""
 
-    device: torch.device  # the device whose memory is planned
-    plan: MemoryPlan  # the memory plan, with the configuration that fits
+    device: torch.device  # whose memory is planned
+    plan: MemoryPlan  # with the configuration that fits
     before: int  # resident bytes of the process before the training: Python and its libraries
 
     @classmethod

@@ -28,11 +28,8 @@ def stamps_of(
 ) -> dict[str, Stamp]:
     """The stamps of photos and masks, by their paths relative to the folder of the dataset.
 
-    Args:
-        before: earlier stamps. Files with the same size and time are not read again.
-
-    Raises:
-        OSError: a file cannot be read.
+    Files with the same size and time as in ``before``, earlier stamps, are not read again. Raises
+    OSError.
     """
     stamps: dict[str, Stamp] = {}
     for view in [*dataset.train, *dataset.test]:

@@ -95,8 +95,7 @@ def local_count() -> int:
 def joined(device: torch.device) -> Iterator[Shards]:
     """The processes that train together, as `Shards`.
 
-    Raises:
-        ProcessLost: another process has ended.
+    Raises: ProcessLost: another process has ended.
     """
     from snowsplat.training.processes.shards import ALONE
 
@@ -125,11 +124,7 @@ def joined(device: torch.device) -> Iterator[Shards]:
 def follow(
     shards: Shards, device: torch.device, parts: Sequence[Part] = (), loss: Loss | None = None
 ) -> None:
-    """Take part in the training of process 0, until it ends.
-
-    Args:
-        parts, loss: as those of process 0.
-    """
+    """Take part in the training of process 0, until it ends; ``parts`` and ``loss`` as there."""
     from snowsplat.pipeline.run.collective import Collective
     from snowsplat.training.core.checkpoint import load
     from snowsplat.training.core.finite import Diverged
@@ -161,9 +156,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run ``snowsplat ARGUMENTS`` in several processes on this computer; returns the exit code.
 
     The output is that of process 0. If a process ends with an error, the others end, too.
-
-    Raises:
-        UserError: fewer than 1 process.
+    Raises: UserError: fewer than 1 process.
     """
     if processes < 1:
         raise UserError(f"{processes} processes are too few; use 1 or more")
@@ -203,8 +196,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
 def _wait(running: Sequence[subprocess.Popen[bytes]]) -> int | None:
     """Wait until all processes have ended, or a while after one of them has failed.
 
-    Returns:
-        The first process that has failed, except for those that lost the connection to it.
+    Returns the first process that has failed, except for those that lost the connection to it.
     """
     # Ctrl-C reaches the processes, too. They save the scene and end.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

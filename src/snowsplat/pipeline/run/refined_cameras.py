@@ -25,14 +25,9 @@ _SPARSE = ("sparse", "0")
 
 
 def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
-    """Write the model; returns its folder.
+    """Write the model of ``views``, which may have any size; returns its folder.
 
-    Args:
-        views: with the refined cameras, at any size.
-        full: the same dataset, with the photos at their full size.
-
-    Raises:
-        OSError: the folder is not writable, or the disk is full.
+    ``full``: the same dataset, with the photos at their full size.
     """
     sizes = {v.name: (v.camera.width, v.camera.height) for v in [*full.train, *full.test]}
     numbers: dict[ColmapCamera, int] = {}
@@ -56,8 +51,7 @@ def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
 def with_refined(output: Path, dataset: Dataset) -> Dataset:
     """The dataset with the cameras of `write_refined`; unchanged if there are none.
 
-    Raises:
-        UserError: the model is damaged, or a photo is not in it.
+    Raises: UserError: the model is damaged, or a photo is not in it.
     """
     folder = output.joinpath(FOLDER, *_SPARSE)
     if not folder.is_dir():

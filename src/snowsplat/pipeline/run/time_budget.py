@@ -34,14 +34,11 @@ class TimeBudget:
     def for_run(
         cls, minutes: float | None, before: dict[str, Any] | None, started: float
     ) -> TimeBudget | None:
-        """The budget of a training run.
+        """The budget of a training run; None if no time was requested, now or in an earlier run.
 
         Args:
             minutes: the requested time; if a run is resumed, the time for the remaining steps.
             before: the value of `as_json` in the checkpoint that is resumed.
-
-        Returns:
-            None if no time was requested, neither now nor in an earlier run.
         """
         if minutes is not None:
             return cls(60.0 * minutes, 0.0, started)
@@ -60,14 +57,10 @@ class TimeBudget:
         self, dataset: Dataset, config: TrainConfig, device: torch.device, **allowed: bool
     ) -> Plan:
         """Choose the number of steps, the photo size and the limit of the number of Gaussians for
-        the time that is left.
+        the time that is left, for ``dataset`` at full resolution. ``allowed``: see `make_plan`.
 
         The speed is measured with a separate, short training run. The `Trainer` of the real run
         cannot be used, because its resolution, limit and schedule depend on the plan.
-
-        Args:
-            dataset: at full resolution.
-            allowed: what the plan may change, see `make_plan`.
         """
         from snowsplat.training.budgets.time_plan import make_plan, measure_time_ratio
 

@@ -96,15 +96,12 @@ class TrainingRun:
             KeyboardInterrupt: Ctrl-C before the first step was finished; no files remain.
         """
         try:
-            self.observer.steps_begin(self.first_step, self.trainer.schedule.iterations)
-            try:
+            with self.observer.stepping(self.first_step, self.trainer.schedule.iterations):
                 self._finish_interrupted_writes()
                 self.together.proceed()
                 self.history.step_begins()
                 with self.watchers:
                     self.trainer.run(self._record)
-            finally:
-                self.observer.steps_end()
         except KeyboardInterrupt:
             if self.trainer.step == 0 or self.trainer.within_step:  # no complete state to save
                 self.out.discard()
@@ -150,18 +147,19 @@ class TrainingRun:
         )
         if paused:
             self._left.postpone(paused)
-            if self.pace is not None and self.budget is not None:
-                self.pace.postpone(paused)
-                self.budget.started += paused
+        if self.pace is None:
+            return
+        if paused and self.budget is not None:
+            self.pace.postpone(paused)
+            self.budget.started += paused
         # If the scene overfits, the schedule was shortened, and no more time is needed.
-        overfits = self.overfitting is not None and self.overfitting.found is not None
-        if self.pace is not None and not overfits:
-            schedule = self.trainer.schedule
+        if self.overfitting is None or self.overfitting.found is None:
+            schedule, step = self.trainer.schedule, progress.step
             length = self.pace.iterations_after(
-                schedule, progress.step, progress.downscale, progress.gaussians
+                schedule, step, progress.downscale, progress.gaussians
             )
             if length is not None:
-                self.together.stretch(progress.step, length)
+                self.together.stretch(step, length)
 
     def _seconds_left(self, progress: Progress) -> float:
         schedule = self.trainer.schedule
@@ -290,7 +288,7 @@ class TrainingRun:
         lines = [f"Finished: {self.trainer.step:,} steps in {duration(seconds)}"]
         lines.append(f"{gaussians:,} Gaussians")
         if self.evaluation is not None:
-            _, means = self.evaluation
+            means = self.evaluation[1]
             lines.append(f"PSNR {means.psnr:.2f} dB, {len(means.views)} held-out photos")
         return lines
 
@@ -337,7 +335,7 @@ class TrainingRun:
             trained_on,
             dataset,
             left_out=left_out,
-            spread=_spread(self._mean_exposures()),
+            spread=pstdev(exposures) if (exposures := self._mean_exposures()) else 0.0,
             poses=about_poses if self.poses is None else None,  # refined poses are no fault
             capture=recorded_verdict(Path(self.settings.path)),
         )
@@ -387,8 +385,3 @@ class TrainingRun:
             ),
         )
         return self.out.report
-
-
-def _spread(exposures: tuple[float, ...]) -> float:
-    """The standard deviation of the exposures, in EV; 0 if there are none."""
-    return pstdev(exposures) if exposures else 0.0

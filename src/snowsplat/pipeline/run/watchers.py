@@ -61,9 +61,7 @@ def socket_in(output: Path, create: bool = False) -> Iterator[str]:
 
     Paths of sockets have at most about 100 characters. On Linux, a short name of the open folder
     takes the place of a longer path.
-
-    Raises:
-        OSError: there is no such folder, or other users can enter it or own it.
+    Raises: OSError: there is no such folder, or other users can enter it or own it.
     """
     if create:
         with suppress(FileExistsError):

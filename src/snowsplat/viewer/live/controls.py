@@ -50,6 +50,11 @@ def note(text: str) -> str:
     return f'<div style="{style}">{text}</div>'
 
 
+def lines_of(texts: list[str]) -> str:
+    """`note` of lines of plain text."""
+    return note("<br>".join(map(html.escape, texts)))
+
+
 def in_server_thread(run: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
     """A callback of a control, which calls ``run`` in the server's thread.
 
@@ -82,14 +87,9 @@ class TrainingPanel:
             self._bar = server.gui.add_progress_bar(0.0)
             self._pause = server.gui.add_button("Pause")
             self._step = server.gui.add_button("One step")
-            self._share = server.gui.add_slider(
-                "Viewing time (%)",
-                5,
-                95,
-                5,
-                round(100 * session.share),
-                hint="While a camera moves: share of the time for rendering its images",
-            )
+            hint = "While a camera moves: share of the time for rendering its images"
+            share = round(100 * session.share)
+            self._share = server.gui.add_slider("Viewing time (%)", 5, 95, 5, share, hint=hint)
             self._loss = _plot(server, "Loss", "#4a7fe0")
             self._psnr = _plot(server, "PSNR (dB)", "#e08a2a")
         self._pause.on_click(in_server_thread(self._pause_clicked))
@@ -116,16 +116,11 @@ class TrainingPanel:
         self._pause.label = "Resume" if self._session.paused else "Pause"
 
     def show(self, status: list[str], share: float, loss: Curve, psnr: Curve) -> None:
-        """Show the state of the training.
-
-        Args:
-            status: lines of text.
-            share: finished fraction of the steps, 0..1.
-        """
+        """Show lines of text, the finished share of the steps, 0..1, and the curves."""
         curves = loss.arrays(), psnr.arrays()
 
         def put() -> None:
-            self._status.content = note("<br>".join(map(html.escape, status)))
+            self._status.content = lines_of(status)
             self._bar.value = 100.0 * share  # type: ignore[misc]  # viser's setter has another type
             for plot, curve in zip((self._loss, self._psnr), curves, strict=True):
                 if len(curve[0]) > 1:
@@ -138,7 +133,7 @@ class TrainingPanel:
         """Show lines of text, and hide the controls: the training has finished."""
 
         def hide() -> None:
-            self._status.content = note("<br>".join(map(html.escape, status)))
+            self._status.content = lines_of(status)
             self._bar.value = 100.0  # type: ignore[misc]
             for control in (self._share, self._step, self._pause):
                 control.visible = False
@@ -178,7 +173,7 @@ class ScenePanel:
         """Show lines of text."""
 
         def put() -> None:
-            self._status.content = note("<br>".join(map(html.escape, status)))
+            self._status.content = lines_of(status)
 
         call_in_server_thread(self._server, put)
 
@@ -219,22 +214,10 @@ class Controls:
             degree = gui.add_slider(
                 "SH degree", 0, 3, 1, display.sh_degree, hint="Degree of view-dependent colour"
             )
-            scale = gui.add_slider(
-                "Gaussian size",
-                2,
-                100,
-                2,
-                100,
-                hint="In percent; small values separate the Gaussians",
-            )
-            finest = gui.add_slider(
-                "Image size",
-                320,
-                2560,
-                80,
-                self._visitor.longest,
-                hint="Longer side in pixels while the camera does not move",
-            )
+            hint = "In percent; small values separate the Gaussians"
+            scale = gui.add_slider("Gaussian size", 2, 100, 2, 100, hint=hint)
+            hint = "Longer side in pixels while the camera does not move"
+            finest = gui.add_slider("Image size", 320, 2560, 80, self._visitor.longest, hint=hint)
 
         def size_chosen() -> None:
             longest = int(within(finest.value, 320, 2560))
@@ -266,15 +249,8 @@ class Controls:
         with gui.add_folder("Photos", order=2, visible=bool(self._photos.views)):
             self._shown = gui.add_checkbox("Cameras", False)
             self._where = gui.add_html(note(_NOWHERE))
-            self._wipe = gui.add_slider(
-                "Photo (%)",
-                0,
-                100,
-                1,
-                0,
-                visible=False,
-                hint="How much of the rendering the photo covers, from the left",
-            )
+            hint = "How much of the rendering the photo covers, from the left"
+            self._wipe = gui.add_slider("Photo (%)", 0, 100, 1, 0, visible=False, hint=hint)
             self._flip = gui.add_button_group("Show only", ("Render", "Photo"), visible=False)
             self._move = gui.add_button_group("Go to", ("Previous", "Next"))
         self._show_frustums()

@@ -65,11 +65,7 @@ class SampledPsnr:
     """PSNR of a few fixed views, measured one at a time, because this delays the training."""
 
     def __init__(self, views: Sequence[View], background: Tensor) -> None:
-        """
-        Args:
-            views: `_VIEWS` of them are used, evenly spaced.
-            background: (3,) colour, 0..1.
-        """
+        """``views``: `_VIEWS` of them are used, evenly spaced; ``background``: (3,) in 0..1."""
         self._background = background
         chosen = [views[i * len(views) // _VIEWS] for i in range(_VIEWS)] if views else []
         unique = list(dict.fromkeys(chosen))

@@ -41,9 +41,8 @@ class Pose:
     quat: Tensor = field(repr=False)
     position: Tensor  # (3,) float64, camera centre
     fov: float  # vertical field of view in radians
-    # width, height: size of the window in pixels.
-    width: int
-    height: int
+    width: int  # of the window, in pixels
+    height: int  # of the window, in pixels
 
     def camera(self, width: int, height: int) -> Camera:
         """The camera of an image of this size."""

@@ -83,11 +83,7 @@ class Guard:
     """The checks of one server."""
 
     def __init__(self, hosts: KnownHosts, token: str, title: str) -> None:
-        """
-        Args:
-            token: the first component of all paths.
-            title: that of the page.
-        """
+        """``token``: the first component of all paths. ``title``: that of the page."""
         self.serves = False  # whether viser has started its server through `serve`
         self.is_open = False  # whether the scene is complete, so that browsers may connect
         self._hosts, self._token = hosts, token.encode()
@@ -209,11 +205,7 @@ def _bytes(path: str) -> bytes:
 
 
 class Connection(ServerConnection):
-    """A connection that is closed if it exceeds the limits.
-
-    Attributes:
-        on_arrival: called when images have arrived at the browser, with their number.
-    """
+    """A connection that is closed if it exceeds the limits."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -223,6 +215,7 @@ class Connection(ServerConnection):
         self._budget = _BURST  # number of frames that may be received now
         self._counted = self.loop.time()  # when the budget was updated
         self._frames = 0  # number of frames of the current message
+        # Called when images have arrived at the browser, with their number.
         self.on_arrival: Callable[[int], None] = lambda images: None
         # Numbers of images: handed to viser, sent, and arrived.
         self._handed = self._sent = self._arrived = 0

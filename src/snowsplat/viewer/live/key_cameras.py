@@ -21,16 +21,12 @@ _NONE = "Store two or more views to make a video."
 
 
 class KeyCameras:
-    """The views that a user has stored in one browser, and the buttons for them.
-
-    Attributes:
-        cameras: the views, in the world.
-    """
+    """The views that a user has stored in one browser, and the buttons for them."""
 
     def __init__(
         self, client: viser.ClientHandle, visitor: Visitor, world_from_page: Similarity
     ) -> None:
-        self.cameras: list[Camera] = []
+        self.cameras: list[Camera] = []  # the views, in the world
         self._client, self._visitor, self._world_from_page = client, visitor, world_from_page
         self._sent = -math.inf
         gui = client.gui

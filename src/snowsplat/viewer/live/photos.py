@@ -39,11 +39,7 @@ _READING_SHARE = 0.2  # maximum share of the time for reading thumbnails during 
 
 
 class Photos:
-    """The photos of a dataset in the scene of a server.
-
-    Attributes:
-        views: the training views, then the test views.
-    """
+    """The photos of a dataset in the scene of a server."""
 
     def __init__(
         self,
@@ -58,8 +54,7 @@ class Photos:
         """
         Args:
             train, test: with cameras in the frame of the page, see `NetworkViewer`.
-            extent: extent of the scene in that frame.
-            centre: (3,) centre of the scene, around which a browser rotates.
+            extent, centre: of the scene in that frame; (3,), around which a browser rotates.
             background: (3,) colour behind transparent photos, 0..1.
         """
         self.views = [*train, *test]
@@ -123,8 +118,7 @@ class Photos:
     async def read(self, visitor: Visitor, index: int) -> PhotoView:
         """Read a photo. Only one photo is read at a time, for all browsers together.
 
-        Raises:
-            UserError: the photo is missing or damaged.
+        Raises: UserError: the photo is missing or damaged.
         """
         view = self.views[index]
         async with self._reading:

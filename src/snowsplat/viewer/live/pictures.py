@@ -16,7 +16,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.util.process import single_threaded
-from snowsplat.viewer.live import palette
 from snowsplat.viewer.live.display import DisplaySettings, PhotoRectangle
 
 _DOT = 0.8  # pixels: standard deviation of the dot that represents a Gaussian as a point
@@ -30,6 +29,23 @@ _MAX_ERROR = 0.25  # mean absolute colour difference at the end of the palette
 _MAX_COUNT = 256.0  # number of Gaussians at the end of the palette
 _MIN_ALPHA = 0.5  # pixels of lower opacity have neither depth nor normal
 _BRIGHTNESS_AROUND = 0.35  # factor for the rendering outside of the rectangle of a photo
+
+
+def _table(*anchors: tuple[int, int, int]) -> Tensor:
+    places = np.linspace(0.0, 255.0, len(anchors))
+    columns = [np.interp(np.arange(256), places, column) for column in zip(*anchors, strict=True)]
+    return torch.from_numpy(np.rint(np.stack(columns, 1)).astype(np.uint8))
+
+
+# Colour maps: (256, 3) uint8 tables. The lightness of both increases monotonically.
+# DEPTH: from far (violet) through blue and green to near (yellow).
+DEPTH = _table(
+    (68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132), (122, 209, 81), (253, 231, 37)
+)
+# HEAT: from small (black) through violet and orange to large (pale yellow).
+HEAT = _table(
+    (0, 0, 0), (51, 10, 95), (136, 34, 106), (211, 67, 67), (251, 140, 20), (252, 255, 164)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +108,7 @@ def _in_mode(
         splats = _as_ellipsoids(splats, gaussians, camera)
     elif display.mode == "cost":
         counts = ops.count_blended(splats, *size)
-        return palette.HEAT[_palette_indices(torch.log1p(counts) / math.log1p(_MAX_COUNT))]
+        return HEAT[_palette_indices(torch.log1p(counts) / math.log1p(_MAX_COUNT))]
     image, _, _ = ops.rasterize(splats, *size, background)
     if display.mode == "error" and photo is not None:
         return _error(image.cpu(), photo)
@@ -131,7 +147,7 @@ def _depth(depth: Tensor, alpha: Tensor) -> Tensor:
         return torch.zeros(*depth.shape, 3, dtype=torch.uint8)
     far, near = torch.quantile(some[:: 1 + len(some) // 10_000], some.new_tensor([0.01, 0.99]))
     share = (disparity - far) / (near - far).clamp_min(1e-6 * float(near))
-    return palette.DEPTH[_palette_indices(share)] * shown[:, :, None].cpu()
+    return DEPTH[_palette_indices(share)] * shown[:, :, None].cpu()
 
 
 def _axes(splats: Splats2D, gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -205,7 +221,7 @@ def _error(image: Tensor, photo: Photo) -> Tensor:
     rows, columns = slice(at.top, at.top + at.height), slice(at.left, at.left + at.width)
     rendered, real = image[rows, columns].to(torch.float32), photo.pixels.to(torch.float32)
     error = (rendered - real).abs_().mean(2) / (255.0 * _MAX_ERROR)
-    image[rows, columns] = palette.HEAT[_palette_indices(error)]
+    image[rows, columns] = HEAT[_palette_indices(error)]
     return image
 
 

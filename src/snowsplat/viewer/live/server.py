@@ -30,17 +30,11 @@ class _Server(viser.ViserServer):
 
 @dataclass(frozen=True)
 class RunningServer:
-    """A server and its address.
-
-    Attributes:
-        url: the URL for browsers on this machine; if a host name was given, also for other
-        machines.
-        others: the URLs for other machines, if they are different ones.
-    """
+    """A server and its address."""
 
     server: viser.ViserServer
-    url: str
-    others: list[str]
+    url: str  # for browsers on this machine; with a host name, also for other machines
+    others: list[str]  # the URLs for other machines, if they are different ones
     guard: Guard
 
     def open(self) -> None:
@@ -55,10 +49,8 @@ def start_server(
 
     ``label`` is the title of the page. Browsers are rejected until `RunningServer.open` is called.
     The URL contains a secret token. ``allow_host``: the names of proxies; see `KnownHosts`.
-
-    Raises:
-        UserError: the port is in use, the host is not an address of this machine, or an allowed
-            name is none.
+    Raises: UserError: the port is in use, the host is not an address of this machine, or an allowed
+    name is none.
     """
     hosts = KnownHosts(host, allow_host)
     free = free_port(host, port)
@@ -106,8 +98,7 @@ def address(host: str, port: int, token: str) -> str:
 def free_port(host: str, port: int | None) -> int:
     """``port`` if it is free; without one, 8080 or the next free one.
 
-    Raises:
-        UserError: the port is in use, or the host is not an address of this machine.
+    Raises: UserError: the port is in use, or the host is not an address of this machine.
     """
     if port is not None and not 0 < port < 65536:
         raise SettingError("port", f"{port} is out of range; use 1 to 65535")

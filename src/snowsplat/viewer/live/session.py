@@ -162,16 +162,14 @@ class Session:
     def move(self, visitor: Visitor, pose: Pose) -> None:
         """Set the pose of a browser. If the browser moves away from the photo, the photo view ends.
 
-        While `Visitor.going` is true, a pose that is not near the photo does not end the photo view
-        immediately, because the browser may have sent this pose before it was moved to the photo.
-        Call this method again with the last pose after `MOVE_SECONDS`: if the user moves the camera
-        immediately, the browser may never send a pose near the photo. The photo view then ends.
+        While `Visitor.going` is true, a pose that is not near the photo may have been sent before
+        the browser was moved to the photo. Call this method again with the last pose after
+        `MOVE_SECONDS`: if the user has moved the camera at once, the photo view then ends.
         """
         photo_view, arrived = visitor.photo_view, visitor.arrived
         if photo_view is not None:
             if pose.is_near(photo_view.pose):
                 arrived = True
-            # Otherwise, the browser may have sent this pose before it was moved to the photo.
             elif arrived or self._clock() - visitor.photo_view_since > MOVE_SECONDS:
                 photo_view = None
         self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
@@ -225,9 +223,7 @@ class Session:
     def next_request(self, scene: int, training: bool) -> RenderRequest | None:
         """The next image to render; None if there is none, or if the training has to run first.
 
-        Args:
-            scene: a number that changes when the scene changes.
-            training: whether the training waits to continue.
+        ``scene`` changes when the scene changes. ``training``: whether it waits to continue.
         """
         now = self._clock()
         with self._changed:
@@ -264,11 +260,9 @@ class Session:
         self.charge(_budget_of(request), seconds)
 
     def charge(self, budget: Literal["requested", "idle"], seconds: float) -> None:
-        """Record that ``seconds`` were used, and delay the next image of this budget accordingly.
-
-        So rendering does not exceed its share of the time during training.
-
-        Requested images also delay the next idle image.
+        """Record that ``seconds`` were used, and delay the next image of this budget accordingly,
+        so that rendering does not exceed its share of the time during training. Requested images
+        also delay the next idle image.
         """
         now = self._clock()
         share = min(max(self.share, 0.01), 1.0)

@@ -31,7 +31,7 @@ class Shortcuts:
         self._first = camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy()
         self._dark = True
         self._add("F", "Frame the scene", self._frame)
-        self._add("R", "Back to the first view", self._reset)
+        self._add("R", "Back to the first view", lambda: self._move(*self._first))
         self._add("N", "Next photo", lambda: controls.step_photo(1))
         self._add("P", "Previous photo", lambda: controls.step_photo(-1))
         self._add("L", "Light or dark theme", self._switch_theme)
@@ -49,9 +49,6 @@ class Shortcuts:
         half = math.tan(camera.fov / 2) * min(1.0, aspect)
         distance = _MARGIN * radius / math.sin(math.atan(half))
         self._move(middle + distance * direction, middle, camera.up_direction)
-
-    def _reset(self) -> None:
-        self._move(*self._first)
 
     def _move(self, position: np.ndarray, look_at: np.ndarray, up: np.ndarray) -> None:
         with self._client.atomic():

@@ -36,16 +36,8 @@ class TrainingViewer:
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
         """Render the requested images and update the page; wait while the training is paused.
 
-        Args:
-            step: number of finished steps.
-            steps: total number of steps.
-            loss: the loss of this step.
-
-        Returns:
-            Seconds for which the training was paused.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C while the training was paused.
+        Returns the seconds for which it was paused after ``step`` of ``steps`` finished steps.
+        Raises: KeyboardInterrupt: Ctrl-C while the training was paused.
         """
         self._losses.add(step, loss)
         before = loss if math.isnan(self._loss) else self._loss

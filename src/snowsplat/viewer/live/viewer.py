@@ -193,10 +193,8 @@ class NetworkViewer:
     def serve(self, gaussians: Gaussians, scene: int, *, training: bool) -> bool:
         """Render the most urgent image and send it; returns whether there was one.
 
-        Args:
-            scene: a number that changes when the Gaussians change.
-            training: whether the training waits to continue. If so, images are rendered only in
-                their share of the time.
+        ``scene`` changes when the Gaussians change. If the ``training`` waits to continue, images
+        are rendered only in their share of the time.
         """
         request = self.session.next_request(scene, training)
         if request is None:

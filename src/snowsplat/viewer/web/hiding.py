@@ -49,22 +49,17 @@ class Hiding:
 
 
 def hiding_of(gaussians: Gaussians, middle: Tensor, radius: float, *, hide: bool) -> Hiding:
-    """The ranges for a scene.
+    """The ranges for a scene, whose subject has the ``middle`` (3,) and the ``radius``.
 
-    Args:
-        middle: (3,) of the subject.
-        radius: of the subject.
-        hide: hide floaters at first.
+    ``hide``: hide floaters at first.
     """
     rows = slice(None, None, -(-len(gaussians) // _ROWS_SAMPLED) or 1)
     distances = (gaussians.means.detach()[rows].double().cpu() - middle).norm(dim=1)
     sizes = _sizes(gaussians)[rows].double().cpu()
     near, small = _NEAREST * radius, _SMALLEST * radius
     # Ranges of at least a factor of 2 have no steps.
-    far, largest = (
-        max(_quantile(distances, _MOST), 2 * near),
-        max(_quantile(sizes, _MOST), 2 * small),
-    )
+    far = max(_quantile(distances, _MOST), 2 * near)
+    largest = max(_quantile(sizes, _MOST), 2 * small)
     floater = max(_FLOATER * radius, _quantile(sizes, 1 - _FEW))
     start = 100 * math.log(floater / largest) / math.log(small / largest) if hide else 0.0
     return Hiding((far, near), (largest, small), max(0, math.floor(start)))

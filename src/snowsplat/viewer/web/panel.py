@@ -58,12 +58,8 @@ def panel_settings(
 ) -> dict[str, Any]:
     """What the script needs.
 
-    Args:
-        gaussians: their number.
-        start: the initial view of the page.
-        stops: the stops, and the subject, which Frame shows.
-        pictures: the address of the image with the pictures of the stops.
-        hiding: the ranges of the sliders.
+    ``gaussians``: their number. ``start``: the initial view. ``stops``: also have the subject,
+    which Frame shows. ``pictures``: the address of the image with the pictures of the stops.
     """
     x, y, z = stops.middle.tolist()
     return {
@@ -81,9 +77,7 @@ def panel_settings(
 
 def script() -> str:
     """The script of the panel, which also creates the viewer."""
-    return "".join(
-        (_FOLDER / name).read_text(encoding="utf-8") for name in ("hiding.js", "panel.js")
-    )
+    return "".join((_FOLDER / name).read_text("utf-8") for name in ("hiding.js", "panel.js"))
 
 
 def style() -> str:

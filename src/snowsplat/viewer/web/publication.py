@@ -6,7 +6,6 @@ import html
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from urllib.parse import quote
 
 import torch
 from PIL import Image
@@ -21,19 +20,10 @@ from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene, ready
-from snowsplat.viewer.web.served_file import FileOnDisk, Served
+from snowsplat.viewer.web.served_file import Served, served
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page
 
 PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
-_TYPES = {
-    ".css": "text/css; charset=utf-8",
-    ".html": "text/html; charset=utf-8",
-    ".jpg": "image/jpeg",
-    ".js": "text/javascript; charset=utf-8",
-    ".json": "application/json",
-    ".txt": "text/plain; charset=utf-8",
-    ".webp": "image/webp",
-}
 #: The size that services recommend for the picture of a link (Open Graph).
 POSTER_SIZE = (1200, 630)
 
@@ -108,13 +98,7 @@ def is_site(folder: Path) -> bool:
 
 def site_files(folder: Path) -> tuple[dict[str, Served], dict[str, str]]:
     """The files of a site for a `StaticServer`, and the HTTP headers for them."""
-    files: dict[str, Served] = {
-        quote(file.relative_to(folder).as_posix()): FileOnDisk(
-            file, _TYPES.get(file.suffix, "application/octet-stream")
-        )
-        for file in sorted(folder.rglob("*"))
-        if file.is_file()
-    }
+    files = served(folder, sorted(file for file in folder.rglob("*") if file.is_file()))
     # The page contains the rest of its policy.
     return {"": files[PAGE], **files}, {"Content-Security-Policy": "frame-ancestors 'none'"}
 

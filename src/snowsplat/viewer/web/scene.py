@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -28,12 +27,11 @@ from snowsplat.trajectory.follow import training_path
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.hiding import Hiding, hiding_of
 from snowsplat.viewer.web.panel import Description, panel_settings
-from snowsplat.viewer.web.served_file import FileOnDisk, Served, ServedFile
+from snowsplat.viewer.web.served_file import Served, ServedFile, served
 from snowsplat.viewer.web.stops import Stops, stops_of
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page, script, settings
 
 _SCENE = "scene.compressed.ply"
-_TYPES = {".json": "application/json", ".webp": "image/webp"}
 #: The file with the pictures of the stops.
 PICTURES = "stops.webp"
 _KEYFRAMES = 121  # of the film; the viewer interpolates between them
@@ -56,11 +54,9 @@ def site(
 
     The initial view is the first of ``cameras``; without cameras, an overview of the scene.
 
-    Args:
-        levels: returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
-            loads instead of the complete scene.
-        count: the number of Gaussians, if ``gaussians`` is only a coarse level. Then the levels
-            stay as they are, and the page only scales them.
+    ``levels`` returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
+    loads instead of the complete scene. ``count``: the number of Gaussians, if ``gaussians`` is
+    only a coarse level. Then the levels stay as they are, and the page only scales them.
     """
     in_place = count is not None
     scene = ready(gaussians, cameras, background, turn=not in_place)
@@ -92,12 +88,7 @@ def _content(gaussians: Gaussians, levels: Callable[[Gaussians], Path] | None) -
         scene = encode_compressed_ply(Path(_SCENE), arrays)
         return {_SCENE: ServedFile(scene, "application/octet-stream")}
     index = levels(gaussians)
-    return {
-        quote(file.relative_to(index.parent).as_posix()): FileOnDisk(
-            file, _TYPES.get(file.suffix, "application/octet-stream")
-        )
-        for file in lod_files(index)
-    }
+    return served(index.parent, lod_files(index))
 
 
 class ReadyScene(NamedTuple):
@@ -122,9 +113,8 @@ class ReadyScene(NamedTuple):
     ) -> dict[str, Any]:
         """What `page` needs, except for the address of the scene.
 
-        Args:
-            pictures: the address of the pictures of the stops.
-            count: the number of Gaussians, if those here are only a coarse level.
+        ``pictures``: the address of the pictures of the stops. ``count``: the number of Gaussians,
+        if those here are only a coarse level.
         """
         count = count or len(self.gaussians)
         return {

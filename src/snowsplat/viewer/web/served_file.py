@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from urllib.parse import quote
 
 _BLOCK = 1 << 18  # bytes sent at once
 
@@ -60,3 +61,23 @@ class FileOnDisk:
 
 
 Served = ServedFile | FileOnDisk
+
+_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".jpg": "image/jpeg",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".txt": "text/plain; charset=utf-8",
+    ".webp": "image/webp",
+}
+
+
+def served(folder: Path, files: Iterable[Path]) -> dict[str, Served]:
+    """Files in a folder, by their quoted paths in it."""
+    return {
+        quote(file.relative_to(folder).as_posix()): FileOnDisk(
+            file, _TYPES.get(file.suffix, "application/octet-stream")
+        )
+        for file in files
+    }

@@ -53,10 +53,8 @@ class StaticServer:
 
     Every response has the additional ``headers``. ``allow_host``: names of proxies; see
     `KnownHosts`.
-
-    Raises:
-        UserError: the port is in use or not permitted, or the host is not an address of this
-            machine; or an allowed name is none.
+    Raises: UserError: the port is in use or not permitted, or the host is not an address of this
+    machine; or an allowed name is none.
     """
 
     def __init__(
@@ -266,7 +264,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _web_server(self) -> _Server:
-        """`server` with its type."""
         return cast(_Server, self.server)
 
     def _answer(self, with_body: bool) -> None:

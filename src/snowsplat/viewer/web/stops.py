@@ -54,13 +54,10 @@ class Stops(NamedTuple):
 def stops_of(
     gaussians: Gaussians, cameras: Sequence[Camera], depth: float, background: Sequence[float]
 ) -> Stops:
-    """The stops of a scene.
+    """The stops of a scene, with the ``cameras`` of the photos in their order.
 
-    Args:
-        cameras: of the photos, in their order. Without cameras, there are no stops, and the subject
-            is the `bound` of the scene.
-        depth: the distance of the targets of the views.
-        background: red, green, blue in 0..1.
+    Without cameras, there are no stops, and the subject is the `bound` of the scene. ``depth``: the
+    distance of the targets of the views. ``background``: red, green, blue in 0..1.
     """
     if not cameras:
         return Stops([], b"", *bound(gaussians), [])
@@ -102,11 +99,8 @@ def _look(
 def _seen(
     gaussians: Gaussians, view: InitialView, depth: float, others: Sequence[Camera]
 ) -> tuple[float, float]:
-    """See `Stops.seen`. What is hidden from another photo counts as seen by it.
-
-    Args:
-        depth: where there is no surface, that of the place that must be in other photos.
-    """
+    """See `Stops.seen`. What is hidden from another photo counts as seen by it. Where there is no
+    surface, a place at ``depth`` must be in other photos."""
     height = _BESIDE_HEIGHT
     width = max(1, round(height * view.aspect))
     wide, high = round(_WIDEST * width), round(_WIDEST * height)

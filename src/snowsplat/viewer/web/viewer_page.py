@@ -37,8 +37,7 @@ _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOT
 def asset(name: str) -> str:
     """The content of a file of the viewer: index.html, index.css, index.js or LICENSE.
 
-    Raises:
-        UserError: the viewer has not been unpacked in this checkout.
+    Raises: UserError: the viewer has not been unpacked in this checkout.
     """
     try:
         return (_FOLDER / name).read_text(encoding="utf-8")
@@ -51,8 +50,7 @@ def asset(name: str) -> str:
 def script(scale: float = 1.0) -> str:
     """index.js, which shows the files of the scene ``scale`` times as large as they say.
 
-    Raises:
-        UserError: see `asset`.
+    Raises: UserError: see `asset`.
     """
     text = asset("index.js")
     if scale == 1:
@@ -66,9 +64,8 @@ def settings(
 ) -> dict[str, Any]:
     """The viewer's settings: its initial view, and a background colour in 0..1.
 
-    Args:
-        film: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
-            If there are none, the viewer uses an animation of its own.
+    ``film``: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
+    If there are none, the viewer uses an animation of its own.
     """
     off = {"enabled": False}
     first = view_numbers(start, start.aspect)
