@@ -131,6 +131,15 @@ def test_a_document_type_is_refused(tmp_path):
         read(tmp_path)
 
 
+def test_the_message_about_an_unknown_encoding_is_short(tmp_path):
+    exports.metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    file.write_text(file.read_text().replace("UTF-8", "UTF" + 500 * "-8"))
+    with pytest.raises(UserError, match="not a complete XML file .'unknown encoding") as refused:
+        read(tmp_path)
+    assert len(str(refused.value)) < len(str(file)) + 200
+
+
 def test_depth_maps_have_a_unit(tmp_path):
     exports.polycam(tmp_path)
     dataset = load_dataset(tmp_path, hold_out=None)

@@ -90,7 +90,7 @@ def load_xml(path: Path) -> Element:
         parser.Parse(data, True)
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:
-        raise UserError(f"{path}: not a complete XML file ({error}); copy it again") from None
+        raise damaged(path, f"not a complete XML file ({quoted(error)})") from None
 
 
 def head_of(path: Path, size: int = 1 << 12) -> bytes:
