@@ -17,8 +17,16 @@ from snowsplat.util.errors import UserError
 # The flags of each action; the others have no effect and are rejected.
 _FLAGS = {
     "plan": (
-        *("output", "blocks", "margin", "recipe", "iterations", "max_gaussians", "images"),
-        *("resolution", "eval", "test_list"),
+        "output",
+        "blocks",
+        "margin",
+        "recipe",
+        "iterations",
+        "max_gaussians",
+        "images",
+        "resolution",
+        "eval",
+        "test_list",
     ),
     "train": ("block", "memory", "device", "threads", "quiet"),
     "merge": ("output",),

@@ -27,8 +27,17 @@ if TYPE_CHECKING:
 
 # The flags that the command for resuming repeats, in this order.
 _RESUMED_FLAGS = (
-    *("output", "quality", "minutes", "hold_out", "title", "exposure", "threads", "device"),
-    *("memory", "port", "host"),
+    "output",
+    "quality",
+    "minutes",
+    "hold_out",
+    "title",
+    "exposure",
+    "threads",
+    "device",
+    "memory",
+    "port",
+    "host",
 )
 
 

@@ -351,7 +351,13 @@ def _warn_of_contradictions(path: Path, scene: _Json) -> None:
             logger.warning(
                 "%s: fl_%s is %g pixels, but camera_angle_%s (%g°) is a focal length of %.5g "
                 "pixels; fl_%s is used; remove the wrong one",
-                *(path, axis, numbers[0], axis, math.degrees(numbers[2]), stated, axis),
+                path,
+                axis,
+                numbers[0],
+                axis,
+                math.degrees(numbers[2]),
+                stated,
+                axis,
             )
             return
 

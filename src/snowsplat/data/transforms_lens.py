@@ -19,14 +19,24 @@ from snowsplat.util.safe_json import quoted
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PERSPECTIVE = frozenset(
     {
-        *("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"),
-        *("OPENCV", "FULL_OPENCV", "BROWN"),
+        "PINHOLE",
+        "SIMPLE_PINHOLE",
+        "PERSPECTIVE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "FULL_OPENCV",
+        "BROWN",
     }
 )
 _FISHEYE = frozenset(
     {
-        *("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE"),
-        *("RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+        "FISHEYE",
+        "OPENCV_FISHEYE",
+        "SIMPLE_FISHEYE",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "THIN_PRISM_FISHEYE",
     }
 )
 #: Project Aria's model, in nerfstudio's and in COLMAP's name; it has a list of coefficients.

@@ -19,8 +19,14 @@ _BLOCK = 1 << 16
 _INFLATION_FREE = 1 << 20
 # What `zipfile` raises for damaged files. OverflowError: an offset larger than that of any file.
 _ERRORS = (
-    *(OSError, ValueError, RuntimeError, OverflowError, EOFError),
-    *(struct.error, zlib.error, zipfile.BadZipFile),
+    OSError,
+    ValueError,
+    RuntimeError,
+    OverflowError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
 )
 
 

@@ -38,8 +38,13 @@ def view_of(gaussians: Gaussians, camera: Camera, sh_degree: int | None = None) 
     """
     degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
     return View(
-        *(camera.cam_from_world, camera.width, camera.height),
-        *(camera.fx, camera.fy, camera.cx, camera.cy),
+        camera.cam_from_world,
+        camera.width,
+        camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
         sh_degree=degree,
         near=camera.near,
         antialiased=gaussians.antialiased,

@@ -15,16 +15,37 @@ from snowsplat.util.natural_order import natural_key
 # "." at its start and "_2", "_4" or "_8" at its end.
 _MASKS = re.compile(r"mask|(\w+_)?masks|(dynamic|images?)_mask|mask_images?")
 _MAPS = {
-    *("depth", "depths", "depth_map", "depth_maps", "depthmaps", "depth_images"),
-    *("confidence", "confidences", "confidence_maps", "normal", "normals", "normal_maps"),
+    "depth",
+    "depths",
+    "depth_map",
+    "depth_maps",
+    "depthmaps",
+    "depth_images",
+    "confidence",
+    "confidences",
+    "confidence_maps",
+    "normal",
+    "normals",
+    "normal_maps",
 }
 _THUMBNAILS = {"thumb", "thumbs", "thumbnail", "thumbnails", "@eadir", "__macosx"}
 _DIVIDED = re.compile(r"(?P<original>.+)_[248]")
 #: Names of folders that say that there are photos inside, and not which ones.
 PHOTO_FOLDERS = frozenset(
     {
-        *("images", "image", "imgs", "img", "input", "photos", "photo", "pictures"),
-        *("rgb", "color", "colors", "colour", "frames"),
+        "images",
+        "image",
+        "imgs",
+        "img",
+        "input",
+        "photos",
+        "photo",
+        "pictures",
+        "rgb",
+        "color",
+        "colors",
+        "colour",
+        "frames",
     }
 )
 # Names of folders that say that they hold changed copies of the photos in another one.

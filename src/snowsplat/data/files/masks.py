@@ -218,7 +218,9 @@ def with_masks(root: Path, posed: Sequence[PosedImage]) -> list[PosedImage]:
             logger.warning(
                 "%s: %d masks are not used, because no photo has the name of %s; the mask of "
                 "IMG.jpg is masks/IMG.png, IMG.jpg.png or IMG_mask.png",
-                *(root, len(unused), unused[0]),
+                root,
+                len(unused),
+                unused[0],
             )
     return posed
 

@@ -69,12 +69,18 @@ def find_photos(
         name, file = next(iter(matches.files.items()))
         logger.warning(
             "%s: %d images are found by other names than it states: %s is %s",
-            *(where, len(matches.files), quoted(name), root / file),
+            where,
+            len(matches.files),
+            quoted(name),
+            root / file,
         )
     if matches.doubtful:
         logger.warning(
             "%s: %d images are not used, because %s has several files for a name or one for "
             "several (the first name is %s)",
-            *(where, len(matches.doubtful), root, quoted(matches.doubtful[0])),
+            where,
+            len(matches.doubtful),
+            root,
+            quoted(matches.doubtful[0]),
         )
     return matches.files

@@ -107,7 +107,8 @@ def _read_chunk(
     if len(groups) > 1:
         logger.warning(
             "%s: has %d components, which are not aligned with each other; using the largest",
-            *(path, len(groups)),
+            path,
+            len(groups),
         )
     given = worlds.get(component)
     scale, world = _world(given if given is not None else whole, groups[component])
@@ -200,7 +201,8 @@ def _lens(where: str, sensor: Element) -> LensModel:
         logger.warning(
             "%s: the skew (b2) of a fisheye lens is not supported: an error of up to %.1f pixels "
             "at the borders; optimise the alignment without b2 if that matters",
-            *(where, abs(skew) * height / (2 * focal)),
+            where,
+            abs(skew) * height / (2 * focal),
         )
     return fisheye(where, width, height, intrinsics, radial, tangential)
 

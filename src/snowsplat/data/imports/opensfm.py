@@ -56,7 +56,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     if len(scenes) > 1:
         logger.warning(
             "%s: has %d separate reconstructions; using the largest (%d photos)",
-            *(path, len(scenes), len(shots[largest])),
+            path,
+            len(scenes),
+            len(shots[largest]),
         )
     cameras = table(f"{path}: cameras", scenes[largest].get("cameras"))
     lenses: dict[str, LensModel] = {}

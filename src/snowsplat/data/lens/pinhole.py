@@ -18,8 +18,15 @@ _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the cor
 # Models that are pinhole cameras if their coefficients are 0.
 _PINHOLES = frozenset(
     {
-        *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
-        *(BROWN, "SIMPLE_DIVISION", "DIVISION"),
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "FULL_OPENCV",
+        BROWN,
+        "SIMPLE_DIVISION",
+        "DIVISION",
     }
 )
 _MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the calibration is wrong

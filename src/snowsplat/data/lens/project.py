@@ -15,8 +15,13 @@ import numpy as np
 # Models with one focal length; the others, except EQUIRECTANGULAR, start with fx, fy.
 _ONE_FOCAL_LENGTH = frozenset(
     {
-        *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE"),
-        *("RADIAL_FISHEYE", "SIMPLE_DIVISION", "SIMPLE_FISHEYE"),
+        "SIMPLE_PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "SIMPLE_DIVISION",
+        "SIMPLE_FISHEYE",
     }
 )
 #: The model of Metashape and RealityScan, which COLMAP does not have: fx, fy, cx, cy, k1, k2, k3,

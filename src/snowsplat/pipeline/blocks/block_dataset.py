@@ -71,7 +71,8 @@ def write_block_dataset(
         logger.warning(
             "%s: the lens distortion has terms that COLMAP's models do not have: an error of up to "
             "%.1f pixels; train without blocks if that matters",
-            *(folder, worst),
+            folder,
+            worst,
         )
     nothing = np.zeros((0, 3))
     write_model(

@@ -71,7 +71,14 @@ _STORED_WORDS = 4
 _SCENE = re.compile(r"iteration_(\d+)")
 _TENSORBOARD = "tensorboard"
 _RESULTS = (
-    *("point_cloud", "checkpoints", "refined", "train", "test", "videos", "films", "masks"),
+    "point_cloud",
+    "checkpoints",
+    "refined",
+    "train",
+    "test",
+    "videos",
+    "films",
+    "masks",
     _TENSORBOARD,
 )
 _REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html", "log.csv")

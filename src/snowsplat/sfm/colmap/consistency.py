@@ -219,7 +219,10 @@ def check_pairs(
             missed |= _misses((ids, xyz), sides[1], sides[0], _MIN_MISS_DISTANCE * error)
             checked.append(
                 CheckedPair(
-                    *(first, second, len(rows), int(is_hit.sum())),
+                    first,
+                    second,
+                    len(rows),
+                    int(is_hit.sum()),
                     follows=(first, second) in follow,
                     agreeing=agreement(pose, *both, error),
                     miss_share=float(np.mean(missed & ~is_hit)),

@@ -13,9 +13,21 @@ EffortName = Literal["draft", "normal", "best"]
 
 # The camera models of COLMAP that can be undistorted to pinhole cameras.
 CAMERA_MODELS = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV"),
-    *("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
-    *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE", "EQUIRECTANGULAR"),
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "FOV",
+    "OPENCV_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EQUIRECTANGULAR",
 )
 #: The camera model of 360° panoramas, twice as wide as high.
 PANORAMA_MODEL = "EQUIRECTANGULAR"

@@ -179,7 +179,11 @@ class PoseEstimation:
         names = [names_in(model) for model in best.models]
         reasons = explain(self.photos, self._evidence(best.matched), names, best.left_out)
         result = result_of(
-            *(best.models, self.photos, reasons, best.matched.choice.description, self.log),
+            best.models,
+            self.photos,
+            reasons,
+            best.matched.choice.description,
+            self.log,
             exif=best.lens.exif,
             held=best.mapping.held,
         )
