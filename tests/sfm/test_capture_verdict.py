@@ -59,6 +59,8 @@ def test_good_photos():
         ({}, {"lost": 30, "sub_models": [50, 20]}, "poor", "the photos form 2 groups"),
         ({}, {"reprojection_error": 2.5}, "usable", "the reprojection error is high: 2.5 pixels"),
         ({}, {"doubts": ["the lens is odd"]}, "usable", "the lens is odd"),
+        ({}, {"doubts": ["it is bent"], "agreement": 0.92}, "usable", "it is bent"),
+        ({}, {"doubts": ["it is bent"], "agreement": 0.8}, "poor", "it is bent"),
         ({"directions": 8.0}, {}, "good", "the scene can be seen from there only"),
     ],
 )

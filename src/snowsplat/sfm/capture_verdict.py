@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.evaluation.verdict import Grade, Reason, Verdict
 from snowsplat.sfm.coverage import Coverage
 from snowsplat.sfm.ingest.sources import RECORDS
 from snowsplat.util.safe_json import read_json
@@ -38,6 +38,9 @@ _BAD_PHOTOS = 0.2
 _ONE_SIDE = 15.0
 #: The mean reprojection error of good poses is below 1 pixel.
 _MAX_ERROR = 1.5
+#: The agreement of poses with their matches (`SfmResult`) is 0.61 to 0.80 in bent models, and 0.92
+#: or more in right ones.
+_BENT = 0.86
 
 _CLOSER = (
     "move by at most a tenth of the distance to what you photograph from one photo to the next, so "
@@ -52,8 +55,7 @@ def capture_verdict(
 
     Args:
         coverage: of the photos with a pose.
-        sfm: an `SfmResult` as JSON values. The optional entry "doubts" lists what is doubtful about
-            the cameras, as clauses for users.
+        sfm: an `SfmResult` as JSON values. The entries "doubts" and "agreement" are optional.
         problems: photos that are blurred, too dark or too bright, and what is wrong.
     """
     # A photo of a wide lens becomes several images.
@@ -61,7 +63,7 @@ def capture_verdict(
     reasons = [
         *_lost(sfm),
         *_distances(coverage),
-        *(Reason("usable", doubt) for doubt in sfm.get("doubts", ())),
+        *_doubts(sfm),
         *_count(coverage, photos),
         *_ends(coverage),
         *_errors(sfm),
@@ -93,6 +95,12 @@ def _lost(sfm: Mapping[str, Any]) -> list[Reason]:
     text = f"{lost} of {lost + placed} photos could not be placed{apart}"
     advice = "take more photos between those that are placed and those that are not"
     return [Reason("poor" if share >= _MANY_LOST else "usable", text, advice)]
+
+
+def _doubts(sfm: Mapping[str, Any]) -> list[Reason]:
+    """What is doubtful about the cameras. In a bent model, parts of the scene are doubled."""
+    grade: Grade = "poor" if sfm.get("agreement", 1.0) < _BENT else "usable"
+    return [Reason(grade, doubt) for doubt in sfm.get("doubts", ())]
 
 
 def _distances(coverage: Coverage) -> list[Reason]:

@@ -69,6 +69,9 @@ class SfmResult:
     doubts: list[str] = field(default_factory=list)
     # The focal lengths, as text for users, if those of photos of one group differ (`Photo.group`).
     zooms: str = ""
+    # How well the poses agree with the matches where they agree least: 0 to 1
+    # (`consistency.agreement_of`).
+    agreement: float = 1.0
     # Which photos are from a fisheye lens, as text for users, if this was found from their matches.
     fisheye: str = ""
 

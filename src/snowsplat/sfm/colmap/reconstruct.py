@@ -199,7 +199,11 @@ class PoseEstimation:
             )
         doubts += self._other_lens(best)
         return dataclasses.replace(
-            result, doubts=doubts, zooms=zooms, fisheye=self._found_fisheye(best)
+            result,
+            doubts=doubts,
+            zooms=zooms,
+            agreement=best.agreement,
+            fisheye=self._found_fisheye(best),
         )
 
     def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
