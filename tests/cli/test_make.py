@@ -89,6 +89,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     facts = json.loads(run("info", out, "--json").out)
     assert facts["kind"] == "output folder"
     assert facts["scenes"] == [75]
+    assert facts["last_scene"]["file"] == str(scene)
 
     # The same command again: all stages are skipped.
     before = state(out)

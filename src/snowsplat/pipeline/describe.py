@@ -13,7 +13,7 @@ from snowsplat.formats import Format, GaussianArrays, ply
 from snowsplat.formats.lod import LEVELS, read_index
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
-from snowsplat.pipeline.output.scene_paths import index_in, training_folder
+from snowsplat.pipeline.output.scene_paths import file_of_make, index_in, training_folder
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.sfm.ingest.archive import files_in, is_zip
 from snowsplat.training.core import checkpoint_file
@@ -66,7 +66,7 @@ def describe(path: Path | str) -> dict[str, Any]:
             return _scene(path, format)
     folder = training_folder(path)
     if folder.is_output_folder() or folder.scenes():
-        return _output(folder)
+        return _output(folder, file_of_make(path))
     return _dataset(path)
 
 
@@ -147,7 +147,8 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     }
 
 
-def _output(folder: OutputFolder) -> dict[str, Any]:
+def _output(folder: OutputFolder, made: Path | None) -> dict[str, Any]:
+    """``made``: the scene of `make`, with its last part, if there is one."""
     facts: dict[str, Any] = {"kind": "output folder", "path": str(folder.path)}
     if folder.is_output_folder():
         settings, background = folder.settings()
@@ -164,7 +165,7 @@ def _output(folder: OutputFolder) -> dict[str, Any]:
         except (ValueError, AttributeError):
             raise UserError(f"{metrics}: damaged; it is not JSON") from None
     if facts["scenes"]:
-        facts["last_scene"] = describe(folder.scene_path(facts["scenes"][-1]))
+        facts["last_scene"] = describe(made or folder.scene_path(facts["scenes"][-1]))
     return facts
 
 
