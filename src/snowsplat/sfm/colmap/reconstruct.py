@@ -274,14 +274,13 @@ class PoseEstimation:
         """
         least = min(attempt.error for attempt in self.attempts)
         lenses = {attempt.lens.any_fisheye for attempt in self.attempts}
-
         undoubted = min((a.misfit for a in self.attempts if not a.doubts), default=float("inf"))
 
         def score(attempt: Attempt) -> float:
-            wrong_lens = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
-            if attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit:
-                wrong_lens = True
-            return attempt.registered * attempt.agreement * (0.5 if wrong_lens else 1.0)
+            wrong_kind = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
+            doubtful = attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit
+            weight = 0.5 if wrong_kind or doubtful else 1.0
+            return attempt.registered * attempt.agreement * weight
 
         return max(self.attempts, key=score)
 
