@@ -35,6 +35,8 @@ from snowsplat.util.safe_json import inside, quoted, read_json
 INDEX = "lod-meta.json"
 #: The name of the format, for users.
 LEVELS = "streamed SOG"
+#: Most levels of an index. Each of them usually has half of the Gaussians of the finer one.
+_MOST_LEVELS = 1000
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def read_index(path: Path) -> LodIndex:
             raise UserError(f"{path}: version {quoted(meta['version'])}; supported is 1")
         levels, names = meta["lodLevels"], meta["filenames"]
         environment = meta.get("environment")
-        leaves = list(_leaves(meta["tree"], _number(levels, 1), len(names)))
+        leaves = list(_leaves(meta["tree"], _number(levels, 1, _MOST_LEVELS), len(names)))
         files = [_file(path, name) for name in names]
         always = None if environment is None else _file(path, environment)
     except (AttributeError, KeyError, TypeError, ValueError):
