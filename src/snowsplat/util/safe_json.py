@@ -25,6 +25,8 @@ _MAX_HEADER = 1 << 20
 _MAX_DEPTH = 100
 # Limit of integers. Larger ones would overflow in computations.
 _MAX_INTEGER = 1 << 64
+# Longest name of a file or folder, in characters: no usual file system has longer ones.
+_LONGEST_NAME = 255
 
 
 def read_json(path: Path, ratio: int = _RATIO) -> Any:
@@ -101,7 +103,7 @@ def inside(folder: Path, name: str) -> Path | None:
     Only names are compared. Symbolic links in the folder are followed, because only the owner of
     the folder can create them.
     """
-    if "\0" in name:
+    if "\0" in name or max(map(len, name.split("/"))) > _LONGEST_NAME:
         return None
     root = os.path.abspath(folder)
     target = os.path.abspath(os.path.join(root, name))
