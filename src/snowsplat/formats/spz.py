@@ -90,9 +90,9 @@ def read_spz(path: Path | str) -> GaussianArrays:
         rows = _leaves(path, rows, np.frombuffer(contents.children, "<u2"))
     if header.flags & ANTIALIASED and is_of_spark(data):
         logger.warning(
-            "%s: seems to be of Spark, which marks all scenes as antialiased (if it was not trained "
-            "so, render it with --antialias off) and does not convert axes (if it is upside down, "
-            "convert it with --rotate 180 0 0)",
+            "%s: seems to be of Spark, which marks all scenes as antialiased (if it was not "
+            "trained so, render it with --antialias off) and does not convert axes (if it is "
+            "upside down, convert it with --rotate 180 0 0)",
             path,
         )
     position, alpha, color, scales, rotation, sh = rows
