@@ -40,7 +40,7 @@ from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
-__all__ = ["WRITTEN_VERSIONS", "is_spz", "read_spz", "spz_version", "write_spz"]
+__all__ = ["WRITTEN_VERSIONS", "is_spz", "parse_spz", "read_spz", "spz_version", "write_spz"]
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +65,6 @@ _SCALE_RANGE = (-10.0, 255 / 16 - 10)  # logarithms
 _SH_STEPS = (2, 4)
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
 def read_spz(path: Path | str) -> GaussianArrays:
     """Read a scene of version 1 to 4. Coefficients of SH degree 4 are ignored.
 
@@ -75,8 +74,12 @@ def read_spz(path: Path | str) -> GaussianArrays:
         UserError: the file cannot be read, has another version, is damaged or truncated, or
             declares an implausible number of Gaussians.
     """
-    path = Path(path)
-    data = packing.read_file(path)
+    return parse_spz(Path(path), packing.read_file(Path(path)))
+
+
+@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+def parse_spz(path: Path, data: bytes) -> GaussianArrays:
+    """The scene in the content ``data`` of a file, as `read_spz`; ``path`` is for messages."""
     contents = unpack(path, data)
     header, columns = contents.header, contents.columns
     if header.sh_degree > 3:
