@@ -195,7 +195,7 @@ def test_info_reports_versions_and_rejects_other_files(run, refused, ply, tmp_pa
     assert run("convert", ply, tmp_path / "b.sog").code == 0
     assert json.loads(run("info", tmp_path / "b.sog", "--json").out)["format"] == "SOG 2"
     assert run("convert", ply, tmp_path / "b.html").code == 0
-    assert "can be written, not read" in refused("info", tmp_path / "b.html")
+    assert "use the scene file that the page was made from" in refused("info", tmp_path / "b.html")
     (tmp_path / "scene.obj").write_text("v 0 0 0")
     assert "not a known scene file" in refused("info", tmp_path / "scene.obj")
 

@@ -1,6 +1,8 @@
 """The mark of an antialiased scene in the files of each format."""
 
+import json
 import logging
+import zipfile
 
 import pytest
 
@@ -65,6 +67,16 @@ def test_comments_of_other_programs(tmp_path, make_scene, comments, expected):
     path.write_bytes(path.read_bytes().replace(b"element", lines + b"element", 1))
     assert read_gaussians(path).antialiased == expected
     assert is_antialiased(comments) == expected
+
+
+@pytest.mark.parametrize("mark", [True, False])
+def test_a_sog_may_have_the_older_mark(tmp_path, make_scene, mark):
+    write_gaussians(tmp_path / "a.sog", make_scene(3, 0))
+    with zipfile.ZipFile(tmp_path / "a.sog") as packed:
+        packed.extractall(tmp_path)
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    (tmp_path / "meta.json").write_text(json.dumps(meta | {"antialias": mark}))
+    assert read_gaussians(tmp_path / "meta.json").antialiased == mark
 
 
 @pytest.mark.slow  # Node is started

@@ -315,9 +315,47 @@ def test_the_method_of_compressed_splats_is_named_if_it_is_known(tmp_path, seed,
     primitive(document)["attributes"] = {"POSITION": 0}
     path = assemble(tmp_path / "a.glb", document, binary)
     assert "compressed by an unknown method" in one_line(path)
-    extension(document)["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {}}
+    extension(document)["extensions"] = {"EXT_some_compression": {}}
     path = assemble(tmp_path / "a.glb", document, binary)
-    assert "compressed by KHR_gaussian_splatting_compression_spz_2" in one_line(path)
+    assert "compressed by EXT_some_compression" in one_line(path)
+    primitive(document)["attributes"] = {"POSITION": 0, "_SCALE": 1, "_ROTATION": 2}
+    path = assemble(tmp_path / "a.glb", document, binary)
+    assert "an early draft" in one_line(path)
+
+
+@pytest.mark.parametrize("draft", ["spz_2", "spz", "the first"])
+def test_splats_in_an_spz_file_are_read(tmp_path, make_scene, one_line, draft):
+    """As 3dgs_io writes them: the accessors have no data."""
+    write_gaussians(tmp_path / "a.spz", make_scene(40, 2))
+    packed = (tmp_path / "a.spz").read_bytes()
+    name = f"KHR_gaussian_splatting_compression_{draft}"
+    extensions = {PREFIX[:-1]: {"kernel": "ellipse", "extensions": {name: {"bufferView": 1}}}}
+    if draft == "the first":
+        name = "KHR_spz_gaussian_splats_compression"
+        extensions = {name: {"bufferView": 1}}
+    attributes = {"POSITION": 0, f"{PREFIX}SCALE": 1}
+    document = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": [PREFIX[:-1], name],
+        "extensionsRequired": [name],
+        "nodes": [{"mesh": 0, "translation": [1, 2, 3]}],
+        "meshes": [
+            {"primitives": [{"mode": 0, "attributes": attributes, "extensions": extensions}]}
+        ],
+        "accessors": [{"componentType": 5126, "count": 40, "type": "VEC3"}] * 2,
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 4},
+            {"buffer": 0, "byteOffset": 4, "byteLength": len(packed)},
+        ],
+        "buffers": [{"byteLength": 4 + len(packed)}],
+    }
+    read = read_gaussians(assemble(tmp_path / "a.glb", document, bytes(4) + packed))
+    read.means += torch.tensor(read.origin) - torch.tensor([1.0, -2, -3])  # y down, z forward
+    assert_same(read, read_gaussians(tmp_path / "a.spz"))
+    document["bufferViews"][1]["byteLength"] += 1
+    assert "exceeds" in one_line(assemble(tmp_path / "a.glb", document, bytes(4) + packed))
+    document["bufferViews"][1]["byteLength"] = len(packed) // 2
+    assert "damaged" in one_line(assemble(tmp_path / "a.glb", document, bytes(4) + packed))
 
 
 def test_invalid_chunks_are_reported(tmp_path, seed, one_line):

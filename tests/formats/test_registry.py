@@ -83,6 +83,18 @@ def test_unknown_formats_are_one_line_errors(tmp_path):
         read_gaussians(tmp_path)
 
 
+def test_formats_of_others_that_are_not_read_are_named_with_what_to_do(tmp_path):
+    for name, head, advice in (
+        ("a.rad", b"RAD0\x80", "build-lod --unlod --spz"),
+        ("a-0.radc", b"RADC\x80", "build-lod --unlod --spz"),
+        ("a.splat", b"RAD0\x80", "build-lod --unlod --spz"),
+        ("a.lcc", b"{", "splat-transform"),
+    ):
+        (tmp_path / name).write_bytes(head)
+        with pytest.raises(UserError, match=f"files cannot be read; .*{advice}"):
+            read_gaussians(tmp_path / name)
+
+
 def test_a_suffix_of_the_folder_is_ignored(tmp_path):
     folder = tmp_path / "v1.ply"
     folder.mkdir()

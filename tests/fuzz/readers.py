@@ -152,7 +152,11 @@ def _scene(file: str) -> Reader:
     )
 
 
-def _spz(name: str, version: int, pack: Callable[[bytes], bytes] | None = None) -> Reader:
+def _spz(
+    name: str, version: int, pack: Callable[[bytes], bytes] | None = None, links: bytes = b""
+) -> Reader:
+    """``links``: of a tree of levels of detail of 30 Gaussians."""
+
     def make(folder: Path) -> None:
         path = folder / "a.spz"
         write_spz(path, GaussianArrays.from_gaussians(make_scene(30, 2)), max(version, 2))
@@ -161,8 +165,8 @@ def _spz(name: str, version: int, pack: Callable[[bytes], bytes] | None = None) 
         columns = unpack(path, path.read_bytes()).columns
         if version == 1:
             columns[0] = bytes(range(30)) * 6
-        head = struct.pack("<4sIIBBBB", b"NGSP", version, 30, 2, 12, 0, 0)
-        path.write_bytes(head + b"".join(columns))
+        head = struct.pack("<4sIIBBBB", b"NGSP", version, 30, 2, 12, 0x80 if links else 0, 0)
+        path.write_bytes(head + b"".join([*columns, links]))
 
     read = _reads("a.spz")
     return Reader(name, "a.spz", make, read, pack=pack)
@@ -636,6 +640,7 @@ READERS: tuple[Reader, ...] = (
     *(_ksplat(level) for level in (0, 1, 2)),
     *(_spz(f"scene spz {version}", version) for version in (1, 2, 3, 4)),
     _spz("scene spz 3, in gzip", 3, gzip.compress),
+    _spz("scene spz 2, a tree", 2, links=struct.pack("<30H", 29, *[0] * 29) + bytes(120)),
     *(_sog_part(member) for member in ("meta.json", "means_l.webp", "shN_centroids.webp")),
     Reader("scene sog, a folder", "meta.json", _sog_folder, _reads("meta.json"), json=True),
     Reader("levels of detail", INDEX, _make_levels, _reads(INDEX), json=True),

@@ -55,7 +55,7 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     path = Path(path)
     format = format_for_reading(path)
     if format.read is None:
-        raise UserError(f"{path}: {format.name} files can be written, not read")
+        raise UserError(f"{path}: {format.name} files cannot be read; {format.instead}")
     scene = format.read(path)
     _name_coarse_positions(path, scene)
     if format.stores_origin:

@@ -136,6 +136,21 @@ def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:
             yield array.tobytes()
 
 
+def view(document: Document, index: int) -> memoryview:
+    """The bytes of a buffer view.
+
+    Raises:
+        Damaged: it exceeds its buffer.
+        KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
+    """
+    entry = _item(document.json, "bufferViews", index)
+    data = document.buffer(entry["buffer"])
+    start, length = _non_negative(entry.get("byteOffset", 0)), _non_negative(entry["byteLength"])
+    if start + length > len(data):
+        raise Damaged(f"its buffer view {index} exceeds the file")
+    return data[start : start + length]
+
+
 def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
     """The (count, width) float32 values of an accessor whose type is one of ``kinds``, as "VEC3".
 
@@ -148,16 +163,14 @@ def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
         raise Damaged(f"its accessor {index} does not have the type of its attribute")
     code, divisor = _COMPONENTS[entry["componentType"]]
     dtype, width, count = np.dtype(code), _WIDTHS[entry["type"]], _non_negative(entry["count"])
-    view = _item(document.json, "bufferViews", entry["bufferView"])
-    data = document.buffer(view["buffer"])
+    data = view(document, entry["bufferView"])
     row = width * dtype.itemsize
-    stride = _non_negative(view.get("byteStride", row))
-    start, length = _non_negative(view.get("byteOffset", 0)), _non_negative(view["byteLength"])
+    stride = _item(document.json, "bufferViews", entry["bufferView"]).get("byteStride", row)
     offset = _non_negative(entry.get("byteOffset", 0))
-    needed = offset + (stride * (count - 1) + row if count else 0)
-    if stride < row or needed > length or start + length > len(data):
+    needed = offset + (_non_negative(stride) * (count - 1) + row if count else 0)
+    if stride < row or needed > len(data):
         raise Damaged(f"its accessor {index} exceeds the file")
-    values = np.ndarray((count, width), dtype, data, start + offset, (stride, dtype.itemsize))
+    values = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
     result = values.astype(np.float32)
     if entry.get("normalized", False) and divisor != 1.0:
         # The most negative integer also means -1.

@@ -5,7 +5,9 @@
 The splats are a primitive of points with one accessor per attribute: POSITION; ROTATION,
 quaternions xyzw; SCALE, the standard deviations themselves; OPACITY in 0 … 1; SH_DEGREE_l_COEF_n,
 with the basis and order of our renderer. COLOR_0 lets programs without the extension display
-points. A Gaussian of SH degree 3 takes about 236 bytes.
+points. A Gaussian of SH degree 3 takes about 236 bytes. Instead of the accessors, a buffer view may
+have an .spz file, as in the tiles of Cesium (a draft: pull request 2531 of Khronos). Its numbers
+are taken as those of the mesh, as by CesiumJS. Such files are read, not written.
 
 The frame of glTF is x right, y up, z towards the viewer: our frame, rotated by 180° about x.
 Readers must apply the transforms of the nodes, which place the splats in the scene. Numbers in the
@@ -24,6 +26,7 @@ import numpy as np
 from snowsplat.formats import glb, packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.glb import Document
+from snowsplat.formats.spz import parse_spz
 from snowsplat.formats.zip_members import Damaged
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -33,8 +36,14 @@ from snowsplat.util.safe_json import quoted
 logger = logging.getLogger(__name__)
 
 EXTENSION = "KHR_gaussian_splatting"
+# The names of the extension for .spz files in its drafts; the last one is not inside of EXTENSION.
+_SPZ = (
+    "KHR_gaussian_splatting_compression_spz_2",
+    "KHR_gaussian_splatting_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+)
 #: Extensions that a file may require.
-_UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization"}
+_UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", *_SPZ}
 _SPACES = ("srgb_rec709_display", "lin_rec709_display")
 _ROUNDING = 1e-3  # of the largest scale
 _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colour
@@ -73,7 +82,7 @@ def read_gltf(path: Path | str) -> GaussianArrays:
         if unknown:
             raise Damaged(f"it needs {sorted(map(str, unknown))[0][:60]}, which is not supported")
         notes: set[str] = set()
-        parts = _parts(document, notes)
+        parts = _parts(path, document, notes)
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
             raise UserError(f"{path}: a glTF file without Gaussian splats ({EXTENSION})")
         if _are_logarithms([part.log_scales for part, _ in parts]):
@@ -96,10 +105,21 @@ def read_gltf(path: Path | str) -> GaussianArrays:
     )
     if any(any(part.origin) for part in placed):
         means = np.concatenate([part.world_means() for part in placed]) * packing.UP_BACK
-    return decoded(path, means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
+    return decoded(
+        path,
+        means,
+        scene.log_scales,
+        quats,
+        scene.opacity_logits,
+        scene.sh_dc,
+        sh_rest,
+        antialiased=scene.antialiased,
+    )
 
 
-def _parts(document: Document, notes: set[str]) -> list[tuple[GaussianArrays, np.ndarray]]:
+def _parts(
+    path: Path, document: Document, notes: set[str]
+) -> list[tuple[GaussianArrays, np.ndarray]]:
     """The splats of each primitive that has splats, and ``world_from_mesh`` (4, 4).
 
     The log scales are SCALE as it is stored; ``notes`` gets what is not read as it is meant.
@@ -114,11 +134,16 @@ def _parts(document: Document, notes: set[str]) -> list[tuple[GaussianArrays, np
         if seen > _MOST_PRIMITIVES:
             raise Damaged(f"it has more than {_MOST_PRIMITIVES} primitives")
         for primitive in mesh["primitives"]:
-            extension = primitive.get("extensions", {}).get(EXTENSION)
-            if extension is None:
+            extensions = primitive.get("extensions", {})
+            inner = extensions.get(EXTENSION, {}).get("extensions", {}) | extensions
+            packed = next((inner[name] for name in _SPZ if name in inner), None)
+            if packed is not None:
+                part = _unpacked(path, document, packed["bufferView"])
+            elif EXTENSION in extensions:
+                _check(primitive, extensions[EXTENSION], notes)
+                part = _splats(document, primitive["attributes"], notes)
+            else:
                 continue
-            _check(primitive, extension, notes)
-            part = _splats(document, primitive["attributes"], notes)
             count += len(part.means)
             if count > _MOST_COPIES * document.size // _LEAST_BYTES or len(parts) >= _MOST_PARTS:
                 raise Damaged("its nodes repeat the splats too often")
@@ -126,10 +151,22 @@ def _parts(document: Document, notes: set[str]) -> list[tuple[GaussianArrays, np
     return parts
 
 
+def _unpacked(path: Path, document: Document, view: int) -> GaussianArrays:
+    """As `_splats`, of an .spz file."""
+    scene = parse_spz(path, bytes(glb.view(document, view)))
+    means, quats, sh_rest = packing.flip_axes(
+        scene.means, scene.quats, scene.sh_rest, packing.UP_BACK
+    )
+    scales = np.exp(scene.log_scales)
+    return replace(scene, means=means, log_scales=scales, quats=quats, sh_rest=sh_rest)
+
+
 def _check(primitive: dict[str, Any], extension: dict[str, Any], notes: set[str]) -> None:
     if primitive.get("mode", 4) != _POINTS:
         raise Damaged("its splats are not points")
     if not any(name.startswith(f"{EXTENSION}:") for name in primitive["attributes"]):
+        if "_SCALE" in primitive["attributes"]:
+            raise Damaged("its splats are those of an early draft, which is not supported")
         packed = ", ".join(map(str, extension.get("extensions", {}))) or "an unknown method"
         raise Damaged(f"its splats are compressed by {packed[:60]}, which is not supported")
     kernel = extension.get("kernel", "ellipse")

@@ -49,6 +49,7 @@ class Format:
         version: the version of a file that ``recognises`` accepts, if the format has several.
         stores_origin: whether a file has the `scene.origin`; if not, it is in a file beside it.
         bytes: the size of a scene; None: the scene is a single file, whose size is taken.
+        instead: for users, what to do with a file of a format that cannot be read.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Format:
     version: Callable[[Path], str] | None = None
     stores_origin: bool = False
     bytes: Callable[[Path], int] | None = None
+    instead: str = ""
 
     def size(self, path: Path) -> int:
         """The bytes of an existing scene, with all files that belong to it."""
@@ -162,6 +164,26 @@ FORMATS: list[Format] = [
         None,
         "precision: SH have 8 to 32 bits, all other values 16 or 32",
         False,
+    ),
+    Format(
+        "RAD",
+        (".rad", ".radc"),
+        lambda head: head.startswith((b"RAD0", b"RADC")),
+        None,
+        None,
+        "not known",
+        False,
+        instead="use the file that Spark made it from, or the .spz of its build-lod --unlod --spz",
+    ),
+    Format(
+        "LCC",
+        (".lcc", ".lcc2"),
+        None,
+        None,
+        None,
+        "not known",
+        False,
+        instead="export the scene as .ply, or convert it with splat-transform",
     ),
 ]
 

@@ -16,6 +16,7 @@ which has these images:
   codebook.
 
 The entry "model" of `meta.json` is "antialiased" for an antialiased scene; other scenes have none.
+Older versions of the format have the entry "antialias" instead, as the types of Spark show.
 The entry "origin" of "asset", ours, is the `scene.origin` of a scene that is far away from 0.
 
 Version 1 has evenly spaced levels between mins and maxs instead of codebooks. A scene of version 1
@@ -80,7 +81,8 @@ def read_stored(path: Path | str) -> GaussianArrays:
             meta = files.meta()
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
-    scene = placed(*arrays, antialiased=meta.get("model") == "antialiased")
+    antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
+    scene = placed(*arrays, antialiased=antialiased)
     asset = meta.get("asset")
     stored = stored_origin(asset.get("origin")) if isinstance(asset, dict) else None
     return replace(scene, origin=added(scene.origin, stored or HERE))

@@ -27,12 +27,20 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.spz_container import ANTIALIASED, Header, is_spz, pack, read_header, unpack
+from snowsplat.formats.spz_container import (
+    ANTIALIASED,
+    Header,
+    is_of_spark,
+    is_spz,
+    pack,
+    read_header,
+    unpack,
+)
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
-__all__ = ["WRITTEN_VERSIONS", "is_spz", "read_spz", "spz_version", "write_spz"]
+__all__ = ["WRITTEN_VERSIONS", "is_spz", "parse_spz", "read_spz", "spz_version", "write_spz"]
 
 logger = logging.getLogger(__name__)
 
@@ -57,25 +65,41 @@ _SCALE_RANGE = (-10.0, 255 / 16 - 10)  # logarithms
 _SH_STEPS = (2, 4)
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
 def read_spz(path: Path | str) -> GaussianArrays:
     """Read a scene of version 1 to 4. Coefficients of SH degree 4 are ignored.
+
+    Of a tree of levels of detail of Spark, the finest level is read.
 
     Raises:
         UserError: the file cannot be read, has another version, is damaged or truncated, or
             declares an implausible number of Gaussians.
     """
-    path = Path(path)
-    contents = unpack(path, packing.read_file(path))
+    return parse_spz(Path(path), packing.read_file(Path(path)))
+
+
+@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+def parse_spz(path: Path, data: bytes) -> GaussianArrays:
+    """The scene in the content ``data`` of a file, as `read_spz`; ``path`` is for messages."""
+    contents = unpack(path, data)
     header, columns = contents.header, contents.columns
     if header.sh_degree > 3:
         logger.warning("%s: SH degree %d is reduced to 3", path, header.sh_degree)
     n = header.count
-    position, alpha, color, scales, rotation, sh = (
+    rows = [
         np.frombuffer(column, np.uint8).reshape(n, -1 if n else width)
         for column, width in zip(columns, header.columns(), strict=True)
-    )
-    sh_rest = sh.reshape(n, sh.shape[1] // 3, 3)[:, : SH_REST_COUNTS[-1]]
+    ]
+    if contents.children:
+        rows = _leaves(path, rows, np.frombuffer(contents.children, "<u2"))
+    if header.flags & ANTIALIASED and is_of_spark(data):
+        logger.warning(
+            "%s: seems to be of Spark, which marks all scenes as antialiased (if it was not "
+            "trained so, render it with --antialias off) and does not convert axes (if it is "
+            "upside down, convert it with --rotate 180 0 0)",
+            path,
+        )
+    position, alpha, color, scales, rotation, sh = rows
+    sh_rest = sh.reshape(len(sh), sh.shape[1] // 3, 3)[:, : SH_REST_COUNTS[-1]]
     means, quats, sh_rest = packing.flip_axes(
         _unpack_positions(position, header),
         _unpack_rotations(rotation),
@@ -92,6 +116,20 @@ def read_spz(path: Path | str) -> GaussianArrays:
         sh_rest,
         antialiased=bool(header.flags & ANTIALIASED),
     )
+
+
+def _leaves(path: Path, rows: list[np.ndarray], children: np.ndarray) -> list[np.ndarray]:
+    """The rows of the Gaussians without children, with opacities as in a file without a tree.
+
+    The others are merged Gaussians, which may be more than opaque; so all opacities are halved.
+    """
+    if len(children) != 1 + int(children.sum()):  # all but the root are the child of one Gaussian
+        logger.warning(
+            "%s: is a part of a scene in levels of detail; give all parts to convert", path
+        )
+    leaves = [column[children == 0] for column in rows]
+    leaves[1] = np.minimum(leaves[1], 127) * 2 + (leaves[1] > 127)
+    return leaves
 
 
 def spz_version(path: Path) -> str:

@@ -4,6 +4,9 @@ Versions 1 to 3 have a header of 16 bytes and the columns, in one gzip stream (s
 them uncompressed). Version 4 has a header of 32 bytes, extensions, a table with the packed and
 unpacked size of each column, and the columns, each in a zstd stream; empty columns are omitted.
 
+Spark writes version 2, also with a tree of levels of detail: after the columns, the number of
+children of each Gaussian (2 bytes) and its first child (4 bytes). The leaves are the scene.
+
 The sizes that a file declares are compared with the size of the file before memory is allocated.
 """
 
@@ -21,11 +24,14 @@ from snowsplat.util.errors import UserError
 #: Bits of `Header.flags`.
 ANTIALIASED = 1
 EXTENDED = 2
+LEVELS = 0x80  # of Spark
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
 _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fraction, flags, streams
 _HEADER_BYTES = 32  # of version 4
+_LINK_BYTES = 6  # of a Gaussian in a tree
+_SPARK = bytes.fromhex("1f8b08000000000000ff")  # other writers of .spz name a system in the last
 _EXTENSION_LIMIT = 1 << 16
 
 _GZIP_LEVEL = 4
@@ -53,12 +59,14 @@ class Header:
 class Contents:
     """The unpacked columns of position, opacity, colour, scales, rotation, SH.
 
+    ``children``: the number of children of each Gaussian, 2 bytes each; empty without `LEVELS`.
     Invariant: each column has the size that follows from the header.
     """
 
     header: Header
     columns: list[bytes]
     extensions: bytes
+    children: bytes = b""
 
 
 def is_spz(head: bytes) -> bool:
@@ -69,6 +77,11 @@ def is_spz(head: bytes) -> bool:
         except zlib.error:
             return False
     return head.startswith(_MAGIC)
+
+
+def is_of_spark(data: bytes) -> bool:
+    """Whether Spark 2 seems to have written the file content ``data``."""
+    return data.startswith(_SPARK)
 
 
 def read_header(path: Path, data: bytes) -> Header:
@@ -104,12 +117,12 @@ def _unpack(path: Path, data: bytes) -> Contents:
         if header.version > 3:
             return _unpack_streams(path, data, header)
         body = data[_HEAD.size :]
-        size = sum(header.columns()) * header.count
+        size = _body_bytes(header)
     else:
         stream = zlib.decompressobj(31)
         head = stream.decompress(data, _HEAD.size)
         header = _header(path, head, len(data))
-        size = sum(header.columns()) * header.count
+        size = _body_bytes(header)
         # The checksum is only verified at the end of the stream.
         body = stream.decompress(stream.unconsumed_tail, size + _EXTENSION_LIMIT)
         if header.version > 3 or not stream.eof:
@@ -120,7 +133,13 @@ def _unpack(path: Path, data: bytes) -> Contents:
     for width in header.columns():
         columns.append(body[start : start + width * header.count])
         start += width * header.count
-    return Contents(header, columns, body[start:] if header.flags & EXTENDED else b"")
+    children = body[start : start + 2 * header.count] if header.flags & LEVELS else b""
+    return Contents(header, columns, body[size:] if header.flags & EXTENDED else b"", children)
+
+
+def _body_bytes(header: Header) -> int:
+    links = _LINK_BYTES if header.flags & LEVELS else 0
+    return (sum(header.columns()) + links) * header.count
 
 
 def _header(path: Path, head: bytes, file_size: int) -> Header:

@@ -178,7 +178,7 @@ def bundler(folder: Path):
     return expected
 
 
-def polycam(folder: Path, corrected=True):
+def polycam(folder: Path, corrected=True, sizes=True):
     """Keyframes with depth maps in millimetres, and maps of confidence."""
     keyframes = folder / "keyframes"
     prefix = "corrected_" if corrected else ""
@@ -190,7 +190,8 @@ def polycam(folder: Path, corrected=True):
     for name, (rotation, translation) in rig().items():
         pose = np.column_stack([rotation.T @ np.diag([1.0, -1, -1]), -rotation.T @ translation])
         values = {f"t_{i}{j}": float(pose[i, j]) for i in range(3) for j in range(4)}
-        values |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH, "height": HEIGHT}
+        values |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        values |= {"width": WIDTH, "height": HEIGHT} if sizes else {}
         stem = Path(name).stem
         (keyframes / f"{prefix}cameras" / f"{stem}.json").write_text(json.dumps(values))
         x, y, z = in_camera(name)

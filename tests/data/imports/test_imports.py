@@ -53,6 +53,7 @@ CASES = {
     "bundler": (exports.bundler, {}),
     "polycam": (exports.polycam, {}),
     "polycam arkit": (exports.polycam, {"corrected": False}),
+    "polycam 2025": (exports.polycam, {"sizes": False}),
     "record3d": (exports.record3d, {}),
     "record3d rows": (exports.record3d, {"rows": True}),
     "openmvg": (exports.openmvg, {}),

@@ -56,7 +56,7 @@ def test_the_scene_is_embedded(tmp_path):
 
 def test_html_files_cannot_be_read(tmp_path):
     write_gaussians(tmp_path / "scene.html", three_balls())
-    with pytest.raises(UserError, match="HTML files can be written, not read"):
+    with pytest.raises(UserError, match="HTML files cannot be read; use the scene file"):
         read_gaussians(tmp_path / "scene.html")
 
 

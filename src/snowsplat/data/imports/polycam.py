@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.data.decode import read_header
 from snowsplat.data.imports.lenses import perspective
 from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import from_opengl, load_json, number, table
@@ -60,6 +61,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             continue
         values = table(file, load_json(file))
         fx, fy, cx, cy = (number(file, values, key) for key in ("fx", "fy", "cx", "cy"))
+        if "width" not in values:  # as in corrected cameras since 2025
+            header = read_header(photos.root / photo)
+            values |= {"width": header.width, "height": header.height}
         width, height = number(file, values, "width"), number(file, values, "height")
         lens = perspective(file, width, height, (fx, fy, cx, cy))
         entries = [

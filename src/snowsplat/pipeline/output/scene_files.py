@@ -37,4 +37,15 @@ def _write_html(path: Path, gaussians: GaussianArrays) -> None:
     write_html(path, ready(gaussians.to_gaussians(), ()))
 
 
-register_format(Format("HTML", (".html",), None, None, _write_html, "the same as in SOG", True))
+register_format(
+    Format(
+        "HTML",
+        (".html",),
+        None,
+        None,
+        _write_html,
+        "the same as in SOG",
+        True,
+        instead="use the scene file that the page was made from",
+    )
+)
