@@ -279,6 +279,7 @@ def test_damaged_indices(tmp_path, make_scene, one_line):
     assert "supported is 1" in refused(version=2)
     assert "does not describe" in refused(lodLevels=0)
     assert "does not describe" in refused(lodLevels=2**31)
+    assert "does not describe" in refused(filenames=["0/" * 200, *meta["filenames"][1:]])
     assert "does not describe" in refused(tree={})
     assert "does not describe" in refused(tree={"lods": {"0": {"file": 99, "count": 3}}})
     assert "does not describe" in refused(tree={"lods": {"0": {"file": 0, "count": -3}}})

@@ -20,6 +20,8 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.data.decode import LoadedImage
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.ops.splats import COLORS, Splats2D
+from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
@@ -192,6 +194,23 @@ def test_the_decision(clean, degraded):
     off = Trainer(same, replace(CONFIG, exposure="off"), note=notes.append)
     assert off.part(Exposure) is None
     assert len(notes) == 4
+
+
+def test_a_training_without_gains_is_told_that_exposures_differ(clean, degraded, tmp_path):
+    notes: list[str] = []
+    observer = Observer()
+    observer.note = notes.append
+
+    def told(folder: Path, **settings: object) -> bool:
+        notes.clear()
+        options = TrainOptions(settings={"iterations": 1, "init": "points", **settings})
+        train(folder, tmp_path / "out", options, overwrite=True, observer=observer)
+        return any("exposure=auto learns one gain for each photo" in note for note in notes)
+
+    assert told(clean.with_name("degraded"))
+    assert not told(clean.with_name("degraded"), exposure="off")
+    assert not told(clean.with_name("degraded"), exposure="auto")
+    assert not told(clean)
 
 
 @pytest.mark.parametrize("background", [(0.3, 0.9, 0.6), (0.0, 0.0, 0.0)])

@@ -125,7 +125,15 @@ def test_a_pipe_is_not_read(tmp_path):
 def test_names_inside_and_outside_a_folder(tmp_path):
     for name in ("a", "a/b.png", "./a", "a/../b", str(tmp_path / "a"), "..a", "a..b"):
         assert inside(tmp_path, name) == tmp_path / name
-    for name in ("..", "../a", "a/../../b", "/etc/passwd", str(tmp_path) + "x/a", "a\0b", "x" * 256):
+    for name in (
+        "..",
+        "../a",
+        "a/../../b",
+        "/etc/passwd",
+        str(tmp_path) + "x/a",
+        "a\0b",
+        "x" * 256,
+    ):
         assert inside(tmp_path, name) is None
 
 

@@ -37,6 +37,8 @@ INDEX = "lod-meta.json"
 LEVELS = "streamed SOG"
 #: Most levels of an index. Each of them usually has half of the Gaussians of the finer one.
 _MOST_LEVELS = 1000
+#: Longest path in an index. Programs write such as "0_0/meta.json".
+_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,8 @@ def _number(value: Any, low: int, high: int = 1 << 40) -> int:
 
 
 def _file(path: Path, name: Any) -> Path:
+    if isinstance(name, str) and len(name) > _LONGEST_NAME:
+        raise ValueError
     found = inside(path.parent, name) if isinstance(name, str) else None
     if found is None:
         raise UserError(f"{path}: refers to a file outside of its folder ({quoted(name)})")

@@ -172,11 +172,27 @@ class Exposure(Part):
         self._updates.copy_(tensors["updates"])
 
 
+def exposure_hint(run: Run) -> str | None:
+    """A line for a training without gains whose photos differ in exposure; None if they do not.
+
+    Without gains, a scene reproduces the exposure of each photo by veils and by colours that depend
+    on the direction, which are wrong between the photos.
+    """
+    start = exposure_start(run.dataset, run.images)
+    if start.spread is None or start.spread < LEAST_SPREAD or not start.everywhere:
+        return None
+    return f"exposure: {_found(start)}; exposure=auto learns one gain for each photo and channel"
+
+
+def _found(start: ExposureStart) -> str:
+    return f"photos differ by {start.spread:.2f} EV (standard deviation, from {start.source})"
+
+
 def _reason(start: ExposureStart, active: bool) -> str:
     if start.spread is None:
         found = "not known, because there are neither points nor EXIF data"
     else:
-        found = f"photos differ by {start.spread:.2f} EV (standard deviation, from {start.source})"
+        found = _found(start)
         if start.spread >= LEAST_SPREAD and not start.everywhere:
             found += ", but not by the same in all parts of the scene, as shiny surfaces do"
     what = "one gain for each photo and channel is learnt" if active else "no gains are learnt"
