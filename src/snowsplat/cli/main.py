@@ -1,8 +1,8 @@
 """The command `snowsplat`: selects the subcommand, runs it, and reports errors.
 
 Exit codes: 0 success; 2 an error in the flags or the input, reported as one line on stderr;
-130 interrupted by Ctrl-C, with all finished results saved; 141 the reader of the output has closed
-it. Any other failure is a defect of the program and shows a traceback.
+130 stopped by Ctrl-C, SIGTERM or SIGHUP, with all finished results saved; 141 the reader of the
+output has closed it. Any other failure is a defect of the program and shows a traceback.
 """
 
 import difflib
@@ -28,6 +28,7 @@ from snowsplat.cli.reports import run
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.safe_json import printable
 
 # Former names of subcommands, still accepted but not listed.
@@ -55,13 +56,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(overview())
         return 0
     try:
-        return run(parse(arguments))
+        with ended_by_signals():
+            return run(parse(arguments))
     except SettingError as error:
         return _fail(with_flags(f"`{error.setting}`: {error.problem}"), 2)
     except UserError as error:
         return _fail(with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        return _fail("stopped by Ctrl-C", 130)
+        return _fail("stopped", 130)
     except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141  # 128 + SIGPIPE, as for other programs: the run is not complete
