@@ -6,6 +6,7 @@ output has closed it. Any other failure is a defect of the program and shows a t
 """
 
 import difflib
+import errno
 import inspect
 import io
 import logging
@@ -34,6 +35,11 @@ from snowsplat.util.safe_json import printable
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
 
+_REMEDIES = {
+    errno.EACCES: "check the owner and the permissions, or use another folder",
+    errno.EROFS: "write the result to another folder",
+    errno.ENOSPC: "free some space, or write the result to another disk",
+}
 _OUT_OF_MEMORY = (
     "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
 )
@@ -75,7 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(_OUT_OF_MEMORY, 2)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}", 2)
+        remedy = _REMEDIES.get(error.errno or 0)
+        return _fail(f"{where}{error.strerror or error}{f'; {remedy}' if remedy else ''}", 2)
 
 
 def parse(arguments: Sequence[str]) -> Any:
