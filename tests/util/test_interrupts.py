@@ -132,3 +132,18 @@ with ended_by_signals():
     os.close(terminal)
     os.waitpid(process, 0)
     assert (tmp_path / "saved").exists()
+
+
+def test_pycolmap_does_not_take_the_signal():
+    code = """
+import os, signal
+from snowsplat.util.interrupts import ended_by_signals
+with ended_by_signals():
+    import snowsplat.sfm.colmap
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except KeyboardInterrupt:
+        print("as Ctrl-C")
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.stdout, ended.stderr) == ("as Ctrl-C\n", "")

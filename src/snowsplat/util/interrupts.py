@@ -43,6 +43,7 @@ def interrupts_between_steps() -> Iterator[Callable[..., None]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda *_: None
         return
+    handle_again()
     own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if own:
         signal.signal(signal.SIGINT, defer)
@@ -86,6 +87,14 @@ def ended_by_signals() -> Iterator[None]:
     finally:
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
+
+
+def handle_again() -> None:
+    """Install the handler of SIGTERM again: the logger of COLMAP has replaced it when pycolmap was
+    imported, and would print a stack trace."""
+    handler = signal.getsignal(signal.SIGTERM)
+    if callable(handler) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 @contextmanager
