@@ -28,6 +28,7 @@ def test_the_flags_to_use_exist():
             "--pipeline.model.sh-degree: use --sh-degree; --strategy.cap_max: use --max-gaussians",
         ),
         ("evaluate --load-config c.yml", "--load-config: use no flag: snowsplat evaluate OUT"),
+        ("convert -s garden --resize", "-s: convert.py is snowsplat sfm -s DATASET"),
         ("evaluate out --max-steps 4", "--max-steps: unknown flag; leave it out"),  # it has none
         (
             "train mcmc garden -o out",

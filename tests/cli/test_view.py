@@ -15,6 +15,7 @@ import pytest
 
 from snowsplat.cli import view
 from snowsplat.cli.main import main
+from snowsplat.cli.page_flags import for_other_computers
 from snowsplat.formats import read_gaussians, write_gaussians
 
 from ..browser import Browser
@@ -104,6 +105,18 @@ def test_over_ssh_it_prints_the_port_forwarding_command(served, out):
     assert f"ssh -L {port}:127.0.0.1:{port} " in result.out
     assert not opened
     assert "ssh" not in served(out)[0].out
+
+
+def test_a_user_without_a_name_can_forward_a_port(monkeypatch):
+    """In a container, a user may have a number only."""
+
+    def unknown() -> str:
+        raise KeyError("getpwuid(): uid not found: 4242")
+
+    monkeypatch.setattr("getpass.getuser", unknown)
+    monkeypatch.setenv("SSH_CONNECTION", "1")
+    (line,) = for_other_computers("http://127.0.0.1:81/", [])
+    assert line.startswith("from your computer: ssh -L 81:127.0.0.1:81 USER@")
 
 
 def test_with_a_public_host_it_prints_the_address_for_other_computers(served, out):

@@ -82,7 +82,8 @@ class Evaluate(SceneFlags, Reports):
             print("LPIPS was not measured; to measure it: --lpips vgg")
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
-        print(f"iteration {scene.iteration}, {which}: {where}")
+        step = f"iteration {scene.iteration}, " if scene.iteration else ""  # a file has none
+        print(f"{step}{which}: {where}")
         out = self.output_path()
         photos = [] if self.dataset is None else ["--dataset", self.dataset]
         print(next_step("to see the renders", "render", out, *photos, "--split", self.split))

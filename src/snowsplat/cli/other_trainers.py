@@ -1,7 +1,8 @@
 """What to use for flags and words of gsplat's `simple_trainer.py` and of nerfstudio.
 
 They are not accepted, because what they do differs in detail: an error names what to use instead.
-Those of the reference implementation are accepted, see `reference_flags`.
+Those of the reference implementation are accepted, see `reference_flags`; only the name of its
+`convert.py` is that of another subcommand here.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ def advice(subcommand: str, name: str, flags: Collection[str]) -> str | None:
     *groups, word = name.removeprefix("--").split(".")
     if word in _INPUTS and subcommand in SUBCOMMANDS:
         return f"use no flag: snowsplat {subcommand} {SUBCOMMANDS[subcommand].usage}"
+    if (subcommand, name) in (("convert", "-s"), ("convert", "--source-path")):
+        return "convert.py is snowsplat sfm -s DATASET"
     if groups and f"--{word}" in flags:
         return f"use --{word}"
     if word in ("save-ply", "disable-video"):
