@@ -7,9 +7,7 @@ import threading
 import urllib.request
 import webbrowser
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -83,8 +81,7 @@ def served(run, monkeypatch):
         site = viewing.site
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
         monkeypatch.setattr(viewing, "site", lambda *a: (sites.append(a), site(*a))[1])
-        interrupted = SimpleNamespace(wait=lambda _: done.wait(0.3) or True)
-        monkeypatch.setattr(view, "interrupts", lambda: nullcontext(interrupted))
+        monkeypatch.setattr(view, "wait", lambda: done.wait(0.3))
         result = run("view", *arguments)
         assert result.code == 0, result.err
         return result, opened, sites[0]

@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _fail(_OUT_OF_MEMORY, 2)
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
+        where = f"{_locked_folder(error) or error.filename}: " if error.filename else ""
         remedy = _REMEDIES.get(error.errno or 0)
         return _fail(f"{where}{error.strerror or error}{f'; {remedy}' if remedy else ''}", 2)
 
@@ -153,6 +153,13 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
     """Whether torch ran out of memory; it has an exception class for GPU memory only."""
     text = str(error)
     return any(part in text for part in ("out of memory", "not enough memory", "allocate memory"))
+
+
+def _locked_folder(error: OSError) -> str | None:
+    """The folder that cannot be entered, if this is why a file cannot be found in it."""
+    folder = os.path.dirname(str(error.filename)) or "."
+    locked = isinstance(error, PermissionError) and not os.access(folder, os.X_OK)
+    return folder if locked else None
 
 
 def _fail(message: str, code: int) -> int:

@@ -28,10 +28,7 @@ _FLAGS = {
     "--antialias": "rasterize-mode",
     "--background": "random-bkgd background-color",
     "--init": "init-type random-init",
-    "--initial-points": "init-num-pts num-random",
     "--view": "vis viewer",
-    "--port": "websocket-port",
-    "--host": "websocket-host",
     "--ssim-weight": "ssim-lambda",
     "--grad-threshold": "grow-grad2d densify-grad-thresh",
     "--abs-grad": "absgrad use-absgrad",
@@ -47,7 +44,6 @@ _FLAGS = {
     "--lr-opacity-logits": "opacities-lr",
     "--lr-sh-dc": "sh0-lr",
     "--lr-sh-rest": "shN-lr",
-    "--lpips": "lpips-net",
 }
 _INPUTS = ["data", "data-dir", "ckpt", "load-config", "input"]
 
