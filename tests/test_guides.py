@@ -166,8 +166,17 @@ OTHERS = {
         "--max_steps",
         "--save_ply",
         "--strategy",
+        "--app_opt",
+        "--no-normalize-world-space",
+        "--pose_opt",
     },
-    "docs/guides/nerfstudio.md": {"--ply-color-mode"},
+    "docs/guides/nerfstudio.md": {
+        "--downscale-factor",
+        "--max-num-iterations",
+        "--output-dir",
+        "--pipeline",
+        "--ply-color-mode",
+    },
 }
 
 

@@ -190,7 +190,8 @@ def test_errors_of_the_system_and_warnings_are_one_line(replace_run, run):
     assert result.err.splitlines() == [
         "snowsplat: warning: something odd",
         "snowsplat: took the larger one",
-        "snowsplat: out/scene.ply: No space left on device",
+        "snowsplat: out/scene.ply: No space left on device; "
+        "free some space, or write the result to another disk",
     ]
 
     def interrupted(self):

@@ -143,6 +143,22 @@ def test_a_dataset_that_has_moved(run, refused, trained, dataset, tmp_path):
     assert run("evaluate", moved, "-s", dataset).code == 0
 
 
+def test_a_scene_file_on_the_photos_of_a_dataset(run, refused, trained, dataset, tmp_path):
+    """The result folder of gsplat is such a file, too."""
+    (tmp_path / "ply").mkdir()
+    for name in ("scene.ply", "ply/point_cloud_99.ply", "ply/point_cloud_100.ply"):
+        shutil.copy(trained / "point_cloud/iteration_60/point_cloud.ply", tmp_path / name)
+    assert "set --dataset" in refused("evaluate", tmp_path / "scene.ply")
+    assert "is a file" in refused("watch", tmp_path / "scene.ply")
+    assert run("evaluate", tmp_path / "scene.ply", "--dataset", dataset).code == 0
+    assert run("render", tmp_path, "--dataset", dataset, "--split", "test").code == 0
+    ours = json.loads((trained / "metrics.json").read_text())
+    theirs = json.loads((tmp_path / "scene_views/metrics.json").read_text())
+    assert theirs["views"] == ours["views"]
+    assert any((tmp_path / "ply/point_cloud_100_views/test/ours_0/renders").iterdir())
+    assert "point_cloud_100.ply" in run("info", tmp_path).out
+
+
 def test_errors(refused, trained, tmp_path):
     assert "no such folder" in refused("render", tmp_path / "absent")
     assert "not the output folder" in refused("evaluate", tmp_path)

@@ -181,13 +181,14 @@ def test_kill_9_and_resume_give_the_same_scene(run, start, dataset, tmp_path):
     assert (killed / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
 
 
-def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_saves_and_resumes(run, start, dataset, tmp_path, number):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     process = start("train", dataset, "-o", stopped, "--iterations", 100_000, "--threads", 1)
     deadline = time.monotonic() + 60
     while "step" not in (process.stdout.readline() if process.poll() is None else "step"):
         assert time.monotonic() < deadline
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, (out, err)
     assert err == ""
@@ -218,7 +219,7 @@ def test_a_second_ctrl_c_saves_no_incomplete_step(run, dataset, tmp_path, monkey
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_optimize", press_twice)
         result = run("train", dataset, "-o", stopped, *flags)
-    assert (result.code, result.err) == (130, "snowsplat: stopped by Ctrl-C\n")
+    assert (result.code, result.err) == (130, "snowsplat: stopped\n")
     newest = stopped / "checkpoints/step_000020.safetensors"
     assert f"not saved; the last good checkpoint is {newest};" in result.out
     assert checkpoint.files(stopped / "checkpoints")[0] == (20, newest)

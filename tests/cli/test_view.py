@@ -7,14 +7,13 @@ import threading
 import urllib.request
 import webbrowser
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from snowsplat.cli import view
 from snowsplat.cli.main import main
+from snowsplat.cli.page_flags import for_other_computers
 from snowsplat.formats import read_gaussians, write_gaussians
 
 from ..browser import Browser
@@ -82,8 +81,7 @@ def served(run, monkeypatch):
         site = viewing.site
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
         monkeypatch.setattr(viewing, "site", lambda *a: (sites.append(a), site(*a))[1])
-        interrupted = SimpleNamespace(wait=lambda _: done.wait(0.3) or True)
-        monkeypatch.setattr(view, "interrupts", lambda: nullcontext(interrupted))
+        monkeypatch.setattr(view, "wait", lambda: done.wait(0.3))
         result = run("view", *arguments)
         assert result.code == 0, result.err
         return result, opened, sites[0]
@@ -104,6 +102,18 @@ def test_over_ssh_it_prints_the_port_forwarding_command(served, out):
     assert f"ssh -L {port}:127.0.0.1:{port} " in result.out
     assert not opened
     assert "ssh" not in served(out)[0].out
+
+
+def test_a_user_without_a_name_can_forward_a_port(monkeypatch):
+    """In a container, a user may have a number only."""
+
+    def unknown() -> str:
+        raise KeyError("getpwuid(): uid not found: 4242")
+
+    monkeypatch.setattr("getpass.getuser", unknown)
+    monkeypatch.setenv("SSH_CONNECTION", "1")
+    (line,) = for_other_computers("http://127.0.0.1:81/", [])
+    assert line.startswith("from your computer: ssh -L 81:127.0.0.1:81 USER@")
 
 
 def test_with_a_public_host_it_prints_the_address_for_other_computers(served, out):

@@ -438,3 +438,10 @@ def test_wrong_shapes_name_the_argument(name: str) -> None:
     with pytest.raises(ValueError, match=f"^rasterization: {name} must be ") as caught:
         given.rendered()
     assert one_line(caught.value)
+
+
+def test_one_camera_needs_a_dimension_too() -> None:
+    given = inputs()
+    given.viewmats, given.Ks = given.viewmats[0], given.Ks[0]
+    with pytest.raises(ValueError, match=r"viewmats must be \('C', 4, 4\), .*: viewmats\[None\]"):
+        given.rendered()

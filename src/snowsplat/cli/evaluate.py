@@ -23,6 +23,7 @@ class Evaluate(SceneFlags, Reports):
       snowsplat evaluate out/garden
       snowsplat evaluate out/garden --split train
       snowsplat evaluate out/garden --lpips vgg
+      snowsplat evaluate splat.ply --dataset garden
 
     Notes:
       The metrics of each view and their means are printed, and written to
@@ -81,8 +82,10 @@ class Evaluate(SceneFlags, Reports):
             print("LPIPS was not measured; to measure it: --lpips vgg")
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
-        print(f"iteration {scene.iteration}, {which}: {where}")
+        step = f"iteration {scene.iteration}, " if scene.iteration else ""  # a file has none
+        print(f"{step}{which}: {where}")
         out = self.output_path()
-        print(next_step("to see the renders", "render", out, "--split", self.split))
+        photos = [] if self.dataset is None else ["--dataset", self.dataset]
+        print(next_step("to see the renders", "render", out, *photos, "--split", self.split))
         about = {"folder": out, "iteration": scene.iteration, "split": self.split}
         return about | {"size": evaluation.size, **evaluation.as_json()}

@@ -1,8 +1,8 @@
 """Invalid flags as one line: the flag, its value, and what is allowed.
 
-tyro parses the flags. If it rejects them, the arguments are examined here: an unknown flag gets the
-most similar one as a suggestion, and an invalid value is explained as it is in Python, with the
-declaration of the setting.
+tyro parses the flags. If it rejects them, the arguments are examined here: flags of other trainers
+are translated, another unknown flag gets the most similar one as a suggestion, and an invalid value
+is explained as it is in Python, with the declaration of the setting.
 """
 
 from __future__ import annotations
@@ -15,8 +15,11 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
+from snowsplat.cli import other_trainers
+from snowsplat.cli.subcommands import SUBCOMMANDS
 from snowsplat.training.settings.declare import Setting, allowed, kinds_of, shown
 from snowsplat.training.settings.declare import suggestion as similar
+from snowsplat.training.settings.recipes import RECIPES
 from snowsplat.util.safe_json import printable
 
 _FLAG = re.compile(r"-[^\d.]")
@@ -30,7 +33,16 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         kind: the dataclass of the subcommand.
         message: what tyro has printed; it is used if the arguments do not show the reason.
     """
-    flags = spellings(kind)
+    flags, subcommand = spellings(kind), kind.__name__.lower()
+    names = [each.partition("=")[0] for each in arguments if _FLAG.match(each)]
+    unknown = {name: name.replace("_", "-") for name in names}
+    advised = {
+        name: other_trainers.advice(subcommand, spelling, flags)
+        for name, spelling in unknown.items()
+        if spelling not in flags
+    }
+    if told := [f"{printable(name)}: {use}" for name, use in advised.items() if use]:
+        return "; ".join(told)
     for number, argument in enumerate(arguments):
         if not _FLAG.match(argument):
             continue
@@ -53,6 +65,12 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         for text in texts:
             if not any(_is_of(text, each) for each in kinds):
                 return f"{spelling}: {shown(text)} is not valid; use {allowed(hint, declared)}"
+    if extra := re.search(r"Unrecognized options: (.*)", message):
+        usage = SUBCOMMANDS[subcommand].usage
+        what = f"{printable(extra[1].strip(_FRAME))}: too many names"
+        recipe = next((each for each in arguments if each in RECIPES), None)
+        advice = f"; use --recipe {recipe}" if recipe else ""
+        return f"{what}{advice}; snowsplat {subcommand} {usage}"
     lines = [line.strip(_FRAME) for line in message.splitlines()[1:]]
     end = lines.index("") if "" in lines else len(lines)
     return " ".join(lines[:end]).rstrip(".") or "invalid flags"

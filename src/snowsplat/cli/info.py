@@ -56,12 +56,15 @@ class Info:
             print(json.dumps(facts, indent=2))
         else:
             _print(facts)
-            print("\n".join(_next(facts["kind"], self.path)))
+            print("\n".join(_next(facts, self.path)))
         return 0
 
 
-def _next(kind: str, path: Path) -> list[str]:
+def _next(facts: dict[str, Any], path: Path) -> list[str]:
     """What to do with what was described."""
+    kind = facts["kind"]
+    if facts.get("scenes") == []:
+        return [next_step("to continue", "train", "-o", path, "--resume")]
     if kind in ("scene", "output folder"):
         return [see_and_share(path)]
     if kind in ("photos", "video"):

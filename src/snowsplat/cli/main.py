@@ -1,11 +1,12 @@
 """The command `snowsplat`: selects the subcommand, runs it, and reports errors.
 
 Exit codes: 0 success; 2 an error in the flags or the input, reported as one line on stderr;
-130 interrupted by Ctrl-C, with all finished results saved; 141 the reader of the output has closed
-it. Any other failure is a defect of the program and shows a traceback.
+130 stopped by Ctrl-C, SIGTERM or SIGHUP, with all finished results saved; 141 the reader of the
+output has closed it. Any other failure is a defect of the program and shows a traceback.
 """
 
 import difflib
+import errno
 import inspect
 import io
 import logging
@@ -28,11 +29,17 @@ from snowsplat.cli.reports import run
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.safe_json import printable
 
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
 
+_REMEDIES = {
+    errno.EACCES: "check the owner and the permissions, or use another folder",
+    errno.EROFS: "write the result to another folder",
+    errno.ENOSPC: "free some space, or write the result to another disk",
+}
 _OUT_OF_MEMORY = (
     "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
 )
@@ -55,13 +62,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(overview())
         return 0
     try:
-        return run(parse(arguments))
+        with ended_by_signals():
+            return run(parse(arguments))
     except SettingError as error:
         return _fail(with_flags(f"`{error.setting}`: {error.problem}"), 2)
     except UserError as error:
         return _fail(with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        return _fail("stopped by Ctrl-C", 130)
+        return _fail("stopped", 130)
     except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141  # 128 + SIGPIPE, as for other programs: the run is not complete
@@ -72,8 +80,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _fail(_OUT_OF_MEMORY, 2)
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}", 2)
+        where = f"{_locked_folder(error) or error.filename}: " if error.filename else ""
+        remedy = _REMEDIES.get(error.errno or 0)
+        return _fail(f"{where}{error.strerror or error}{f'; {remedy}' if remedy else ''}", 2)
 
 
 def parse(arguments: Sequence[str]) -> Any:
@@ -144,6 +153,13 @@ def _is_out_of_memory(error: RuntimeError) -> bool:
     """Whether torch ran out of memory; it has an exception class for GPU memory only."""
     text = str(error)
     return any(part in text for part in ("out of memory", "not enough memory", "allocate memory"))
+
+
+def _locked_folder(error: OSError) -> str | None:
+    """The folder that cannot be entered, if this is why a file cannot be found in it."""
+    folder = os.path.dirname(str(error.filename)) or "."
+    locked = isinstance(error, PermissionError) and not os.access(folder, os.X_OK)
+    return folder if locked else None
 
 
 def _fail(message: str, code: int) -> int:

@@ -57,4 +57,8 @@ def over_ssh() -> bool:
 
 def _forwarding(port: int | None) -> str:
     """The command that forwards a port of this machine to the computer of the user."""
-    return f"ssh -L {port}:{LOCAL_HOST}:{port} {getpass.getuser()}@{socket.gethostname()}"
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # in containers, a user may have a number only
+        user = "USER"
+    return f"ssh -L {port}:{LOCAL_HOST}:{port} {user}@{socket.gethostname()}"

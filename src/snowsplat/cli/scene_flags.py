@@ -21,7 +21,8 @@ class SceneFlags:
     """The base class of these subcommands."""
 
     output: Annotated[Path | None, tyro.conf.Positional, flag("OUT")] = None
-    """Output folder of snowsplat train or make, or of the reference implementation."""
+    """Output folder of snowsplat train or make, or of the reference implementation. With --dataset,
+    it may be a scene file of any program, in the world of that dataset."""
     model_path: Annotated[Path | None, flag("OUT", "-m", "-o")] = None
     """The same as OUT. This is the flag of the reference implementation."""
     iteration: Annotated[int | None, flag("N", default="the last step")] = None

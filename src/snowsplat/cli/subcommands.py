@@ -57,8 +57,9 @@ _WORDS = {
     "use convert": "edit crop merge compress decimate transform resize rotate scale",
     "use view": "show open play viewer serve gui display",
     "use make": "reconstruct splat build create scan run process new start",
-    "use sfm": "colmap poses cameras match dataset",
-    "use train": "fit optimize optimise resume continue",
+    "use sfm": "colmap poses cameras match dataset process-data convert.py",
+    "use train": "fit optimize optimise resume continue simple_trainer splatfacto gsplat",
+    "use benchmark": "full_eval",
     "use evaluate": "metrics test eval psnr score compare",
     "use render": "video movie film images",
     "use clean": "prune filter floaters",
@@ -70,8 +71,9 @@ _WORDS = {
 
 def advice(word: str) -> str | None:
     """What to use for a word that is no subcommand, such as "export"; None if it is not known."""
-    word = word.lower()
-    return next((hint for hint, words in _WORDS.items() if word in words.split()), None)
+    word = word.lower().removeprefix("ns-")
+    names = (word, word.removesuffix(".py"))
+    return next((hint for n in names for hint, words in _WORDS.items() if n in words.split()), None)
 
 
 def overview() -> str:

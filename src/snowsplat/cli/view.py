@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
+import time
 import webbrowser
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -64,7 +63,7 @@ class View:
         with (
             TerminalObserver() as observer,
             viewed_scene(self.path, self.iteration, observer) as scene,
-            interrupts() as interrupted,
+            suppress(KeyboardInterrupt),
             StaticServer(
                 scene.files, scene.headers, self.host, self.port, self.allow_host
             ) as server,
@@ -76,8 +75,7 @@ class View:
                 print(line, flush=True)
             if not self.no_browser and has_screen():
                 open_browser(server.url)
-            while not interrupted.wait(1.0):  # on Windows Ctrl-C arrives only between two waits
-                pass
+            wait()
         return 0
 
 
@@ -93,14 +91,7 @@ def open_browser(url: str) -> None:
     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
-@contextmanager
-def interrupts() -> Iterator[threading.Event]:
-    """An event that is set by Ctrl-C or SIGTERM, which do not end the process meanwhile."""
-    interrupted = threading.Event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
-    try:
-        yield interrupted
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
+def wait() -> None:
+    """Wait for Ctrl-C, which arrives only between two waits on Windows."""
+    while True:
+        time.sleep(1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -13,6 +15,8 @@ from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
 
+logger = logging.getLogger(__name__)
+
 Split = Literal["test", "train"]
 
 
@@ -23,7 +27,7 @@ def evaluate(
     lpips: Lpips | Path | str | None = None,
     on_view: Callable[[ViewMetrics], None] | None = None,
 ) -> Evaluation:
-    """Compare the renderings of a scene with its photos; write OUT/metrics.json.
+    """Compare the renderings of a scene with its photos; write OUT/metrics.json, if possible.
 
         evaluate(load_trained("out/garden")).psnr
 
@@ -37,7 +41,8 @@ def evaluate(
 
     Raises:
         UserError: there are no photos in this split, or a photo or the weights file is damaged.
-        OSError: metrics.json cannot be written.
+        OSError: metrics.json cannot be written, for another reason than a folder or disk in which
+            nothing can be written.
     """
     views = views_of(scene, split)
     if isinstance(lpips, Path | str):
@@ -46,7 +51,12 @@ def evaluate(
         evaluation = evaluate_views(
             scene.gaussians, views, background=scene.background, lpips=lpips, on_view=on_view
         )
-    scene.folder.write_metrics(scene.iteration, split, evaluation)
+    try:
+        scene.folder.write_metrics(scene.iteration, split, evaluation)
+    except OSError as error:  # the folder may be of somebody else; the figures are returned
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC):
+            raise
+        logger.warning("metrics.json was not written: %s", error)
     return evaluation
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,6 +41,7 @@ from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.stored import config_from_json
+from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 from snowsplat.util.run_lock import one_run
@@ -47,6 +49,7 @@ from snowsplat.util.run_lock import one_run
 logger = logging.getLogger(__name__)
 
 # Settings that may be changed when a training run is resumed.
+_BYTES_IN_FILE = 248  # of a Gaussian of SH degree 3: 62 float32
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 
@@ -376,6 +379,12 @@ class _Job:
         memory: MemoryUse,
     ) -> TrainResult:
         self.observer.note(f"training on {device_name(self.device)}; {memory}")
+        most = _BYTES_IN_FILE * (memory.plan.limit or len(trainer.gaussians))
+        if (free := shutil.disk_usage(self.out.path).free) < most:
+            what = f"only {format_bytes(free)} are free on the disk"
+            self.observer.note(
+                f"{what}, and the scene may need {format_bytes(most)}: free some space"
+            )
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(
             self.out,

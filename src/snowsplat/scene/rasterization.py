@@ -128,6 +128,9 @@ def rasterization(
         rasterize_mode,
     )
     *batch, n, _ = means.shape
+    if viewmats.dim() != len(batch) + 3:
+        what = f"viewmats must be {(*batch, 'C', 4, 4)}, got {tuple(viewmats.shape)}"
+        raise ValueError(f"rasterization: {what}; for one camera, C is 1: viewmats[None]")
     of_views = (*batch, *viewmats.shape[-3:-2])
     row: tuple[int, ...] = colors.shape[-1:] if sh_degree is None else colors.shape[-2:]
     per_camera = colors.dim() - len(row) == len(batch) + 2

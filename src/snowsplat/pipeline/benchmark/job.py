@@ -30,6 +30,7 @@ from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
+from snowsplat.util.interrupts import ended_by_signals, ended_together
 from snowsplat.util.machine import processor_name
 from snowsplat.util.process_memory import peak_bytes
 from snowsplat.util.run_lock import InUse, locked
@@ -109,7 +110,10 @@ def run(job: Job, device: str | None, threads: int | None) -> None:
     command = [sys.executable, "-m", "snowsplat.pipeline.benchmark.job"]
     pipe = subprocess.PIPE
     # The encoding of the streams may differ from that of the locale (PYTHONIOENCODING).
-    with subprocess.Popen(command, stdin=pipe, stderr=pipe, text=True, errors="replace") as process:
+    with (
+        subprocess.Popen(command, stdin=pipe, stderr=pipe, text=True, errors="replace") as process,
+        ended_together(process),
+    ):
         assert process.stdin is not None
         assert process.stderr is not None
         process.stdin.write(request + "\n")
@@ -201,7 +205,8 @@ def main() -> int:
     try:
         with locked(Path(f"{job.output}.lock"), f"{job.scene}: in use by", _WAIT_SECONDS):
             if SceneResult.read(job) is None:
-                work(job, request["device"], request["threads"])
+                with ended_by_signals():
+                    work(job, request["device"], request["threads"])
     except InUse as error:
         print(error, file=sys.stderr)
         return TAKEN

@@ -288,6 +288,13 @@ class OutputFolder:
     def scene_path(self, iteration: int) -> Path:
         return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
+    def without_scene(self) -> UserError:
+        """The error that this folder has no scene."""
+        what = "contains no scene (no point_cloud/iteration_N in it)"
+        if any(self.checkpoints.glob("step_*.safetensors")):
+            what = "contains no scene yet, but checkpoints; show it with watch, or continue it"
+        return UserError(f"{self.path}: {what}")
+
     def write_scene(self, iteration: int, gaussians: Gaussians) -> Path:
         """Save the scene; returns the file."""
         from snowsplat.formats import write_gaussians
@@ -305,13 +312,9 @@ class OutputFolder:
         """
         from snowsplat.formats import read_gaussians
 
-        if not self.path.is_dir():
-            raise UserError(
-                f"{self.path}: no such folder; give the output folder of a training run"
-            )
         scenes = self.scenes()
         if not scenes:
-            raise UserError(f"{self.path}: contains no scene (no point_cloud/iteration_N in it)")
+            raise self.without_scene()
         chosen = scenes[-1] if iteration in (None, -1) else iteration
         if chosen not in scenes:
             there = ", ".join(map(str, scenes))
@@ -331,6 +334,7 @@ class OutputFolder:
         ``left_out``: names of the photos that the training has left out, for the list "left_out";
         None: the list of the existing file is kept.
         """
+        self.path.mkdir(parents=True, exist_ok=True)
         path = self.path / "metrics.json"
         names = _left_out_in(path) if left_out is None else list(left_out)
         head: dict[str, Any] = {"iteration": iteration, "split": split}

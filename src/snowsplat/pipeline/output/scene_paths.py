@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import filecmp
+import re
 from pathlib import Path
 
 from snowsplat.formats.lod import INDEX
@@ -17,12 +18,14 @@ from snowsplat.util.safe_json import read_json
 #: The record of `make` in its folder. "title": the name of the scene for people; "file": its file.
 RECORD = "make.json"
 _HEAD_BYTES = 16_384
+_STEP = re.compile(r"_(\d+)")  # in the names of files of gsplat
 
 
 def existing_folder(path: Path) -> OutputFolder:
     """The same as `training_folder`. Raises: UserError: ``path`` is not a folder."""
     if not path.is_dir():
-        raise UserError(f"{path}: no such folder; give the output folder of a training run")
+        what = "is a file" if path.is_file() else "no such folder"
+        raise UserError(f"{path}: {what}; give the output folder of a training run")
     return training_folder(path)
 
 
@@ -33,8 +36,8 @@ def training_folder(path: Path) -> OutputFolder:
 
 
 def index_in(folder: Path) -> Path | None:
-    """The file that describes the scene of which ``folder`` consists: `lod-meta.json`, or the
-    `meta.json` of SOG; None if there is none."""
+    """The file that describes the scene of which ``folder`` consists: `lod-meta.json`, the
+    `meta.json` of SOG, or the newest scene of a training of gsplat; None if there is none."""
     if (folder / INDEX).is_file():
         return folder / INDEX
     sog = folder / META
@@ -42,7 +45,11 @@ def index_in(folder: Path) -> Path | None:
         with open(sog, "rb") as file:
             if is_sog(file.read(_HEAD_BYTES)):
                 return sog
-    return None
+    if any((folder / name).exists() for name in ("point_cloud", "sparse", "transforms.json")):
+        return None  # a training of other programs, or a dataset
+    theirs = [*folder.glob("ply/point_cloud_*.ply"), *folder.glob("ckpts/ckpt_*_rank0.pt")]
+    steps = {path: int(match[1]) for path in theirs if (match := _STEP.search(path.name))}
+    return max(steps, key=steps.__getitem__, default=None)
 
 
 def scene_file(path: Path) -> Path:
@@ -61,7 +68,7 @@ def scene_file(path: Path) -> Path:
     folder = training_folder(path)
     scenes = folder.scenes()
     if not scenes:
-        raise UserError(f"{path}: contains no scene (no point_cloud/iteration_N in it)")
+        raise folder.without_scene()
     return folder.scene_path(scenes[-1])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from snowsplat.data import Dataset
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.output.scene_paths import (
     existing_folder,
     file_of_make,
@@ -31,7 +31,7 @@ class TrainedScene:
     """A scene in the output folder of its training, with its dataset.
 
     Attributes:
-        iteration: the step after which it was saved.
+        iteration: the step after which it was saved; 0 for a file.
         gaussians: on the device that was requested, with the origin of the dataset.
         dataset: its photos and cameras, split as in the training.
         background: red, green, blue in 0..1.
@@ -54,6 +54,10 @@ def load_trained(
 ) -> TrainedScene:
     """Load a scene from the output folder of `train`, `make` or the reference implementation.
 
+    A scene file of any program, or the result folder of gsplat, is loaded if ``dataset`` is given.
+    Its world must be that of the dataset. The test split of the dataset, or every 8th photo, is
+    held out, the background is black, and results are written to the folder NAME_views beside it.
+
     Args:
         iteration: the iteration to load; default: the last one.
         dataset: the folder of the dataset, if it was moved after the training.
@@ -63,9 +67,17 @@ def load_trained(
     Raises:
         UserError: scene, settings or dataset are missing or damaged; an unusable device.
     """
-    folder = existing_folder(Path(output))
-    data, background = load_dataset_of(folder, dataset, resolution)
-    found, gaussians = folder.read_scene(iteration)
+    file = index_in(Path(output)) or Path(output)
+    if file.is_file():
+        if dataset is None:
+            raise UserError(f"{file}: a scene file does not name its photos; set `dataset`")
+        settings = DatasetSettings(str(dataset), resolution=resolution or -1, hold_out=8)
+        folder, background = OutputFolder(file.with_name(f"{file.stem}_views")), (0.0, 0.0, 0.0)
+        data, found, gaussians = settings.load(), 0, read_gaussians(file)
+    else:
+        folder = existing_folder(Path(output))
+        data, background = load_dataset_of(folder, dataset, resolution)
+        found, gaussians = folder.read_scene(iteration)
     gaussians = seen_from_dataset(gaussians, data.origin).to((compute or Compute()).apply())
     return TrainedScene(folder, found, gaussians, data, background)
 

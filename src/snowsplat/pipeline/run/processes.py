@@ -24,6 +24,7 @@ from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.interrupts import ended_together, interrupts_between_steps
 
 if TYPE_CHECKING:
     import torch
@@ -183,6 +184,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
             process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=output, stderr=error
             )
+            files.enter_context(ended_together(process))
             running.append(files.enter_context(process))
         try:
             failed = _wait(running)
@@ -198,11 +200,9 @@ def _wait(running: Sequence[subprocess.Popen[bytes]]) -> int | None:
 
     Returns the first process that has failed, except for those that lost the connection to it.
     """
-    # Ctrl-C reaches the processes, too. They save the scene and end.
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     deadline = math.inf
     failed: int | None = None
-    try:
+    with interrupts_between_steps():  # they reach the processes, too, which save the scene and end
         while True:
             codes = [process.poll() for process in running]
             if any(codes):
@@ -213,8 +213,6 @@ def _wait(running: Sequence[subprocess.Popen[bytes]]) -> int | None:
             if None not in codes or time.monotonic() > deadline:
                 return failed
             time.sleep(0.05)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _exit_code(

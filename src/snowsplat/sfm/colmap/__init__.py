@@ -5,6 +5,7 @@
 """
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.interrupts import handle_again
 
 try:
     from snowsplat.sfm.colmap.child import estimate_poses
@@ -17,5 +18,6 @@ except ModuleNotFoundError as error:
         "pycolmap is not installed, and PyPI may have no package for this computer; build it "
         "from the sources of COLMAP 4.2, or make the dataset on another computer; train needs none"
     ) from None
+handle_again()
 
 __all__ = ["SfmOptions", "SfmResult", "describe_model", "estimate_poses"]

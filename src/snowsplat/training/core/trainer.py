@@ -16,7 +16,8 @@ from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.regularizers import add_regularizers
 from snowsplat.training.core.run import Run
 from snowsplat.training.core.view_gradient import ViewGradient
-from snowsplat.util.process import interrupts_between_steps, single_threaded
+from snowsplat.util.interrupts import interrupts_between_steps
+from snowsplat.util.process import single_threaded
 
 
 class Trainer(Run):

@@ -6,7 +6,7 @@ import math
 import time
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.util.process import raise_deferred_interrupt
+from snowsplat.util.interrupts import raise_deferred_interrupt
 from snowsplat.viewer.live.controls import TrainingPanel
 from snowsplat.viewer.live.curves import Curve, SampledPsnr
 from snowsplat.viewer.live.viewer import NetworkViewer
