@@ -51,7 +51,7 @@ def test_render_antialiased(run, trained, tmp_path):
     renders = trained / "test/ours_60/renders/00000.png"
     images = {}
     for flags in ((), ("--antialias", "on"), ("--antialias", "off")):
-        assert run("render", trained, "--split", "test", *flags).code == 0
+        assert run("render", trained, "--split", "test", "-r", 2, *flags).code == 0
         images[flags] = image(renders)
     assert np.array_equal(images[()], images["--antialias", "on"])
     assert np.abs(images[()] - images["--antialias", "off"]).max() > 10
@@ -63,7 +63,7 @@ def test_render_antialiased(run, trained, tmp_path):
     assert gaussians.antialiased
     gaussians.antialiased = False
     write_gaussians(scene, gaussians)
-    assert run("render", unmarked, "--split", "test").code == 0
+    assert run("render", unmarked, "--split", "test", "-r", 2).code == 0
     again = image(unmarked / "test/ours_60/renders/00000.png")
     assert np.array_equal(again, images["--antialias", "off"])
     assert not json.loads(run("info", scene, "--json").out)["antialiased"]
