@@ -179,15 +179,6 @@ def test_only_depths_that_another_map_confirms_are_used(dataset: Dataset) -> Non
     assert float(confirmed[2][32:].float().mean()) > 0.5
 
 
-@pytest.mark.parametrize(("depth", "confirmed"), [(3.0, False), (3.9, True), (5.0, True)])
-def test_free_space_contradicts_and_a_hidden_point_does_not(depth: float, confirmed: bool) -> None:
-    """Two maps agree on this depth, and the other two source views show a surface at 4."""
-    pose = torch.eye(4, dtype=torch.float64)[:3]
-    camera = Camera(8, 6, 8.0, 8.0, 4.0, 3.0, pose)
-    maps = [DepthMap(camera, torch.full((6, 8), 1.0 / z)) for z in (depth, depth, 4.0, 4.0)]
-    assert bool(consistent(maps, [[1, 2, 3], [0], [], []])[0].all()) == confirmed
-
-
 def test_points_of_a_map() -> None:
     pose = torch.eye(4, dtype=torch.float64)[:3]
     pose[:, 3] = -50.0

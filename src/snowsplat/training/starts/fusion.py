@@ -17,8 +17,6 @@ from snowsplat.training.starts.photos import reduced_photo
 
 #: Two inverse depths of one point agree if they differ by at most this share.
 _TOLERANCE = 0.02
-#: A point is in front of a surface if it is nearer by more than this share.
-_IN_FRONT = 0.06
 #: This number of pixels per resulting point is used.
 _PIXELS_PER_POINT = 16
 #: Number of steps in the search for the voxel size.
@@ -54,13 +52,10 @@ def fused_points(
 
 
 def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]) -> list[Tensor]:
-    """For each map, (H, W) bool: the pixels whose depth the maps of source views confirm.
+    """For each map, (H, W) bool: the pixels whose depth the map of a source view confirms.
 
-    A source view confirms a point that has the depth of its map (geometric consistency, Schönberger
-    et al. 2016). It contradicts a point in front of the surface that it sees there, in space that
-    must be free (Merrell et al. 2007). More source views must confirm than contradict: two maps may
-    agree on a wrong match, where textures repeat. A source view in which the point is hidden says
-    nothing.
+    A depth is confirmed if its point, projected into the source view, has the depth of the map
+    there (geometric consistency, Schönberger et al. 2016).
     """
     confirmed = []
     for depth_map, chosen in zip(maps, sources, strict=True):
@@ -69,25 +64,23 @@ def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]
             continue
         known = depth_map.inverse_depth > 0.0
         points = depth_map.points(known)
-        for_, against = torch.zeros(2, len(points), dtype=torch.int32)
+        agrees = torch.zeros(len(points), dtype=torch.bool)
         for j in chosen:
-            if (other := maps[j]) is not None:
-                ratio = _relative_depths(points, other)
-                for_ += (ratio - 1.0).abs() <= _TOLERANCE
-                against += ratio < 1.0 - _IN_FRONT
-        stable = (for_ > 0) & (for_ > against)
-        confirmed.append(known.clone().masked_scatter_(known, stable))
+            other = maps[j]
+            if other is not None:
+                agrees |= _agrees(points, other)
+        confirmed.append(known.clone().masked_scatter_(known, agrees))
     return confirmed
 
 
-def _relative_depths(points: Tensor, depth_map: DepthMap) -> Tensor:
-    """(P,): the depth of each point, relative to that of the map at its pixel; NaN: not known."""
+def _agrees(points: Tensor, depth_map: DepthMap) -> Tensor:
+    """(P,) bool: whether the depth of each point is that of the map at its pixel."""
     camera = depth_map.camera
     pixel, depth = camera.project(points)
     x, y = pixel.nan_to_num(-1.0).clamp(-1.0, 1e6).floor().to(torch.int64).unbind(1)
     inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     found = depth_map.inverse_depth[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
-    return torch.where(inside & (found > 0), found * depth, torch.nan)
+    return inside & (found > 0) & ((found * depth - 1.0).abs() <= _TOLERANCE)
 
 
 def thinned(points: Tensor, colors: Tensor, widths: Tensor, count: int) -> Points:
