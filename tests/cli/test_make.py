@@ -28,7 +28,7 @@ from snowsplat.util.stages import Stages
 from ..fork_server import popen
 from ..sfm.colmap import scenes
 
-#: With few passes, there are a quarter more steps.
+#: With few passes, there are up to half more steps.
 QUICK = replace(PRESETS["draft"], iterations=120)
 #: The command as a separate process, with the same short training and frequent checkpoints.
 PROGRAM = """

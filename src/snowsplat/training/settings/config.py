@@ -24,7 +24,7 @@ _SEED_LIMIT = 2**61
 
 #: What is added to the two moments of `TrainConfig.coarse_to_fine` if each photo is used a few
 #: times only, and the share of further steps.
-_COARSER, _LONGER = (0.05, 0.1), 0.25
+_COARSER, _LONGER = (0.05, 0.1), 0.5
 
 
 @dataclass(frozen=True)
@@ -240,8 +240,8 @@ class TrainConfig(Settings):
     few_passes: float = setting(
         0.0,
         "With fewer passes over the photos than this, images are reduced for longer, and a recipe "
-        "has more steps, which take about the same time; with half as many or fewer, by 0.05 and "
-        "0.1 of all steps, and a quarter more steps. If `coarse_to_fine` is set, this is 0 unless "
+        "has more steps; with half as many or fewer, by 0.05 and 0.1 of all steps, and half more "
+        "steps. If `coarse_to_fine` is set, this is 0 unless "
         "it is set, too; 0: never.",
         least=0.0,
     )

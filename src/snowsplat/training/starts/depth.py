@@ -40,8 +40,8 @@ def depth_points(
     The maps may have any unit. Each of them is aligned to the points of the dataset that its photo
     shows: as z and as distance up to a factor, and as disparity up to a factor and a shift (Ranftl
     et al. 2022). The kind with the smallest error is used. If the dataset has no points, the values
-    must be z in units of ``View.depth_unit``. Pixels are used whose depth more maps of other views
-    confirm than contradict.
+    must be z in units of ``View.depth_unit``. Pixels are used whose depth the map of another view
+    confirms.
 
     Args:
         generator: a random generator on the CPU.
