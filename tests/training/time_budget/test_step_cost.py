@@ -47,6 +47,13 @@ def test_what_repeats_itself_is_expected_again():
     assert observed(*[1, 1, 1, 8, 1] * 4, 9000)[1] == pytest.approx(2.4, abs=0.3)
 
 
+def test_what_does_not_repeat_itself_any_more_is_expected_less():
+    usual, mean = observed(*[1, 1, 1, 8, 1] * 20, *[1] * 68)
+    assert usual == pytest.approx(1.0)
+    assert mean == pytest.approx(1.0 + 7 * 6 / 99)  # six times in the last 99 steps
+    assert mean < 1.0 + 7 * 20 / 168
+
+
 def test_a_machine_that_has_become_slow_is_noticed():
     assert observed(*[4] * 1000)[0] == pytest.approx(4.0, rel=0.01)
     assert observed(1, 4000, 4000)[0] == observed(1, 5, 5)[0] > 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -44,6 +45,9 @@ _INITIAL_WEIGHT, _INITIAL_STEPS = 0.3, 5
 #: contains something rare: a densification, or masks of what moves. If long steps follow each
 #: other, the machine has become slow; the time of each is limited to the second multiple.
 _LONG, _LONGEST = 3.0, 5.0
+#: How often something rare happens is known from the steps since this number of times before: there
+#: are no densifications in the last part of a training.
+_TIMES = 6
 
 
 @dataclass(frozen=True)
@@ -137,7 +141,8 @@ class StepCost:
         self._time_ratio = 1.0 if time_ratio is None else time_ratio
         self._initial = _INITIAL_WEIGHT * time_constant / self._time_ratio
         self._steps = 0
-        self._rare: list[float] = []  # what long steps took in addition
+        # The last long steps, and what they took in addition.
+        self._rare: deque[tuple[int, float]] = deque(maxlen=_TIMES + 1)
         self._long = False  # whether the last step was long
 
     def observe(self, seconds: float, downscale: int, gaussians: int) -> None:
@@ -150,7 +155,7 @@ class StepCost:
         expected = self.predict(downscale, gaussians)
         was_long, self._long = self._long, seconds > _LONG * expected
         if self._long and not was_long:
-            self._rare.append(seconds - expected)
+            self._rare.append((self._steps, seconds - expected))
             seconds = expected
         seconds = min(seconds, _LONGEST * expected)
         if downscale not in self._measured:
@@ -177,5 +182,9 @@ class StepCost:
         """
         rare = 0.0
         if len(self._rare) > 1:
-            rare = statistics.median_low(self._rare) * len(self._rare) / self._steps
+            usual = statistics.median_low(extra for _, extra in self._rare)
+            since, times = 0, len(self._rare)
+            if times > _TIMES:
+                since, times = self._rare[0][0], _TIMES
+            rare = usual * times / (self._steps - since)
         return sum(self.predict(*part) for part in parts) / len(parts) + rare
