@@ -73,7 +73,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     assert result.code == 0, result.err
     out = tmp_path / "Häuser am See_scene"
     scene = out / "Häuser am See.ply"
-    original = out / "scene/point_cloud/iteration_75/point_cloud.ply"
+    original = out / "scene/point_cloud/iteration_90/point_cloud.ply"
     assert scene.read_bytes() == original.read_bytes()
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert metrics["psnr"] > 12
@@ -88,7 +88,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
 
     facts = json.loads(run("info", out, "--json").out)
     assert facts["kind"] == "output folder"
-    assert facts["scenes"] == [75]
+    assert facts["scenes"] == [90]
     assert facts["last_scene"]["file"] == str(scene)
 
     # The same command again: all stages are skipped.
@@ -104,7 +104,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     again = run(*command)
     assert "pictures: repeated (its files are missing)" in again.out
     assert state(out).keys() == before.keys()
-    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_75/point_cloud.ply"]
+    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_90/point_cloud.ply"]
 
     # Another training setting: the cameras are kept.
     monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=20))
@@ -149,7 +149,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     monkeypatch.setattr(all_photos, "SHARE", 0.01)  # fewer than two steps for each photo
     assert "no last part with the held-out photos: it would use each" in run(*command).out
     before = (out / f"{dataset.name}.ply").read_bytes()
-    evaluated = OutputFolder(out / "scene").scene_path(50)
+    evaluated = OutputFolder(out / "scene").scene_path(60)
     assert before == evaluated.read_bytes()
 
     monkeypatch.setattr(all_photos, "SHARE", 1.0)
@@ -157,7 +157,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     result = run(*command, "--title", "A <title>")
     assert result.code == 0, result.err
     views = len(list((dataset / "images").iterdir()))
-    assert f"50 more steps with all {views} photos" in result.out
+    assert f"60 more steps with all {views} photos" in result.out
     assert f"before the last part, which has used all {views} photos" in result.out
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert f"PSNR {metrics['psnr']:.2f} dB" in result.out

@@ -18,6 +18,16 @@ from snowsplat.util.interrupts import (
 )
 
 
+@pytest.fixture(autouse=True)
+def _default_actions():
+    """Also if the tests were started with nohup: then SIGHUP is ignored, and in child processes."""
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, signal.SIG_DFL) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+
+
 def press() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
