@@ -78,7 +78,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert metrics["psnr"] > 12
     assert list(metrics["views"]) == [sorted(path.name for path in photos.iterdir())[4]]
-    made = files(out / "scene/test/ours_75")
+    made = files(out / "scene/test/ours_90")
     assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(1)}
     assert (out / "dataset/dataset_report.html").is_file()
     assert not (out / "scene/checkpoints").exists()
@@ -112,8 +112,8 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     assert again.code == 0, again.err
     assert "scene: repeated (changed: iterations)" in again.out
     assert again.out.count("done before") == 4
-    assert (out / "scene/test/ours_25").is_dir()
-    assert not (out / "scene/test/ours_75").exists()
+    assert (out / "scene/test/ours_30").is_dir()
+    assert not (out / "scene/test/ours_90").exists()
 
     # Other photos: the existing output is not replaced.
     fewer = tmp_path / "fewer"
