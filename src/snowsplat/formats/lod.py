@@ -164,9 +164,11 @@ def _number(value: Any, low: int, high: int = 1 << 40) -> int:
 
 
 def _file(path: Path, name: Any) -> Path:
-    if isinstance(name, str) and len(name) > _LONGEST_NAME:
-        raise ValueError
-    found = inside(path.parent, name) if isinstance(name, str) else None
+    found = None
+    if isinstance(name, str):
+        if len(name) > _LONGEST_NAME:
+            raise ValueError
+        found = inside(path.parent, name)
     if found is None:
         raise UserError(f"{path}: refers to a file outside of its folder ({quoted(name)})")
     return found

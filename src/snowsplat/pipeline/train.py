@@ -48,8 +48,9 @@ from snowsplat.util.run_lock import one_run
 
 logger = logging.getLogger(__name__)
 
+# Of a Gaussian of SH degree 3 in a PLY file: 62 float32.
+_BYTES_IN_FILE = 248
 # Settings that may be changed when a training run is resumed.
-_BYTES_IN_FILE = 248  # of a Gaussian of SH degree 3: 62 float32
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
 
 

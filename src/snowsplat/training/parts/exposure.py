@@ -76,9 +76,7 @@ class Exposure(Part):
         start = ExposureStart(torch.zeros(len(views), 3), None)
         if not run.resumed:
             start = run.shards.of_first(exposure_start(run.dataset, run.images) if first else None)
-        spread = start.spread if start.everywhere else None
-        learnt = spread is not None and spread >= LEAST_SPREAD
-        self.active = self._setting == "on" or learnt
+        self.active = self._setting == "on" or _differ(start)
         if not run.resumed:
             run.note(_reason(start, self.active))
         self.start = start.log_gains * self.active
@@ -179,9 +177,14 @@ def exposure_hint(run: Run) -> str | None:
     on the direction, which are wrong between the photos.
     """
     start = exposure_start(run.dataset, run.images)
-    if start.spread is None or start.spread < LEAST_SPREAD or not start.everywhere:
+    if not _differ(start):
         return None
     return f"exposure: {_found(start)}; exposure=auto learns one gain for each photo and channel"
+
+
+def _differ(start: ExposureStart) -> bool:
+    """Whether the photos differ as photos of other exposures do."""
+    return start.spread is not None and start.spread >= LEAST_SPREAD and start.everywhere
 
 
 def _found(start: ExposureStart) -> str:

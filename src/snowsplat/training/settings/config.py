@@ -241,8 +241,7 @@ class TrainConfig(Settings):
         0.0,
         "With fewer passes over the photos than this, images are reduced for longer, and a recipe "
         "has more steps; with half as many or fewer, by 0.05 and 0.1 of all steps, and half more "
-        "steps. If `coarse_to_fine` is set, this is 0 unless "
-        "it is set, too; 0: never.",
+        "steps. If `coarse_to_fine` is set, this is 0 unless it is set, too; 0: never.",
         least=0.0,
     )
     image_memory: int = setting(
@@ -309,7 +308,7 @@ class TrainConfig(Settings):
         """This configuration of a recipe, with more steps if ``views`` are used in few passes.
 
         Early steps with small images are cheap looks at many photos, so they are extended, too; see
-        docs/measurements/2026-11-26-fewer-pairs.md.
+        docs/measurements/2026-11-26-fewer-pairs.md and 2026-11-27-exposures-units-steps.md.
         """
         more = 1.0 + _LONGER * self._few(views)
         return replace(self, iterations=round(more * self.iterations))
