@@ -108,7 +108,7 @@ def test_many_cameras_are_sampled():
     limit = NearLimit(0.5)
     limit.begin(stage(cameras=[camera(0.001 * i) for i in range(500)], points=wall()))
     assert limit._views is not None
-    assert len(limit._views.limit) <= 64 * 5
+    assert len(limit._views.depths) <= 64 * 5
 
 
 def test_a_training_run_without_a_floater(tmp_path):

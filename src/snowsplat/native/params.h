@@ -356,6 +356,22 @@ struct PlaneSweepParams {
               centre, first, step, planes, radius, inverse_depth, score)
 };
 
+// ---- points_in_frusta ---------------------------------------------------------------------------
+
+template <class T>
+struct PointsInFrustaParams {
+  int64_t n;          // points
+  const T* points;    // (n, 3) world units
+  int64_t views;      // V
+  const T* to_image;  // (V, 3, 4) K [R | t]
+  const T* size;      // (V, 2) width and height, pixels
+  const T* depths;    // (V, 2) the range of depths, without its ends
+  const T* focal;     // (V,) pixels
+  T* counts;          // out, (n,) the number of views that contain the point
+  T* rates;           // out, (n,) the largest focal / depth of these views, or 0
+  SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
+};
+
 // ---- match_descriptors (CPU only) ---------------------------------------------------------------
 
 // For each row, a descriptor of the first image, the column with the largest dot product, this

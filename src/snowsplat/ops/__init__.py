@@ -10,6 +10,7 @@ from snowsplat.ops.adam import AdamRates, Moments, adam_step
 from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, device_name, resolve_device
+from snowsplat.ops.frusta import Frusta, points_in_frusta
 from snowsplat.ops.gaussian_parameters import GaussianParameters
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
@@ -24,6 +25,7 @@ from snowsplat.ops.view import View
 __all__ = [
     "AdamRates",
     "Capacity",
+    "Frusta",
     "GaussianParameters",
     "Moments",
     "SplatGradient",
@@ -40,6 +42,7 @@ __all__ = [
     "neighbours",
     "photometric_loss",
     "plane_sweep",
+    "points_in_frusta",
     "project",
     "project_activated",
     "rasterize",

@@ -319,6 +319,19 @@ class PlaneSweepParams(Params):
     score: Tensor
 
 
+@dataclass(slots=True, kw_only=True)
+class PointsInFrustaParams(Params):
+    n: int
+    points: Tensor
+    views: int
+    to_image: Tensor
+    size: Tensor
+    depths: Tensor
+    focal: Tensor
+    counts: Tensor
+    rates: Tensor
+
+
 # --------------------------------------------------------------------------------------- sizes
 
 
@@ -356,4 +369,5 @@ ENTRIES: dict[str, type[Params]] = {
     "photometric_u8": PhotometricParams,
     "neighbours": NeighboursParams,
     "plane_sweep": PlaneSweepParams,
+    "points_in_frusta": PointsInFrustaParams,
 }

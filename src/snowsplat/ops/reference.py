@@ -12,6 +12,7 @@ kernels with these functions in float64. From top to bottom, this file describes
                                                                      Wang et al. 2004
     neighbours      the initial size             Kerbl et al. 2023, §5.1
     accumulate_screen_statistics                 for density control Kerbl et al. 2023, §5.2
+    points_in_frusta   which views show a point  focal / z           Yu et al. 2024, §4.1
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
 
 `plane_sweep` is in `sweep_reference.py`.
@@ -37,6 +38,7 @@ from torch.nn.functional import conv2d
 
 from snowsplat.ops.adam import AdamRates, Moments
 from snowsplat.ops.capacity import Capacity
+from snowsplat.ops.frusta import Frusta
 from snowsplat.ops.gaussian_parameters import PARAMETERS, GaussianParameters
 from snowsplat.ops.splats import SplatGradient, Splats2D
 from snowsplat.ops.sweep_reference import plane_sweep as plane_sweep
@@ -485,6 +487,24 @@ def neighbours(points: Tensor, k: int = 3) -> Tensor:
         distances[rows, rows + start] = torch.inf  # not the point itself
         found[start : start + 1024, :available] = distances.topk(available, largest=False).values
     return found
+
+
+# ------------------------------------------------------------------------------ points_in_frusta
+
+
+@torch.no_grad()
+def points_in_frusta(points: Tensor, frusta: Frusta) -> tuple[Tensor, Tensor]:
+    """The number (N,) of frusta that contain each of points (N, 3), and the largest sampling rate.
+
+    A point at depth z is sampled with focal / z pixels per world unit (Yu et al. 2024, eq. 6).
+    """
+    at = torch.einsum("vij,nj->nvi", frusta.to_image[:, :, :3], points) + frusta.to_image[..., 3]
+    depth = at[..., 2]
+    inside = (depth > frusta.depths[:, 0]) & (depth < frusta.depths[:, 1])
+    inside &= (at[..., :2] >= 0).all(-1) & (at[..., :2] < frusta.size * depth[..., None]).all(-1)
+    rates = torch.where(inside, frusta.focal / depth, 0.0)
+    nothing = rates.new_zeros(len(points), 1)
+    return inside.sum(1).to(points.dtype), torch.cat([rates, nothing], 1).amax(1)
 
 
 # ------------------------------------------------------------------ accumulate_screen_statistics

@@ -16,6 +16,7 @@ from typing import Any
 from snowsplat.ops.cuda import (
     adam,
     driver,
+    frusta,
     nearest_neighbours,
     photometric,
     projection,
@@ -27,7 +28,17 @@ from snowsplat.ops.cuda import (
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.util.native_layout import Params
 
-_PARTS = (projection, adam, sorting, tiling, rasterizer, photometric, nearest_neighbours, sweep)
+_PARTS = (
+    projection,
+    adam,
+    sorting,
+    tiling,
+    rasterizer,
+    photometric,
+    nearest_neighbours,
+    sweep,
+    frusta,
+)
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
 SEQUENCES: dict[str, Callable[..., int]] = {
     name: sequence for part in _PARTS for name, sequence in part.SEQUENCES.items()

@@ -22,13 +22,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from snowsplat import ops
+from snowsplat.ops import Frusta
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.frusta import frusta_of
 from snowsplat.training.parts.part import REMOVED, Part
 from snowsplat.training.parts.unseen_cameras import beside
 from snowsplat.training.starts.source_views import source_views
@@ -52,7 +54,7 @@ _QUANTILE = 0.02
 _FEWEST_POINTS = 50
 #: A Gaussian near a camera is removed if at most this number of photos show its centre.
 _UNCONFIRMED = 1
-#: This number of Gaussians is processed at a time, to limit the memory.
+#: Distances are computed for this number of Gaussians at a time, to limit the memory.
 _ROWS = 1 << 14
 
 
@@ -67,8 +69,8 @@ class NearLimit(Part):
             share: the limit, relative to the depth of the nearest points.
         """
         self.share = share
-        self._views: _Views | None = None  # None: no limit
-        self._photos: _Views
+        self._views: Frusta | None = None  # before the limits; None: no limit
+        self._photos: Frusta
         self._spheres: Tensor  # (C, 4): the position of a camera, and its limit
 
     def begin(self, run: Run) -> None:
@@ -86,8 +88,9 @@ class NearLimit(Part):
         views = [(c, limit) for c, limit in zip(used + unseen, limits, strict=True) if limit > 0.0]
         if not views:
             return
-        self._views = _Views.of(views, device)
-        self._photos = _Views.of([(camera, math.inf) for camera in cameras], device)
+        like = torch.empty(0, device=device)
+        self._views = frusta_of([c for c, _ in views], [(0.0, far) for _, far in views]).to(like)
+        self._photos = frusta_of(cameras, [(0.0, math.inf)] * len(cameras)).to(like)
         spheres = [
             [*camera.position.tolist(), limit]
             for camera, limit in zip(used, limits, strict=False)  # without the unseen ones
@@ -97,56 +100,25 @@ class NearLimit(Part):
     def between(self, run: Run) -> None:
         """Make the Gaussians that are too near transparent, in every `INTERVAL`-th step."""
         if self._views is not None and run.schedule.multiples(run.step, INTERVAL):
-            parts = run.gaussians.means.split(_ROWS)
-            near = torch.cat([self._in_front(part) | self._unconfirmed(part) for part in parts])
-            run.gaussians.opacity_logits.masked_fill_(near, REMOVED)
-
-    def _in_front(self, means: Tensor) -> Tensor:
-        """(M,) bool: which of the means (M, 3) are in front of the limit of a view."""
-        assert self._views is not None
-        return self._views.count(means) > 0
+            means = run.gaussians.means
+            in_front = ops.points_in_frusta(means, self._views)[0] > 0
+            run.gaussians.opacity_logits.masked_fill_(in_front | self._unconfirmed(means), REMOVED)
 
     def _unconfirmed(self, means: Tensor) -> Tensor:
         """(M,) bool: which means (M, 3) are near a camera, and in at most one photo."""
         # Not as |a|² + |b|² − 2 a·b, whose digits would not suffice far from the origin.
         exact = "donot_use_mm_for_euclid_dist"
-        distances = torch.cdist(means, self._spheres[:, :3], compute_mode=exact)
-        near = (distances < self._spheres[:, 3]).any(1)
+        centres, limits = self._spheres[:, :3], self._spheres[:, 3]
+        near = torch.cat(
+            [
+                (torch.cdist(part, centres, compute_mode=exact) < limits).any(1)
+                for part in means.split(_ROWS)
+            ]
+        )
         rows = near.nonzero()[:, 0]
-        near[rows[self._photos.count(means[rows]) > _UNCONFIRMED]] = False
+        photos, _ = ops.points_in_frusta(means[rows], self._photos)
+        near[rows[photos > _UNCONFIRMED]] = False
         return near
-
-
-@dataclass(frozen=True)
-class _Views:
-    """Cameras as tensors: V views."""
-
-    to_image: Tensor  # (V, 3, 4) float32, K [R | t]
-    size: Tensor  # (V, 2) float32, pixels
-    limit: Tensor  # (V,) float32, the largest depth that counts
-
-    @staticmethod
-    def of(views: Sequence[tuple[Camera, float]], device: torch.device) -> _Views:
-        """The cameras with their limits."""
-        to_image = torch.stack(
-            [c.intrinsics @ c.cam_from_world.to(torch.float64) for c, _ in views]
-        )
-        size = [[float(c.width), float(c.height)] for c, _ in views]
-        return _Views(
-            to_image.to(device, torch.float32),
-            torch.tensor(size, device=device),
-            torch.tensor([limit for _, limit in views], device=device),
-        )
-
-    def count(self, means: Tensor) -> Tensor:
-        """(M,) int64: the number of views in which each of the means (M, 3) is before the limit."""
-        depths = means @ self.to_image[:, 2, :3].T + self.to_image[:, 2, 3]
-        row, view = torch.nonzero((depths > 0.0) & (depths < self.limit), as_tuple=True)
-        affine = self.to_image[view]
-        projected = (affine[:, :2, :3] @ means[row, :, None])[:, :, 0] + affine[:, :2, 3]
-        pixel = projected / depths[row, view, None]
-        inside = ((pixel >= 0.0) & (pixel < self.size[view])).all(1)
-        return torch.bincount(row[inside], minlength=len(means))
 
 
 def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:

@@ -23,7 +23,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from snowsplat import ops
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.frusta import frusta_of
 from snowsplat.training.parts.part import Part
 
 if TYPE_CHECKING:
@@ -56,11 +58,5 @@ class SmoothingFilter(Part):
 
 def sampling_rates(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """(N,): the most pixels per world unit with which an image shows each mean (N, 3), or 0."""
-    rates = means.new_zeros(len(means))
-    for camera in cameras:
-        pixel, depth = camera.project(means)
-        size = pixel.new_tensor([camera.width, camera.height])
-        inside = (depth > camera.near) & (pixel >= 0.0).all(1) & (pixel <= size).all(1)
-        rate = max(camera.fx, camera.fy) / depth
-        rates = torch.maximum(rates, rate.where(inside, 0.0).to(rates.dtype))
-    return rates
+    depths = [(camera.near, math.inf) for camera in cameras]
+    return ops.points_in_frusta(means, frusta_of(cameras, depths).to(means))[1]
