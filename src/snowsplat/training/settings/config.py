@@ -24,7 +24,7 @@ _SEED_LIMIT = 2**61
 
 #: What is added to the two moments of `TrainConfig.coarse_to_fine` if each photo is used a few
 #: times only, and the share of further steps.
-_COARSER, _LONGER = (0.05, 0.1), 0.5
+_COARSER, _LONGER = (0.05, 0.1), 0.75
 
 
 @dataclass(frozen=True)
@@ -307,11 +307,13 @@ class TrainConfig(Settings):
     def lengthened(self, views: int) -> TrainConfig:
         """This configuration of a recipe, with more steps if ``views`` are used in few passes.
 
-        Early steps with small images are cheap looks at many photos, so they are extended, too; see
-        docs/measurements/2026-11-26-fewer-pairs.md and 2026-11-27-exposures-units-steps.md.
+        Early steps with small images are cheap looks at many photos, so they are extended, too, as
+        if the passes were as few as before. See docs/measurements/2026-11-26-fewer-pairs.md and
+        2026-11-27-many-photos.md.
         """
         more = 1.0 + _LONGER * self._few(views)
-        return replace(self, iterations=round(more * self.iterations))
+        passes = more * self.few_passes
+        return replace(self, iterations=round(more * self.iterations), few_passes=passes)
 
     def staged(self, views: int) -> TrainConfig:
         """This configuration with the moments of ``coarse_to_fine`` for this number of views.
