@@ -38,7 +38,7 @@ from starlette.types import Receive, Scope, Send
 
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
-from snowsplat.studio.library import Library, Scene, UnknownScene
+from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import printable
@@ -70,7 +70,9 @@ _Answer = Callable[[Request, Scene], Awaitable[Any]]
 
 def studio_app(library: Library, addresses: Callable[[], list[str]]) -> Starlette:
     """The app. ``addresses``: the URLs of the page for other machines."""
-    return Starlette(routes=_Studio(library, addresses).routes())
+    app = Starlette(routes=_Studio(library, addresses).routes())
+    app.router.redirect_slashes = False  # the address would lack the token
+    return app
 
 
 class _File:
@@ -218,7 +220,8 @@ class _Studio:
         scene.inputs()
         async with self._locks[scene.name, "start"]:
             if not job.is_running(scene):
-                scene.change(quality=quality, minutes=minutes)
+                title = safe_title(str(wanted.get("title") or scene.job.title))
+                scene.change(title=title, quality=quality, minutes=minutes)
             job.start(scene)
         return {}
 

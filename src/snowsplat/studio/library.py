@@ -141,7 +141,7 @@ class Library:
         for path in inputs:
             if not path.exists():
                 raise UserError(f"{printable(str(path))}: no such file or folder")
-        title = printable(title.strip())[:_LONGEST] or "scene"
+        title = safe_title(title)
         name = safe_name(title)
         number = 1
         while True:
@@ -157,12 +157,18 @@ class Library:
         return scene
 
 
+def safe_title(title: str) -> str:
+    """A title of a scene: a short line without control characters."""
+    return printable(" ".join(title.split()))[:_LONGEST] or "scene"
+
+
 def safe_name(name: str) -> str:
     """A name of a file or folder that every system accepts, without a path: similar to ``name``."""
     name = re.sub(r'[\x00-\x1f\x7f<>:"/\\|?*\ud800-\udfff]', "_", name)
+    name = name.lstrip(". ")
     stem, dot, suffix = name.rpartition(".")
     stem, suffix = (stem, suffix) if dot and len(suffix) <= 8 else (name, "")
-    stem = stem.lstrip(". ")[:_LONGEST]
+    stem = stem[:_LONGEST]
     while len(stem.encode()) > 2 * _LONGEST:  # systems limit the bytes
         stem = stem[:-1]
     name = (f"{stem}.{suffix}" if suffix else stem).rstrip(". ") or "_"

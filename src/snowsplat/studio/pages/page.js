@@ -84,7 +84,7 @@ export function command(/** @type {string} */ line) {
         "div.command",
         {},
         make("code", {}, line),
-        make("button.plain", { type: "button", click: () => navigator.clipboard?.writeText(line), "aria-label": say("copy") }, "⧉"),
+        make("button.plain", { type: "button", click: () => navigator.clipboard?.writeText(line), }, say("copy")),
     );
 }
 

@@ -121,7 +121,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             multiple: true,
             change: (/** @type {any} */ event) => add(chosen(event.target.files)),
         });
-        return make("label.button.plain", {}, say("choose_files"), input);
+        return make("p", {}, make("label.button.plain", {}, say("add_files"), input));
     }
 
     function add(/** @type {import("./upload.js").Item[]} */ items) {
@@ -135,10 +135,12 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const before = scene.minutes ? "within" : (scene.quality ?? "normal");
         const choice = (/** @type {string} */ value, /** @type {Node} */ more) =>
             make("label.choice", {}, make("input", { type: "radio", name: "quality", value, checked: value === before }), make("b", {}, say(value)), more);
+        const title = /** @type {HTMLInputElement} */ (make("input", { type: "text", value: scene.title, maxlength: 80 }));
         const form = /** @type {HTMLFormElement} */ (
             make(
                 "form.card",
                 {},
+                make("label.row", {}, make("b", {}, say("title_label")), title),
                 make(
                     "fieldset",
                     {},
@@ -153,7 +155,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         minutes.addEventListener("focus", () => (form.quality.value = "within"));
         function wanted() {
             const quality = form.quality.value;
-            return quality === "within" ? { minutes: Number(minutes.value) } : { quality };
+            const time = quality === "within" ? { minutes: Number(minutes.value) } : { quality };
+            return { title: title.value, ...time };
         }
         return form;
     }
@@ -269,9 +272,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 }
 
 function factsOf(/** @type {any} */ facts) {
-    const words = (/** @type {any} */ value) =>
-        typeof value === "object" ? Object.entries(value).map(([name, what]) => `${name.split("/").pop()}: ${what}`).join(", ") : String(value);
-    const rows = FACTS.filter(key => facts[key]).flatMap(key => [make("dt", {}, say(key)), make("dd", {}, words(facts[key]))]);
+    const words = (/** @type {any} */ value) => {
+        if (typeof value !== "object") return String(value);
+        const parts = Object.entries(value).map(([name, what]) => [name.split("/").pop(), what]);
+        return parts.length === 1 && parts[0][1] === facts.photos ? parts[0][0] : parts.map(part => part.join(": ")).join(", ");
+    };
+    const known = (/** @type {any} */ value) => value && words(value) !== "unknown";
+    const rows = FACTS.filter(key => known(facts[key])).flatMap(key => [make("dt", {}, say(key)), make("dd", {}, words(facts[key]))]);
     return [make("dl.facts", {}, ...rows)];
 }
 
@@ -284,8 +291,11 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {any} */ scene) {
         ...names.map(name => {
             const past = done.get(name);
             const item = make("li", { "data-state": past ? "done" : name === current ? "now" : "later" }, make("b", {}, say(`stage_${name}`)));
-            if (past) item.append(make("span.soft", {}, ` ${past.lines[0]} (${past.again ? say("before") : duration(past.seconds)})`));
-            else if (name === current) {
+            if (past) {
+                const result = name === "report" ? "" : `${past.lines[0]} `;
+                item.append(make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`));
+            }
+else if (name === current) {
                 const training = name === "scene" && steps;
                 const [count, total, left] = training ? [steps.step, steps.iterations, steps.left] : [now.done, now.total, now.left];
                 const what = training ? say("step").toLowerCase() : (now.what ?? "");
@@ -333,8 +343,8 @@ async function showPhone(/** @type {HTMLElement} */ card, /** @type {string} */ 
     const { addresses } = await ask(`about?path=${encodeURIComponent(site)}`).catch(() => ({ addresses: [] }));
     card.append(
         make("h2", {}, say("phone")),
-        ...(addresses.length
+        make("div.row", {}, ...(addresses.length
             ? addresses.map((/** @type {any} */ { url, code }) => make("div.phone", {}, make("img", { src: code, alt: "" }), make("a", { href: url }, url)))
-            : [make("p.soft", {}, say("phone_how"))]),
+            : [make("p.soft", {}, say("phone_how"))])),
     );
 }
