@@ -294,8 +294,7 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {any} */ scene) {
             if (past) {
                 const result = name === "report" ? "" : `${past.lines[0]} `;
                 item.append(make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`));
-            }
-else if (name === current) {
+            } else if (name === current) {
                 const training = name === "scene" && steps;
                 const [count, total, left] = training ? [steps.step, steps.iterations, steps.left] : [now.done, now.total, now.left];
                 const what = training ? say("step").toLowerCase() : (now.what ?? "");
