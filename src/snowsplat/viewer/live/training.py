@@ -80,17 +80,21 @@ class TrainingViewer:
             loss=self._loss,
             psnr=psnrs[-1] if psnrs else None,
         )
-        points = len(self._losses), len(self._psnrs)
-        if points != self._points:
-            self._points = points
-            curves = {"loss": self._losses.lists(), "psnr": self._psnrs.lists()}
-            self.viewer.tell({"type": "curves", **curves})
+        self._tell_curves()
 
     def _tell(self, **figures: object) -> None:
         """Show the state of the training on all pages."""
         session = self._session
         control = {"paused": session.paused, "share": session.share}
         self.viewer.tell({"type": "training", **control, **figures})
+
+    def _tell_curves(self) -> None:
+        """Show the curves on all pages, if they have new points."""
+        points = len(self._losses), len(self._psnrs)
+        if points != self._points:
+            self._points = points
+            curves = {"loss": self._losses.lists(), "psnr": self._psnrs.lists()}
+            self.viewer.tell({"type": "curves", **curves})
 
     def _steps_per_second(self, step: int) -> float:
         now = time.monotonic()
@@ -107,6 +111,7 @@ class TrainingViewer:
         self._session.training = False
         self._session.resume()
         self._tell(finished=about)
+        self._tell_curves()
 
     def show(self, step: int, gaussians: Gaussians) -> None:
         """Show the result of the training until Ctrl-C, which raises KeyboardInterrupt."""

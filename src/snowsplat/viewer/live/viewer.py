@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket
 from snowsplat.data import Dataset
 from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.trajectory.focus import up_of
+from snowsplat.trajectory.focus import focus_of, up_of, viewing_distance
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.served_file import ServedFile, served
 from snowsplat.viewer.http.server import WebServer
@@ -112,11 +112,15 @@ class NetworkViewer:
         self._told: dict[str, dict[str, Any]] = {}  # the newest messages for all browsers, by type
         self._browsers: set[Browser] = set()
         self._numbers = itertools.count()  # of browsers
+        cameras = [view.camera for view in views]
+        points = torch.zeros(0, 3) if dataset.points is None else dataset.points.xyz
+        focus = focus_of(cameras, viewing_distance(cameras, points))
         self._tell(
             {
                 "type": "scene",
                 "title": label,
-                "up": up_of([view.camera for view in views]).tolist(),
+                "up": up_of(cameras).tolist(),
+                "focus": focus.tolist(),
                 "bounds": dataset.bounds.tolist(),
                 "extent": dataset.extent,
                 **self._photos.description(),

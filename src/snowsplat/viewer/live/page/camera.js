@@ -7,7 +7,7 @@ import { add, axesOf, cross, dot, norm, quatOf, scaled, subtract, turned, unit }
  * A photo: `half` are the tangents of half of its fields of view, across and down.
  * @typedef {{name: string, heldOut: boolean, half: [number, number], quat: Quat, position: Vec}} Photo
  */
-/** @typedef {{up: Vec, bounds: [Vec, Vec], extent: number, photos: Photo[]}} Scene */
+/** @typedef {{up: Vec, focus: Vec, bounds: [Vec, Vec], extent: number, photos: Photo[]}} Scene */
 /** @typedef {{width: number, height: number}} Size in pixels */
 
 const STEEPEST = 0.02; // radians: the smallest angle between the directions of view and of up
@@ -46,8 +46,8 @@ export class Camera {
         this.photo = index;
         this.position = position;
         this.up = scaled(down, -1);
-        // The point on the optical axis that is nearest to the middle of the scene.
-        const distance = dot(ahead, subtract(this.centre, position));
+        // The point on the optical axis that is nearest to what the photos show.
+        const distance = dot(ahead, subtract(this.scene.focus, position));
         this.target = add(position, ahead, Math.max(distance, 0.1 * this.extent));
         this.half = half;
     }

@@ -51,8 +51,8 @@ export const listen = (stage, { camera, moved, clicked, hovered, keys }) => {
     const pan = (dx, dy) => {
         const now = camera();
         if (!now) return;
-        const { shown, distance } = { shown: now.shown({ width: stage.clientWidth, height: height() }), distance: now.distance };
-        const unit = (2 * shown[1] * distance) / height();
+        const shown = now.shown({ width: stage.clientWidth, height: height() });
+        const unit = (2 * shown[1] * now.distance) / height();
         now.move([-dx * unit, -dy * unit, 0]);
     };
 
@@ -81,7 +81,7 @@ export const listen = (stage, { camera, moved, clicked, hovered, keys }) => {
         } else if (event.buttons & 6 || event.shiftKey) {
             pan(dx, dy);
         } else {
-            const turn = (2 * Math.PI) / Math.max(height(), 300);
+            const turn = Math.PI / Math.max(height(), 300);
             now.orbit(dx * turn, dy * turn);
         }
         moved();
