@@ -58,14 +58,15 @@ class View:
         if self.path is None:
             raise UserError("view needs a scene; add a file or the output folder of a training run")
         from snowsplat.pipeline.view import viewed_scene
-        from snowsplat.viewer.web.server import StaticServer
+        from snowsplat.viewer.http.server import WebServer
+        from snowsplat.viewer.http.static import static_app
 
         with (
             TerminalObserver() as observer,
             viewed_scene(self.path, self.iteration, observer) as scene,
             suppress(KeyboardInterrupt),
-            StaticServer(
-                scene.files, scene.headers, self.host, self.port, self.allow_host
+            WebServer(
+                static_app(scene.files), self.host, self.port, self.allow_host, scene.headers
             ) as server,
         ):
             site = scene.gaussians is None

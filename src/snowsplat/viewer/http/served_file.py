@@ -1,4 +1,4 @@
-"""The files of a `StaticServer`: in memory or on disk."""
+"""Files that `static_app` serves: in memory or on disk."""
 
 from __future__ import annotations
 
