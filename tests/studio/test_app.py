@@ -8,8 +8,16 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from starlette.applications import Starlette
+from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from snowsplat.studio import job
+from snowsplat.viewer.http.served_file import ServedFile
+from snowsplat.viewer.http.server import WebServer
+from snowsplat.viewer.http.static import static_app
 
 from ..viewer import clients
 
@@ -70,6 +78,10 @@ def test_start_and_stop(studio, holder):
     while studio.ask(f"scenes/{name}")[1]["status"] == "running":
         time.sleep(0.05)
     assert studio.ask(f"scenes/{name}")[1]["status"] == "stopped"
+    (
+        studio.library.find(name).folder / "state.json"
+    ).unlink()  # it was killed before it said a word
+    assert studio.ask(f"scenes/{name}")[1]["status"] == "interrupted"
 
 
 def test_small_photos_of_a_dataset(studio):
@@ -83,6 +95,40 @@ def test_small_photos_of_a_dataset(studio):
     assert small.size == (240, 120)
     assert studio.ask(f"scenes/{name}/photos/1")[0] == 400
     assert studio.ask(f"scenes/{name}/photos/2")[0] == 404
+
+
+def test_the_page_of_a_running_training_is_passed_on(studio):
+    """Its files and its images, in both directions; its own address is not told."""
+
+    async def images(socket: WebSocket) -> None:
+        await socket.accept()
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                await socket.send_bytes(100_000 * (await socket.receive_text()).encode())
+
+    page = Starlette(routes=[WebSocketRoute("/live", images)])
+    page.mount("/", static_app({"": ServedFile(b"the page", "text/html")}))
+    name = new(studio)
+    scene = studio.library.find(name)
+    live = f"{studio.server.url.replace('http', 'ws', 1)}scenes/{name}/live/live"
+    assert studio.ask(f"scenes/{name}/live/")[0] == 404
+    with pytest.raises(InvalidStatus):
+        connect(live)
+    with WebServer(page, headers={"Content-Security-Policy": "default-src 'self'"}) as job_page:
+        scene.write_state({"page": job_page.url})
+        assert studio.ask(f"scenes/{name}/live/") == (200, b"the page")
+        for other in ("absent", "../..", "%2e%2e/", "//evil.example"):
+            assert studio.ask(f"scenes/{name}/live/{other}")[0] == 404
+        told = studio.ask(f"scenes/{name}")[1]
+        assert told["has_page"]
+        assert job_page.url not in str(told)
+        with connect(live, max_size=None) as socket:
+            for text in ("a", "b"):
+                socket.send(text)
+                assert socket.recv() == 100_000 * text.encode()
+    with pytest.raises(InvalidStatus):  # the training has ended
+        connect(live)
+    assert studio.ask(f"scenes/{name}/live/")[0] == 404
 
 
 def test_folders_of_the_machine(studio, tmp_path):

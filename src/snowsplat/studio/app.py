@@ -12,6 +12,7 @@
     GET  /scenes/NAME/map             the cameras and points from above
     POST /scenes/NAME/exports/KIND    writes a file; GET sends it
     GET  /scenes/NAME/site/…, /made/… the scene in the viewer, its reports
+    GET  /scenes/NAME/live/…          the page of the running training, with its WebSocket
 
 Answers are JSON; an error is ``{"error": …}``, one line for people.
 """
@@ -33,12 +34,14 @@ from PIL import Image, ImageOps
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocket
 
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
+from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import printable
@@ -100,7 +103,7 @@ class _Studio:
         self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
         self._surveys: dict[tuple[str, ...], Any] = {}
 
-    def routes(self) -> list[Route]:
+    def routes(self) -> list[BaseRoute]:
         page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
         scene = [
             ("", "GET", self._scene),
@@ -116,9 +119,11 @@ class _Studio:
             ("/exports/{kind}", "GET", self._exported),
             ("/site/{path:path}", "GET", self._site),
             ("/made/{path:path}", "GET", self._made),
+            ("/live/{path:path}", "GET", self._live),
         ]
         return [
             *page,
+            WebSocketRoute("/scenes/{name}/live/live", self._live_images),
             Route("/about", _answering(self._about)),
             Route("/browse", _answering(self._browse)),
             Route("/scenes", _answering(self._scenes), methods=["GET"]),
@@ -173,6 +178,7 @@ class _Studio:
 
     async def _scene(self, request: Request, scene: Scene) -> Any:
         state, made = scene.state(), scene.job
+        has_page = state.pop("page", None) is not None  # its address is a secret of the job
         return {
             "name": scene.name,
             "title": made.title,
@@ -181,6 +187,7 @@ class _Studio:
             "minutes": made.minutes,
             "status": _status(scene, state),
             "state": state,
+            "has_page": has_page,
             "has_map": (scene.folder / "map.svg").is_file(),
             "command": make_command(scene, made),
             "exports": {kind: export_command(scene, kind) for kind in FORMATS},
@@ -261,6 +268,22 @@ class _Studio:
         file = _inside(scene.made, request.path_params["path"])
         return _File(file, **{"Content-Security-Policy": _REPORT_POLICY})
 
+    async def _live(self, request: Request, scene: Scene) -> Any:
+        page = scene.state().get("page")
+        if page is None:
+            raise UnknownScene("no training runs")
+        return await relay_file(page, quote(request.path_params["path"]))
+
+    async def _live_images(self, socket: WebSocket) -> None:
+        try:
+            page = self._library.find(socket.path_params["name"]).state().get("page")
+        except UnknownScene:
+            page = None
+        if page is None:
+            await socket.close()
+        else:
+            await relay_socket(socket, page)
+
 
 def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
     """An endpoint: what ``answer`` returns as JSON, or its error."""
@@ -289,7 +312,7 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
     """One of new, running, done, stopped, failed or, if the process was killed, interrupted."""
     if job.is_running(scene):
         return "running"
-    if not state:
+    if not state and scene.job.quality is None and scene.job.minutes is None:
         return "new"
     return str(state.get("outcome", "interrupted"))
 

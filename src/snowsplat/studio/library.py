@@ -147,7 +147,9 @@ class Library:
         while True:
             scene = Scene(self.folder / (name if number == 1 else f"{name}-{number}"))
             try:
-                scene.folder.mkdir()
+                scene.folder.mkdir(
+                    mode=0o700
+                )  # the state has the address of a page, with its token
                 break
             except FileExistsError:
                 number += 1

@@ -24,10 +24,11 @@ from typing import Any
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
-from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.output.output_folder import DATASET
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of
@@ -119,6 +120,14 @@ class _Recorder(Observer):
                 self._every *= 2
         self.write(now=False)
 
+    def page_opened(self, page: Page) -> None:
+        self.state["page"] = page.url
+        self.write()
+
+    def steps_end(self) -> None:
+        self.state.pop("page", None)
+        self.write()
+
     def _draw_map(self) -> None:
         try:
             drawing = draw_from_above(self._scene.made / DATASET)
@@ -133,7 +142,8 @@ def run_job(scene: Scene) -> int:
         with locked(scene.lock, f"{scene.folder}: in use by"):
             recorder = _Recorder(scene)
             code, outcome = _outcome(scene, recorder)
-            recorder.state.pop("now", None)
+            for name in ("now", "page"):
+                recorder.state.pop(name, None)
             recorder.state |= outcome
             recorder.write()
             return code
@@ -148,7 +158,15 @@ def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
         with ended_by_signals():
             job = scene.job
             options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
-            made = make(scene.inputs(), scene.made, options, overwrite=True, observer=recorder)
+            with LivePage(port=0) as page:
+                made = make(
+                    scene.inputs(),
+                    scene.made,
+                    options,
+                    overwrite=True,
+                    observer=recorder,
+                    page=page,
+                )
             recorder.begin("page")
             site = publish(scene.made, scene.site, PublishOptions(job.title), overwrite=True)
             recorder.leave()

@@ -171,12 +171,17 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const mapBox = make("figure", { hidden: true }, map, make("figcaption", {}, say("map")));
         const notes = make("ul.notes");
         const stop = make("button.main", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
+        const live = /** @type {HTMLIFrameElement} */ (make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true }));
         let listed = "";
         update = (/** @type {any} */ now) => {
             const state = now.state;
             showStages(stages, now);
             showFigures(figures, curve, state);
             notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, line)));
+            if (live.hidden === now.has_page) {
+                live.hidden = !now.has_page;
+                live.src = now.has_page ? `${address}/live/` : "about:blank";
+            }
             mapBox.hidden = map.hidden = !now.has_map;
             if (now.has_map && !map.getAttribute("src")) map.setAttribute("src", `${address}/map`);
             const key = (state.stages ?? []).map((/** @type {any} */ each) => each.stage).join();
@@ -187,6 +192,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         };
         return [
             make("section.card", {}, stages, make("div.row", {}, scene.status === "running" && stop, make("span.soft", {}, say("stop_help")))),
+            live,
             make("section.row.wide", {}, mapBox, make("div.training", {}, figures, curve)),
             strip,
             notes,

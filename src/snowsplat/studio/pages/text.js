@@ -97,6 +97,7 @@ const TEXTS = {
     command: ["The same in a terminal", "在终端中的相同命令"],
     copy: ["Copy", "复制"],
     viewer: ["The scene", "场景"],
+    live: ["The training, live", "实时训练画面"],
 };
 
 let column = 0;
