@@ -12,10 +12,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.page_flags import AllowHost, for_other_computers, has_screen
 from snowsplat.cli.view import open_browser, wait
-from snowsplat.studio.app import POLICY, own_address, studio_app
-from snowsplat.studio.library import Library
 from snowsplat.viewer.hosts import ANY_HOST
-from snowsplat.viewer.http.server import WebServer
 
 
 @dataclass
@@ -48,6 +45,10 @@ class Studio:
 
     def run(self) -> int:
         """Returns the exit code: 0, also after Ctrl-C, the usual end."""
+        from snowsplat.studio.app import POLICY, own_address, studio_app
+        from snowsplat.studio.library import Library
+        from snowsplat.viewer.http.server import WebServer
+
         library = Library(self.folder or Path.home() / "snowsplat")
         servers: list[WebServer] = []
 
