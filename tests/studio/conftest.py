@@ -56,7 +56,8 @@ class Studio:
 
 
 @pytest.fixture
-def library(tmp_path) -> Library:
+def library(tmp_path, monkeypatch) -> Library:
+    monkeypatch.setattr(job, "_started", {})
     return Library(tmp_path / "library")
 
 

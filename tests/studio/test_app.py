@@ -84,6 +84,14 @@ def test_start_and_stop(studio, holder):
     assert studio.ask(f"scenes/{name}")[1]["status"] == "interrupted"
 
 
+def test_a_damaged_scene_does_not_hide_the_others(studio):
+    name, other = new(studio), new(studio)
+    (studio.library.find(name).folder / "job.json").write_text("{")
+    listed = {scene["name"]: scene["status"] for scene in studio.ask("scenes")[1]}
+    assert listed == {name: "failed", other: "new"}
+    assert studio.ask(f"scenes/{name}")[0] == 400
+
+
 def test_small_photos_of_a_dataset(studio):
     name = new(studio)
     folder = studio.library.find(name).made / "dataset/input"

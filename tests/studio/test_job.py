@@ -1,15 +1,21 @@
 """Jobs: one per folder, stopped, killed; what a worker tells."""
 
+import io
 import os
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from snowsplat.studio import job
 from snowsplat.studio.library import Scene
+from snowsplat.studio.worker import _Recorder
+from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 
 
@@ -86,6 +92,39 @@ def test_errors_of_the_worker_are_one_line(library, tmp_path):
     assert state["outcome"] == "failed"
     assert "empty" in state["error"]
     assert "\n" not in state["error"]
+
+
+def test_what_the_photos_are(library, tmp_path):
+    """In a zip file, which is unpacked; again, it is the same."""
+    scene = library.new("a", [])
+    scene.photos.mkdir()
+    with zipfile.ZipFile(scene.photos / "tour.zip", "w") as archive:
+        for number in range(3):
+            picture = io.BytesIO()
+            colours = np.random.default_rng(number).integers(0, 255, (48, 64, 3), np.uint8)
+            Image.fromarray(colours).save(picture, "JPEG")
+            archive.writestr(f"tour/{number}.jpg", picture.getvalue())
+    for _ in range(2):
+        found = job.work("survey", scene.folder)
+        assert (found["count"], found["facts"]["photos"]) == (3, 3)
+        assert 0 < found["seconds"]["draft"] < found["seconds"]["best"]
+
+
+def test_progress_is_bounded(library):
+    """The curve has a limited number of points, over all steps; numbers are those of the steps."""
+    scene = library.new("a", [])
+    recorder = _Recorder(scene)
+    for step in range(1, 5001):
+        recorder.step(Progress(step, 1.0 / step, 100 + step, 5000, 1, seconds_left=7.0))
+    recorder.note("a line\x1b[0m")
+    state = scene.state()
+    assert state["steps"] == {"step": 5000, "iterations": 5000, "gaussians": 5100, "left": 7.0}
+    assert len(state["curve"]) <= 400
+    steps = [step for step, _ in state["curve"]]
+    assert steps == sorted(steps)
+    assert steps[-1] > 4900
+    assert steps[0] < 100
+    assert "\x1b" not in state["notes"][0]
 
 
 def test_a_worker_that_is_killed_is_an_error(library, monkeypatch):

@@ -12,7 +12,7 @@ import tyro
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.page_flags import AllowHost, for_other_computers, has_screen
 from snowsplat.cli.view import open_browser, wait
-from snowsplat.viewer.hosts import ANY_HOST
+from snowsplat.viewer.hosts import ANY_HOST, is_loopback
 
 
 @dataclass
@@ -54,8 +54,9 @@ class Studio:
 
         def addresses() -> list[str]:
             (server,) = servers
-            here = own_address() if self.host in ANY_HOST else None
-            return ([server.url_at(here)] if here else []) + server.others
+            here = own_address() if self.host in ANY_HOST else self.host
+            open_here = here is not None and not is_loopback(here)
+            return ([server.url_at(str(here))] if open_here else []) + server.others
 
         app = studio_app(library, addresses)
         policy = {"Content-Security-Policy": POLICY}

@@ -101,7 +101,6 @@ class _Studio:
         self._library, self._addresses = library, addresses
         # By scene and kind of work: a second request waits for the first one.
         self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
-        self._surveys: dict[tuple[str, ...], Any] = {}
 
     def routes(self) -> list[BaseRoute]:
         page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
@@ -156,16 +155,7 @@ class _Studio:
         return _listing(Path(request.query_params.get("path") or Path.home()))
 
     async def _scenes(self, request: Request) -> Any:
-        return [
-            {
-                "name": scene.name,
-                "title": scene.job.title,
-                "created": scene.job.created,
-                "status": _status(scene, scene.state()),
-                "picture": (scene.site / "poster.jpg").is_file(),
-            }
-            for scene in self._library.scenes()
-        ]
+        return [_summary(scene) for scene in self._library.scenes()]
 
     async def _new(self, request: Request) -> Any:
         wanted = await _object(request)
@@ -207,11 +197,8 @@ class _Studio:
             return {"received": await asyncio.to_thread(write_part, scene, path, size, start, data)}
 
     async def _survey(self, request: Request, scene: Scene) -> Any:
-        key = (scene.name, *(f"{k}={v}" for k, v in sorted(received(scene).items())))
         async with self._locks[scene.name, "survey"]:
-            if key not in self._surveys:
-                self._surveys[key] = await asyncio.to_thread(job.work, "survey", scene.folder)
-            return self._surveys[key]
+            return await asyncio.to_thread(job.work, "survey", scene.folder)
 
     async def _start(self, request: Request, scene: Scene) -> Any:
         wanted = await _object(request)
@@ -306,6 +293,17 @@ def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request
 
 def _page_files() -> list[str]:
     return sorted(path.name for path in _PAGES.iterdir())
+
+
+def _summary(scene: Scene) -> dict[str, Any]:
+    """A scene in the list of all; one whose file is damaged does not hide the others."""
+    try:
+        about = {"title": scene.job.title, "created": scene.job.created}
+        about["status"] = _status(scene, scene.state())
+    except UserError:
+        about = {"title": scene.name, "created": "", "status": "failed"}
+    picture = (scene.site / "poster.jpg").is_file()
+    return {"name": scene.name, "picture": picture, **about}
 
 
 def _status(scene: Scene, state: dict[str, Any]) -> str:

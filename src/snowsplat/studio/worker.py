@@ -188,9 +188,9 @@ def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
         "file": made.scene.name,
         "bytes": made.scene.stat().st_size,
         "gaussians": gaussians,
-        "psnr": made.psnr,
-        "ssim": made.ssim,
-        "views": made.views,
+        # With gains of exposure, the scene has the mean exposure of the photos.
+        "psnr": made.psnr_aligned if made.exposures else made.psnr,
+        "aligned": made.exposures,
         "seconds": made.seconds,
         "verdict": [] if made.verdict is None else made.verdict.lines("The scene"),
         "reports": {

@@ -10,6 +10,11 @@ const FACTS = ["photos", "sizes", "cameras", "with_gps", "videos", "not_used", "
 /** @type {Map<string, Upload>} */
 const uploads = new Map();
 
+// An upload ends with the page.
+addEventListener("beforeunload", event => {
+    if (uploads.size) event.preventDefault();
+});
+
 /** Begins to upload files to a scene. */
 export function upload(/** @type {string} */ name, /** @type {import("./upload.js").Item[]} */ items) {
     const address = `scenes/${encodeURIComponent(name)}`;
@@ -28,6 +33,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     const status = make("p.status", { role: "status" });
     const body = make("div");
     main.replaceChildren(make("p", {}, make("a", { href: "#" }, `← ${say("back")}`)), title, status, body);
+    let away = false; // whether the server did not answer
     let shown = ""; // which parts `body` has
     /** @type {((scene: any) => void) | undefined} */
     let update;
@@ -40,11 +46,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         try {
             const scene = await ask(address);
             if (closed.aborted) return;
-            notice("");
+            if (away) notice("");
+            away = false;
             show(scene);
             if (scene.status !== "running") wait = 4000;
         } catch (error) {
             if (closed.aborted) return;
+            away = true;
             notice(error instanceof Refused ? error.message : say("offline"));
             wait = 3000;
         }
@@ -74,6 +82,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     function sendingPart() {
         const bar = make("progress", { max: 1, "aria-label": say("files", "", "") });
         const line = make("p");
+        const more = moreFiles();
         update = () => {
             const sending = uploads.get(name);
             if (!sending) return;
@@ -83,8 +92,9 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             const text = `${say("files", sending.finished, sending.items.length)}, ${say("uploading", bytes(now), bytes(sending.total))}${left}`;
             line.textContent = sending.error || (sending.offline ? say("offline") : text);
             line.classList.toggle("bad", Boolean(sending.error));
+            more.hidden = !sending.error;
         };
-        return [make("section.card", {}, bar, line)];
+        return [make("section.card", {}, bar, line, more)];
     }
 
     /** What the photos are, and a form that starts the job. */
@@ -191,8 +201,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             }
         };
         return [
-            make("section.card", {}, stages, make("div.row", {}, scene.status === "running" && stop, make("span.soft", {}, say("stop_help")))),
             live,
+            make("section.card", {}, stages, make("div.row", {}, scene.status === "running" && stop, make("span.soft", {}, say("stop_help")))),
             make("section.row.wide", {}, mapBox, make("div.training", {}, figures, curve)),
             strip,
             notes,
@@ -235,7 +245,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 {},
                 ...fact("gaussians", result.gaussians.toLocaleString()),
                 ...fact("size", bytes(result.bytes)),
-                ...(result.psnr === null ? [] : fact("psnr", `${result.psnr.toFixed(2)} dB`)),
+                ...(result.psnr === null ? [] : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
                 ...fact("took", duration(result.seconds)),
             ),
             result.verdict.length > 0 &&
@@ -268,7 +278,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     const over = (/** @type {Event} */ event) => event.preventDefault();
     const drop = async (/** @type {DragEvent} */ event) => {
         event.preventDefault();
-        if (event.dataTransfer && shown === "new") add(await dropped(event.dataTransfer));
+        if (event.dataTransfer && (shown === "new" || uploads.get(name)?.error)) add(await dropped(event.dataTransfer));
     };
     main.addEventListener("dragover", over, { signal: closed });
     main.addEventListener("drop", drop, { signal: closed });

@@ -66,7 +66,7 @@ function tile(/** @type {any} */ scene) {
         { href: `#${encodeURIComponent(scene.name)}` },
         scene.picture ? make("img", { src: `${address}/site/poster.jpg`, alt: "", loading: "lazy" }) : make("div.empty"),
         make("b", {}, scene.title),
-        make("span.soft", { "data-status": scene.status }, `${say(scene.status)} · ${new Date(scene.created).toLocaleDateString()}`),
+        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString()}`}`),
     );
 }
 

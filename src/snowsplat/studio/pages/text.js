@@ -71,6 +71,7 @@ const TEXTS = {
     of: ["{0} of {1}", "{0} / {1}"],
     gaussians: ["Gaussians", "高斯数"],
     psnr: ["PSNR of held-out photos", "留出照片的 PSNR"],
+    psnr_aligned: ["PSNR of held-out photos, colours aligned", "留出照片的 PSNR（颜色对齐）"],
     loss: ["Loss", "损失"],
     placed: ["Photos", "照片"],
     map: ["Cameras and points, from above", "相机与点云（俯视）"],
