@@ -45,7 +45,9 @@ from snowsplat.data import load_dataset  # noqa: E402
 from snowsplat.synthetic.toy_dataset import write_toy_dataset  # noqa: E402
 from snowsplat.training.core.trainer import Trainer  # noqa: E402
 from snowsplat.training.settings.config import TrainConfig  # noqa: E402
+from snowsplat.viewer.live import browser as live_browser  # noqa: E402
 from snowsplat.viewer.live.curves import SampledPsnr  # noqa: E402
+from snowsplat.viewer.live.messages import parse  # noqa: E402
 from snowsplat.viewer.live.training import TrainingViewer  # noqa: E402
 from snowsplat.viewer.live.viewer import NetworkViewer  # noqa: E402
 
@@ -104,9 +106,11 @@ def fuzz(url: str, count: int, seed: int) -> None:
             for _ in range(rng.randrange(1, 2000)):
                 count -= 1
                 content = message(rng)
-                opcode = rng.choice([1, 1, 1, 1, 2, 9, rng.randrange(16)])
-                whole = frame(content, opcode, fin=rng.random() > 0.01)
-                client.sendall(whole if rng.random() > 0.002 else whole[: len(whole) // 2])
+                opcode = 1 if isinstance(content, str) else 2
+                if rng.random() < 0.002:  # most of these close the connection
+                    opcode = rng.randrange(16)
+                whole = frame(content, opcode, fin=rng.random() > 0.001)
+                client.sendall(whole if rng.random() > 0.001 else whole[: len(whole) // 2])
                 sent[seed] += 1
             reset(client)
 
@@ -127,6 +131,13 @@ def main() -> int:
         for seed in range(arguments.connections):
             sent[seed] = 0
             threads.append(threading.Thread(target=fuzz, args=(viewer.url, each, seed)))
+        read = [0]
+
+        def counted(text: str) -> object:
+            read[0] += 1
+            return parse(text)
+
+        live_browser.parse = counted
         seen: list[float] = []
         over = threading.Event()
 
@@ -159,9 +170,9 @@ def main() -> int:
         same = all(torch.equal(ours[name], theirs[name]) for name in ours)
     gaps = [b - a for a, b in zip([began, *seen], [*seen, began + seconds], strict=True)]
     print(
-        f"{sum(sent.values()):,} messages in {seconds:.0f} s; {trainer.step} steps, "
-        f"{'the same bits' if same else 'OTHER BITS'}; {len(seen)} images, at most "
-        f"{max(gaps):.1f} s apart; memory {grown:+.1f} MiB"
+        f"{sum(sent.values()):,} messages, {read[0]:,} read, in {seconds:.0f} s; "
+        f"{trainer.step} steps, {'the same bits' if same else 'OTHER BITS'}; {len(seen)} images, "
+        f"at most {max(gaps):.1f} s apart; memory {grown:+.1f} MiB"
     )
     return int(not same or grown > BOUND or max(gaps) > 10.0)
 
