@@ -94,7 +94,7 @@ export class DisplayPanel {
             const label = sliders[0].parentElement?.firstElementChild;
             if (label) label.textContent = name;
             sliders.forEach((slider, end) => {
-                slider.ariaLabel = text(end ? 'to' : 'from', { axis: name });
+                slider.setAttribute('aria-label', text(end ? 'to' : 'from', { axis: name }));
             });
         });
     }

@@ -28,7 +28,7 @@ const TURNS = /** @type {Record<string, [number, number]>} */ ({
 const isForControl = ({ target, key }) => {
     if (!(target instanceof HTMLElement)) return false;
     if (target instanceof HTMLSelectElement) return true;
-    if (target instanceof HTMLInputElement && target.type === 'range') return /^(Arrow|Home|End|Page)/.test(key);
+    if (key.startsWith('Arrow') && target.closest('aside')) return true; // moves a slider, or scrolls
     return target.matches('button, summary, input') && [' ', 'Enter'].includes(key);
 };
 

@@ -155,7 +155,7 @@ const goToPhoto = (index) => {
 };
 
 const showTheme = () => {
-    byId('theme').ariaPressed = String(isDark());
+    byId('theme').setAttribute('aria-pressed', String(isDark()));
     drawFrustums();
 };
 

@@ -180,8 +180,8 @@ export const translate = () => {
     for (const element of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll('[data-text]')))
         element.textContent = text(element.dataset.text ?? '');
     for (const element of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll('[data-label]'))) {
-        element.ariaLabel = text(element.dataset.label ?? '');
-        if (element instanceof HTMLButtonElement) element.title = element.ariaLabel;
+        element.setAttribute('aria-label', text(element.dataset.label ?? ''));
+        if (element instanceof HTMLButtonElement) element.title = text(element.dataset.label ?? '');
     }
     for (const element of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll('[data-hint]')))
         element.title = text(element.dataset.hint ?? '');
