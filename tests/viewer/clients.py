@@ -175,12 +175,12 @@ def status(answer: bytes) -> int:
     return int(answer.split(b" ", 2)[1]) if answer else 0
 
 
-def upgrade(url: str) -> socket.socket:
-    """A WebSocket connection for hand-written frames, to the live page."""
+def upgrade(url: str, name: str = "live") -> socket.socket:
+    """A WebSocket connection for hand-written frames; ``name``: its path, relative to the page."""
     client = open_socket(url)
     host, port = place(url)
     client.sendall(
-        f"GET {path(url)}live HTTP/1.1\r\nHost: {host}:{port}\r\n"
+        f"GET {path(url)}{name} HTTP/1.1\r\nHost: {host}:{port}\r\n"
         "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
         f"Sec-WebSocket-Key: {'A' * 22}==\r\n\r\n".encode()
     )

@@ -187,7 +187,7 @@ def test_the_number_of_websockets_is_limited(server, monkeypatch):
     ],
 )
 def test_floods_are_disconnected(server, data):
-    with clients.upgrade(server.url + "echo") as client:
+    with clients.upgrade(server.url, "echo") as client:
         with contextlib.suppress(OSError):
             client.sendall(data)
         client.settimeout(5)
@@ -208,7 +208,7 @@ def test_a_page_may_send_its_messages(server):
 
 def test_a_websocket_that_does_not_read_is_disconnected(server, monkeypatch):
     monkeypatch.setattr(guard, "_SEND_SECONDS", 0.4)
-    client = clients.upgrade(server.url + "flood")
+    client = clients.upgrade(server.url, "flood")
     time.sleep(1.5)
     received = 0
     with contextlib.suppress(ConnectionError):
@@ -222,7 +222,7 @@ def test_close_ends_websockets():
     app = Starlette(routes=[WebSocketRoute("/echo", echo)])
     threads = threading.active_count()
     server = WebServer(app)
-    client = clients.upgrade(server.url + "echo")
+    client = clients.upgrade(server.url, "echo")
     server.close()
     assert threading.active_count() == threads
     with contextlib.suppress(ConnectionError):
@@ -240,7 +240,7 @@ def test_the_first_free_port_of_several(monkeypatch):
 
 def test_a_closed_connection_is_not_written_to(server, caplog):
     for _ in range(3):
-        client = clients.upgrade(server.url + "flood")
+        client = clients.upgrade(server.url, "flood")
         client.recv(1000)
         clients.reset(client)
     time.sleep(0.3)
