@@ -2,6 +2,7 @@
 
 import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.studio import job
+from snowsplat.pipeline.quality import PRESETS
+from snowsplat.sfm.cost import Speed
+from snowsplat.studio import job, worker
 from snowsplat.studio.library import Scene
-from snowsplat.studio.worker import _Recorder
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 
@@ -110,10 +113,20 @@ def test_what_the_photos_are(library, tmp_path):
         assert 0 < found["seconds"]["draft"] < found["seconds"]["best"]
 
 
+def test_poses_that_are_given_take_no_time(library, tmp_path, monkeypatch):
+    dataset = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
+    photos = tmp_path / "photos"
+    shutil.copytree(dataset / "images", photos)
+    monkeypatch.setattr(worker, "measure_speed", lambda _: Speed())
+    given, unknown = (worker.survey_photos(library.new("a", [each])) for each in (dataset, photos))
+    assert (given["facts"]["poses"], unknown["facts"]["poses"]) == (True, False)
+    assert given["seconds"]["draft"] == PRESETS["draft"].training < unknown["seconds"]["draft"]
+
+
 def test_progress_is_bounded(library):
     """The curve has a limited number of points, over all steps; numbers are those of the steps."""
     scene = library.new("a", [])
-    recorder = _Recorder(scene)
+    recorder = worker._Recorder(scene)
     for step in range(1, 5001):
         recorder.step(Progress(step, 1.0 / step, 100 + step, 5000, 1, seconds_left=7.0))
     recorder.note("a line\x1b[0m")

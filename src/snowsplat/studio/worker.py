@@ -211,9 +211,12 @@ def survey_photos(scene: Scene) -> dict[str, Any]:
     speed = measure_speed(thread_count(None))
     seconds = {}
     for quality, preset in PRESETS.items():
-        steps = [*steps_of(photos, preset.photos, quality).values(), Step(preset.training)]
+        steps = [Step(preset.training)]
+        if sources.posed is None:
+            steps += steps_of(photos, preset.photos, quality).values()
         seconds[quality] = round(sum(step.seconds(speed) for step in steps))
-    return {"facts": describe_photos(sources), "count": photos.count, "seconds": seconds}
+    facts = describe_photos(sources) | {"poses": sources.posed is not None}
+    return {"facts": facts, "count": photos.count, "seconds": seconds}
 
 
 def export(scene: Scene, kind: str) -> dict[str, Any]:

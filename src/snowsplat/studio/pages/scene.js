@@ -5,7 +5,7 @@ import { say } from "./text.js";
 import { chosen, dropped, Upload } from "./upload.js";
 
 const STAGES = ["photos", "poses", "images", "report", "scene", "pictures", "all", "page"];
-const FACTS = ["photos", "sizes", "cameras", "with_gps", "videos", "not_used", "doubtful"];
+const FACTS = ["photos", "sizes", "cameras", "with_gps", "videos", "poses", "not_used", "doubtful"];
 
 /** @type {Map<string, Upload>} */
 const uploads = new Map();
@@ -289,6 +289,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
 function factsOf(/** @type {any} */ facts) {
     const words = (/** @type {any} */ value) => {
+        if (value === true) return say("given");
         if (typeof value !== "object") return String(value);
         const parts = Object.entries(value).map(([name, what]) => [name.split("/").pop(), what]);
         return parts.length === 1 && parts[0][1] === facts.photos ? parts[0][0] : parts.map(part => part.join(": ")).join(", ");

@@ -40,6 +40,8 @@ const TEXTS = {
     sizes: ["Sizes", "尺寸"],
     cameras: ["Cameras", "相机"],
     with_gps: ["With GPS", "带 GPS"],
+    poses: ["Camera poses", "相机位姿"],
+    given: ["those of the folder are used", "使用文件夹中已有的位姿"],
     not_used: ["Not used", "未使用"],
     doubtful: ["Doubtful", "存疑"],
     quality: ["How long may it take?", "可以用多长时间？"],
