@@ -476,8 +476,11 @@ def test_both_languages(page):
     assert set(re.findall(r"[A-Za-z]{4,}", chinese)) <= left
     press(page, "language")
     assert page.evaluate("document.body.innerText").split("\n")[0] == english.split("\n")[0]
-    unnamed = "[...document.querySelectorAll('button, input, select')].filter(e => "
-    assert page.evaluate(unnamed + "!e.hasAttribute('aria-label') && !e.textContent.trim() && !e.closest('label')).length") == 0
+    unnamed = (
+        "[...document.querySelectorAll('button, input, select')].filter(e => "
+        "!e.hasAttribute('aria-label') && !e.textContent.trim() && !e.closest('label')).length"
+    )
+    assert page.evaluate(unnamed) == 0
 
 
 def test_it_reconnects_by_itself(page):
