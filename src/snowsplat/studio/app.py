@@ -165,7 +165,8 @@ class _Studio:
         inputs = [Path(os.path.expanduser(path))] if path else []
         if inputs and not inputs[0].is_absolute():
             raise UserError(f"{printable(path)}: write the whole path, such as /home/me/photos")
-        title = str(wanted.get("title") or (inputs[0].stem if inputs else ""))
+        names = [path.name if _is_folder(path) else path.stem for path in inputs]
+        title = str(wanted.get("title") or "".join(names))
         return {"name": self._library.new(title, inputs).name}
 
     async def _scene(self, request: Request, scene: Scene) -> Any:
