@@ -152,6 +152,8 @@ def test_folders_of_the_machine(studio, tmp_path):
         assert "\n" not in answer["error"]
     scene = studio.library.find(new(studio, title="", path=str(tmp_path / "tour")))
     assert (scene.job.title, scene.inputs()) == ("tour", [tmp_path / "tour"])
+    address = f"scenes/{scene.name}/uploads?path=x&size=1&start=0"
+    assert "add the photos there" in studio.ask(address, "PUT", b"x")[1]["error"]
     for wrong in ("tour", "~nobody-of-this-name/x", "/\ud800", "/a\0b", "/" + 5000 * "x"):
         status, answer = studio.ask("scenes", "POST", {"path": wrong})
         assert status == 400, wrong[:40]

@@ -194,6 +194,8 @@ class _Studio:
         size, start = (_whole(query.get(name)) for name in ("size", "start"))
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then add photos")
+        if scene.job.inputs:
+            raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
         data = await request.body()
         path = query.get("path", "")
         async with self._locks[scene.name, "upload"]:
