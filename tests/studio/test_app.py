@@ -175,7 +175,7 @@ def test_only_files_of_a_scene_are_sent(studio, tmp_path, up):
         (folder / "link").symlink_to(secret)
     for kind in ("site", "made"):
         assert studio.ask(f"scenes/{name}/{kind}/index.html") == (200, b"page")
-        for path in (up * 4 + "secret.txt", "link", up + "job.json", f"{up}{secret}"):
+        for path in (up * 4 + "secret.txt", "link", up + "job.json", f"{up}{secret}", 5000 * "x"):
             status, answer = studio.ask(f"scenes/{name}/{kind}/{path}")
             assert status in (400, 404), path
             assert answer != b"secret"

@@ -45,7 +45,7 @@ from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import printable
+from snowsplat.util.safe_json import is_file, printable
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -86,15 +86,8 @@ class _File:
         self._path, self._headers = path, headers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        more = [(name.lower().encode(), value.encode()) for name, value in self._headers.items()]
-
-        async def send_with(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                message = {**message, "headers": [*message["headers"], *more]}
-            await send(message)
-
-        file = FileOnDisk(self._path, content_type(self._path)) if self._path.is_file() else None
-        await send_file(file, scope, receive, send_with)
+        file = FileOnDisk(self._path, content_type(self._path)) if is_file(self._path) else None
+        await send_file(file, scope, receive, send, self._headers)
 
 
 class _Studio:
