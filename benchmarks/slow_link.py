@@ -119,7 +119,7 @@ def main() -> None:
     position = -rotation.T @ camera.cam_from_world[:, 3]
     viewer.left = float(position[0])
     viewer.session.pause()
-    port = viewer.server.get_port()
+    port = viewer.server.port
     link = SlowLink(port, arguments.rate * 125e3, arguments.delay / 1e3)
     via = link.port if arguments.rate else port
     finished = threading.Event()

@@ -12,18 +12,16 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import math
 import statistics
+import struct
 import threading
 import time
 from pathlib import Path
 from socket import socket
 
-import msgspec
 import torch
-import viser
-import viser._messages as messages
-import zstandard
 from PIL import Image
 from websockets.sync.client import connect
 from workloads import SIZES, workload
@@ -49,15 +47,10 @@ class Client:
         self, viewer: NetworkViewer, width: int, height: int, through: socket | None = None
     ) -> None:
         """``through``: a connection to the viewer; default: a direct one."""
-        self._socket = connect(
-            viewer.url.replace("http", "ws"),
-            sock=through,
-            subprotocols=[f"viser-v{viser.__version__}"],
-            max_size=None,
-            compression=None,
-        )
+        address = viewer.url.replace("http", "ws") + "live"
+        self._socket = connect(address, sock=through, max_size=None, compression=None)
         self._size = width, height
-        self.images = 0
+        self._moves = self.images = 0
 
     def move(self, cam_from_world: torch.Tensor, fov: float, shift: float) -> None:
         """Set the camera, shifted by ``shift`` to the right."""
@@ -67,12 +60,19 @@ class Client:
     def move_to(self, rotation: torch.Tensor, fov: float, position: torch.Tensor) -> None:
         """Set the camera at a position (3,)."""
         width, height = self._size
-        message = messages.ViewerCameraMessage(
-            *(tuple(quat_from_rotation(rotation.T).tolist()), tuple(position.tolist()), fov),
-            *(0.01, 1000.0, height, width),
-            *(tuple((position + rotation[2]).tolist()), (0.0, -1.0, 0.0)),
+        self._moves += 1
+        self._send(
+            type="view",
+            number=self._moves,
+            quat=quat_from_rotation(rotation.T).tolist(),
+            position=position.tolist(),
+            fov=fov,
+            width=width,
+            height=height,
         )
-        self._socket.send(msgspec.msgpack.encode(message.as_serializable_dict([])))
+
+    def _send(self, **message: object) -> None:
+        self._socket.send(json.dumps(message))
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for an image; False if none arrived in time."""
@@ -83,13 +83,13 @@ class Client:
                 data = self._socket.recv(timeout=left)
             except TimeoutError:
                 return False
-            size = int.from_bytes(data[8:16], "little")
-            window = msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + size]))
-            for message in window["messages"]:
-                if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
+            if isinstance(data, bytes):
+                kind, number, _ = struct.unpack_from("<BxxxII", data)
+                if kind == 0:
+                    self._send(type="shown", number=number)
                     self.images += 1
-                    self.bytes = len(message["rgb_data"])
-                    self.newest = Image.open(io.BytesIO(message["rgb_data"]))
+                    self.bytes = len(data)
+                    self.newest = Image.open(io.BytesIO(data[12:]))
                     return True
 
     def close(self) -> None:

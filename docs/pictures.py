@@ -114,8 +114,10 @@ def main(demo: Path) -> None:
         page.close()
         with training(made / "dataset") as url:
             page = browser.open(url)
-            page.wait_for("/Step 1,[5-9]/.test(document.body.innerText)", 600)
-            click(page, ".mantine-Notification-closeButton")  # the browser has no GPU
+            page.evaluate("document.documentElement.dataset.theme = 'dark'")
+            page.evaluate("document.getElementById('language').hidden = true")  # needs a font
+            page.evaluate("document.getElementById('frustums').click()")
+            page.wait_for("/Step 1,[5-9]/.test(document.getElementById('status').innerText)", 600)
             shoot(page, PICTURES / "live.webp")
 
 

@@ -26,12 +26,14 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 _HERE = Path(__file__).parent
 #: Marks set by the folder of a test, and by the fixtures that it uses.
-#: Tests of `cli`, `pipeline` and `viewer` train, serve or render; those of the parser are quick.
+#: Tests of `cli`, `pipeline`, `studio` and `viewer` train, serve or render; those of the parser are
+#: quick.
 _OF_FOLDERS = {
     "kill": "kill",
     "fuzz": "slow",
     "cli": "slow",
     "pipeline": "slow",
+    "studio": "slow",
     "viewer": "slow",
 }
 _QUICK = {"cli/test_main.py"}

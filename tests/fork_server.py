@@ -25,7 +25,8 @@ from concurrent.futures import thread as pools
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+_PATHS = filter(None, [str(ROOT / "src"), os.environ.get("PYTHONPATH")])
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(_PATHS)}
 _LARGEST_REQUEST = 1 << 17
 _MOST_FILES = 4096
 

@@ -24,8 +24,9 @@ def import_all() -> None:
     import snowsplat.training.core.trainer
     import snowsplat.training.report
     import snowsplat.training.settings.recipes
+    import snowsplat.viewer.http.server
+    import snowsplat.viewer.http.static
     import snowsplat.viewer.web.scene
-    import snowsplat.viewer.web.server
 
     for name in snowsplat.cli.main.SUBCOMMANDS:
         snowsplat.cli.main.parse([name])

@@ -63,9 +63,9 @@ def test_missing_and_broken_packages(run, broken, monkeypatch):
     broken("torch", "raise OSError('libtorch.so: cannot open shared object file')")
     broken("numpy", "raise ImportError('needs a newer processor')")
     broken("pycolmap", "import os, signal; os.kill(os.getpid(), signal.SIGILL)")
-    broken("viser", "raise ModuleNotFoundError(\"No module named 'viser'\")")
+    broken("uvicorn", "raise ModuleNotFoundError(\"No module named 'uvicorn'\")")
     broken("av", "print('hello')\nffmpeg_version_info = '9.9'")
-    kept = [p for p in doctor._PACKAGES if p.module in ("numpy", "pycolmap", "viser", "av")]
+    kept = [p for p in doctor._PACKAGES if p.module in ("numpy", "pycolmap", "uvicorn", "av")]
     monkeypatch.setattr(doctor, "_PACKAGES", kept)
     result = run("doctor")
     assert (result.code, result.err) == (1, "")
@@ -74,10 +74,10 @@ def test_missing_and_broken_packages(run, broken, monkeypatch):
     assert found["PyTorch"].startswith("BROKEN (libtorch.so: cannot open shared object file; pip")
     assert found["GPU"] == "not known without PyTorch"
     assert found["pycolmap"].startswith("BROKEN (ends the process (SIGILL); pip install --force")
-    assert found["viser"].startswith("MISSING (No module named 'viser'; pip install 'viser")
-    assert "watch" in found["viser"]
+    assert found["uvicorn"].startswith("MISSING (No module named 'uvicorn'; pip install 'uvicorn")
+    assert "watch" in found["uvicorn"]
     assert found["av"].endswith("FFmpeg 9.9")
-    assert result.out.splitlines()[-1] == "see above: processor, PyTorch, numpy, pycolmap, viser"
+    assert result.out.splitlines()[-1] == "see above: processor, PyTorch, numpy, pycolmap, uvicorn"
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,17 @@ def test_the_overview_lists_the_subcommands_and_fits_a_small_terminal(run):
         assert f"  snowsplat {name} " in result.out
 
 
+def test_alone_on_a_screen_it_opens_the_studio(run, monkeypatch):
+    studio = module.load_subcommand("studio")
+    monkeypatch.setattr(studio, "run", lambda self: print("opened", self.folder) or 0)
+    monkeypatch.setattr(module.sys.stdout.__class__, "isatty", lambda _: True, raising=False)
+    monkeypatch.setattr(module, "has_screen", lambda: False)
+    assert "snowsplat studio" in run().out
+    monkeypatch.setattr(module, "has_screen", lambda: True)
+    assert run().out == "opened None\n"
+    assert "snowsplat studio" in run("--help").out
+
+
 def test_each_subcommand_has_help(run):
     assert run("help", "info") == run("info", "--help")
     for name in module.SUBCOMMANDS:
@@ -154,7 +165,7 @@ def test_the_version_is_one_line(run):
 def test_an_unknown_subcommand_is_one_line_with_a_suggestion(refused):
     assert "trian: unknown subcommand; did you mean train?" in refused("trian")
     assert "did you mean sfm?" in refused("captur")  # a former name, still accepted
-    assert "choose from demo, make, sfm, train" in refused("xyz")
+    assert "choose from studio, demo, make, sfm, train" in refused("xyz")
 
 
 def test_a_misplaced_flag_is_found_in_its_subcommand(run):

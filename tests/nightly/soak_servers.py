@@ -135,7 +135,7 @@ class Server:
                 found.append(f"{self.name}: {table[:, column].max():.0f} {what}")
         if self.process.returncode not in (0, 130):
             found.append(f"{self.name}: ended with {self.process.returncode}")
-        strange = re.compile("Traceback|Error|Warning|viser|websockets|asyncio", re.IGNORECASE)
+        strange = re.compile("Traceback|Error|Warning|uvicorn|websockets|asyncio", re.IGNORECASE)
         for line in self.output:
             if strange.search(line) and not line.startswith("step "):
                 found.append(f"{self.name}: printed {line.strip()!r}")
@@ -211,17 +211,16 @@ class Crowd:
         pictures = 0
         for _ in range(rng.randrange(1, 12)):
             position = [rng.uniform(-2, 2) for _ in range(3)]
-            visitor.send_camera(position=position, image_width=size[0], image_height=size[1])
+            visitor.view(position=position, width=size[0], height=size[1])
             pictures += visitor.pictures(rng.uniform(0.1, 2.0))
-            label = rng.choice(["Show", "SH degree", "Gaussian size", "Go to", "Store this view"])
-            value = {
-                "Show": rng.choice(["Depth", "Colour", "Points", "Normals"]),
-                "SH degree": rng.randrange(4),
-                "Gaussian size": rng.randrange(2, 101, 2),
-                "Go to": rng.choice(["Next", "Previous"]),
-            }.get(label, True)
-            if label in visitor.controls:
-                visitor.press(label, value)
+            rng.choice(
+                [
+                    lambda: visitor.display(mode=rng.choice(["depth", "color", "points"])),
+                    lambda: visitor.display(degree=rng.randrange(4), scale=rng.random()),
+                    lambda: visitor.view(photo=rng.randrange(3)),
+                    lambda: visitor.send("key"),
+                ]
+            )()
         self.done["pictures"] += pictures
         if rng.random() < 0.5:
             visitor.__exit__()

@@ -18,7 +18,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.initial_view import overview
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.web.served_file import FileOnDisk
+from snowsplat.viewer.http.served_file import FileOnDisk
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
-"""Clients of both servers, on real sockets: well-behaved and hostile ones.
+"""Clients of both pages, on real sockets: well-behaved and hostile ones.
 
     with Visitor(url) as visitor:
-        visitor.send_camera()
+        visitor.view()
         visitor.pictures(1.0)
 
     HOSTILE["pings"](url)
@@ -12,6 +12,9 @@ The clients do not depend on the implementation of the servers.
 from __future__ import annotations
 
 import contextlib
+import io
+import itertools
+import json
 import os
 import random
 import socket
@@ -23,50 +26,58 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
-import msgspec
-import viser
-import zstandard
+from PIL import Image
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-PROTOCOL = f"viser-v{viser.__version__}"
 POSE = {
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "quat": [1.0, 0.0, 0.0, 0.0],
     "position": [0.0, 0.0, -3.0],
     "fov": 1.0,
-    "near": 0.01,
-    "far": 1000.0,
-    "image_height": 240,
-    "image_width": 320,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, -1.0, 0.0],
+    "width": 320,
+    "height": 240,
+    "photo": None,
 }
+DISPLAY = {
+    "mode": "color",
+    "degree": 3,
+    "scale": 1.0,
+    "wipe": 0.0,
+    "longest": 1280,
+    "crop": None,
+}
+_numbers = itertools.count(1)  # of views
 
 
-def camera(**changes: object) -> bytes:
-    """The camera message of the page."""
-    return msgspec.msgpack.encode({"type": "ViewerCameraMessage", **POSE, **changes})
+def view(**changes: object) -> str:
+    """The message of a camera that has moved."""
+    return json.dumps({"type": "view", "number": next(_numbers), **POSE, **changes})
 
 
-def update(uuid: str, value: object, name: str = "value") -> bytes:
-    """The message of a changed control."""
-    return msgspec.msgpack.encode(
-        {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {name: value}}
-    )
+def display(**changes: object) -> str:
+    """The message of display settings."""
+    return json.dumps({"type": "display", **DISPLAY, **changes})
 
 
 class Visitor:
-    """The page without a browser: sends its camera and receives images."""
+    """The page without a browser: sends its camera and receives images.
+
+    Attributes:
+        told: the newest message of the server of each type.
+        keys: the entries of camera lists that it has received.
+        shown: number of images; `newest` is the last one, `view_shown` the number of its view.
+        thumbnails: indices of the photos of which it has one.
+    """
 
     def __init__(self, url: str, **options: Any) -> None:
         """``options``: those of `websockets.sync.client.connect`."""
-        options = {"open_timeout": 20, "close_timeout": 2, **options}
-        self.socket: ClientConnection = connect(
-            url.replace("http://", "ws://").rstrip("/"),
-            **{"subprotocols": [PROTOCOL], "max_size": None, **options},  # type: ignore[arg-type]
-        )
-        self.controls: dict[str, str] = {}  # uuid by label
-        self.shown = 0  # pictures
+        options = {"open_timeout": 20, "close_timeout": 2, "max_size": None, **options}
+        address = url.replace("http://", "ws://") + "live"
+        self.socket: ClientConnection = connect(address, compression=None, **options)
+        self.told: dict[str, dict[str, Any]] = {}
+        self.keys: list[dict[str, Any]] = []
+        self.thumbnails: set[int] = set()
+        self.shown = self.view_shown = 0
 
     def __enter__(self) -> Visitor:
         return self
@@ -75,34 +86,52 @@ class Visitor:
         with contextlib.suppress(OSError, ConnectionClosed):
             self.socket.close()
 
-    def send_camera(self, **changes: object) -> None:
+    def view(self, **changes: object) -> None:
         """Send the camera."""
-        self.socket.send(camera(**changes))
+        self.socket.send(view(**changes))
+
+    def display(self, **changes: object) -> None:
+        """Send display settings."""
+        self.socket.send(display(**changes))
+
+    def send(self, kind: str, **fields: object) -> None:
+        """Send another message."""
+        self.socket.send(json.dumps({"type": kind, **fields}))
 
     def pictures(self, seconds: float, most: int = 1 << 30) -> int:
         """Receive messages for this time, or until ``most`` images; returns their number."""
         before, end = self.shown, time.monotonic() + seconds
         while self.shown - before < most and (left := end - time.monotonic()) > 0:
             try:
-                data = self.socket.recv(timeout=left)
+                self._take(self.socket.recv(timeout=left))
             except TimeoutError:
                 break
-            assert isinstance(data, bytes)
-            self._take(data)
         return self.shown - before
 
-    def press(self, label: str, value: object = True) -> None:
-        """Set a control by its label."""
-        self.socket.send(update(self.controls[label], value))
+    def wait_for(self, kind: str, seconds: float = 20.0) -> dict[str, Any]:
+        """Receive messages until one of this type was received; returns the newest one."""
+        end = time.monotonic() + seconds
+        while kind not in self.told:
+            self._take(self.socket.recv(timeout=max(0.0, end - time.monotonic())))
+        return self.told[kind]
 
-    def _take(self, data: bytes) -> None:
-        compressed = int.from_bytes(data[8:16], "little")
-        plain = zstandard.ZstdDecompressor().decompress(data[16 : 16 + compressed])
-        for message in msgspec.msgpack.decode(plain)["messages"]:
-            self.shown += message["type"] == "BackgroundImageMessage"
-            label = (message.get("props") or {}).get("label")
-            if isinstance(label, str) and "uuid" in message:
-                self.controls[label] = message["uuid"]
+    @property
+    def newest(self) -> Image.Image:
+        return Image.open(io.BytesIO(self.jpeg))
+
+    def _take(self, data: str | bytes) -> None:
+        if isinstance(data, str):
+            message = json.loads(data)
+            if message["type"] == "key":
+                self.keys.append(message["entry"])
+            self.told[message["type"]] = message
+            return
+        kind, number, view = struct.unpack_from("<BxxxII", data)
+        if kind:
+            self.thumbnails.add(number)
+            return
+        self.shown, self.view_shown, self.jpeg = self.shown + 1, view, data[12:]
+        self.send("shown", number=number)
 
 
 def place(url: str) -> tuple[str, int]:
@@ -146,14 +175,14 @@ def status(answer: bytes) -> int:
     return int(answer.split(b" ", 2)[1]) if answer else 0
 
 
-def upgrade(url: str) -> socket.socket:
-    """A WebSocket connection for hand-written frames."""
+def upgrade(url: str, name: str = "live") -> socket.socket:
+    """A WebSocket connection for hand-written frames; ``name``: its path, relative to the page."""
     client = open_socket(url)
     host, port = place(url)
     client.sendall(
-        f"GET {path(url).rstrip('/') or '/'} HTTP/1.1\r\nHost: {host}:{port}\r\n"
+        f"GET {path(url)}{name} HTTP/1.1\r\nHost: {host}:{port}\r\n"
         "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode()
+        f"Sec-WebSocket-Key: {'A' * 22}==\r\n\r\n".encode()
     )
     answer = b""
     while b"\r\n\r\n" not in answer:
@@ -167,8 +196,11 @@ def upgrade(url: str) -> socket.socket:
     return client
 
 
-def frame(payload: bytes, opcode: int = 2, fin: bool = True, length: int | None = None) -> bytes:
-    """A frame of a client. ``length``: the declared length of the payload."""
+def frame(
+    content: str | bytes, opcode: int = 1, fin: bool = True, length: int | None = None
+) -> bytes:
+    """A frame of a client. ``length``: the declared length of the content."""
+    payload = content.encode() if isinstance(content, str) else content
     size = len(payload) if length is None else length
     head = bytes([opcode | (0x80 if fin else 0)])
     if size < 126:
@@ -208,23 +240,47 @@ def pour(client: socket.socket, data: bytes, seconds: float, read: bool = False)
 def _garbage(url: str, seconds: float) -> None:
     with upgrade(url) as client:
         for _ in range(200):
-            client.sendall(frame(os.urandom(random.randrange(1, 300)), random.choice((1, 2))))
-        client.sendall(frame(msgspec.msgpack.encode({"type": "NoSuchMessage"})))
-        client.sendall(frame(b"\x91" * 60_000))  # nested lists
+            client.sendall(frame(os.urandom(random.randrange(1, 300)), opcode=2))
+        client.sendall(frame('{"type": "nothing"}'))
+        client.sendall(frame("[" * 60_000))
+        client.sendall(frame("9" * 60_000))
+        client.sendall(frame(view()[:-5]))
+        client.sendall(frame(b"\xff\xfe", opcode=1))
         client.sendall(frame(bytes(100), opcode=11))
 
 
+#: Values that a field of a message may have, if a hostile client sends it.
+WRONG = [
+    *(float("nan"), float("inf"), -1, 0, 1e300, -(2**63), 2**64, 10**400, True, "x", None),
+    *([], {}, [[1.0]], [1e300] * 3, [float("nan")] * 3, [0.0] * 4, [1e200] * 4, [1e-200] * 4),
+]
+
+
+def wrong_messages() -> list[str]:
+    """Messages of the page in which one field is wrong, missing or unknown, and others."""
+    found = ["", "null", "[]", "{}", '"view"', '{"type": []}', '{"type": "key", "uuid": 5}']
+    for message in (view(), display()):
+        known = json.loads(message)
+        found += [json.dumps({**known, name: value}) for name in known for value in WRONG]
+        found += [json.dumps({k: v for k, v in known.items() if k != name}) for name in known]
+        found.append(json.dumps({**known, "more": 1}))
+    for kind, name in (
+        ("shown", "number"),
+        ("thumbnails", "count"),
+        ("training", "do"),
+        ("share", "share"),
+    ):
+        found += [json.dumps({"type": kind, name: value}) for value in WRONG]
+    found += [json.dumps({"type": "view", **POSE, "number": 1, "photo": n}) for n in (-1, 10**9)]
+    return found
+
+
 def _wrong_types(url: str, seconds: float) -> None:
-    bad = [float("nan"), float("inf"), -1, 0, 1e300, -(2**63), 2**64 - 1, "x", None, [], {}, b"x"]
     with upgrade(url) as client:
-        client.sendall(frame(camera()))
-        for name, good in POSE.items():
-            for value in bad:
-                client.sendall(frame(camera(**{name: value})))
-                if isinstance(good, list):
-                    client.sendall(frame(camera(**{name: [value] * len(good)})))
-        for kind in ("GuiUpdateMessage", "FileTransferStartUpload", "ShareUrlRequest"):
-            client.sendall(frame(msgspec.msgpack.encode({"type": kind, "uuid": 5, "updates": 7})))
+        client.sendall(frame(view()))
+        for message in wrong_messages():
+            client.sendall(frame(message))
+            time.sleep(0.001)
 
 
 def _huge_frame(url: str, seconds: float) -> None:
@@ -240,7 +296,7 @@ def _pings(url: str, seconds: float) -> None:
 
 def _millions(url: str, seconds: float) -> None:
     with upgrade(url) as client:
-        pour(client, frame(camera()) * 200, seconds)
+        pour(client, frame(view()) * 200, seconds)
 
 
 def _pieces(url: str, seconds: float) -> None:
@@ -249,13 +305,15 @@ def _pieces(url: str, seconds: float) -> None:
         pour(client, frame(b"", opcode=0, fin=False) * 1000, seconds)
 
 
-def _forms(url: str, seconds: float) -> None:
-    """Messages that viser would store forever."""
+def _keys(url: str, seconds: float) -> None:
+    """Asks for answers, and reads none; changes its photo all the time."""
     with upgrade(url) as client:
-        client.sendall(frame(camera()))
+        client.sendall(frame(view()))
         for i in range(900):
-            dirty = {"type": "GuiFormDirtyMessage", "uuid": f"{i}" + "x" * 5000}
-            client.sendall(frame(msgspec.msgpack.encode(dirty)))
+            client.sendall(frame('{"type": "key"}'))
+            client.sendall(frame(view(photo=i % 3)))
+            client.sendall(frame('{"type": "shown", "number": 1000000}'))
+            time.sleep(0.01)
 
 
 def _never_reads(url: str, seconds: float) -> None:
@@ -265,7 +323,7 @@ def _never_reads(url: str, seconds: float) -> None:
         with contextlib.suppress(OSError):
             while time.monotonic() < end:
                 turn += 0.1
-                client.sendall(frame(camera(position=[turn, 0.0, -3.0])))
+                client.sendall(frame(view(position=[turn, 0.0, -3.0])))
                 time.sleep(0.05)
 
 
@@ -309,7 +367,7 @@ def _comers(url: str, seconds: float) -> None:
     while time.monotonic() < end:
         with contextlib.suppress(ConnectionError):
             client = upgrade(url)
-            client.sendall(frame(camera()))
+            client.sendall(frame(view()))
             reset(client)
 
 
@@ -321,7 +379,7 @@ HOSTILE: dict[str, Callable[[str, float], None]] = {
     "pings": _pings,
     "millions of messages": _millions,
     "pieces": _pieces,
-    "forms": _forms,
+    "keys": _keys,
     "never reads": _never_reads,
     "half open": _half_open,
     "long head": _long_head,

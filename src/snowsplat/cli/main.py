@@ -24,6 +24,7 @@ from snowsplat._version import __version__
 from snowsplat.cli.flags import with_flags
 from snowsplat.cli.help_text import join_lines_of_field_docstrings
 from snowsplat.cli.next_steps import next_step
+from snowsplat.cli.page_flags import has_screen
 from snowsplat.cli.reference_flags import translated
 from snowsplat.cli.reports import run
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
@@ -58,6 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if arguments[:1] == ["help"]:  # `help train` is `train --help`
         arguments = [*arguments[1:2], "--help"]
+    if not arguments and sys.stdout.isatty() and has_screen():
+        arguments = ["studio"]
     if arguments in ([], ["-h"], ["--help"]):
         print(overview())
         return 0

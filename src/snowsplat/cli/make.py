@@ -16,7 +16,7 @@ from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, page_at
 from snowsplat.cli.reports import JsonFlag, Reports
-from snowsplat.cli.stage_lines import photos_of_last_part
+from snowsplat.pipeline.stage_lines import photos_of_last_part
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError

@@ -6,10 +6,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from snowsplat.cli.page_flags import for_other_computers
-from snowsplat.cli.stage_lines import described
 from snowsplat.cli.stage_progress import StageProgress
 from snowsplat.cli.step_progress import StepProgress, held_out_line
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.stage_lines import described
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 

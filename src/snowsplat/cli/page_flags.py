@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import os
 import socket
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 from urllib.parse import urlsplit
@@ -53,6 +54,13 @@ def for_other_computers(url: str, others: Sequence[str]) -> list[str]:
 def over_ssh() -> bool:
     """Whether this shell is a remote one."""
     return any(name in os.environ for name in ("SSH_CONNECTION", "SSH_TTY"))
+
+
+def has_screen() -> bool:
+    """Whether a browser opened here has a screen; otherwise a text browser would take the shell."""
+    if sys.platform in ("win32", "darwin"):
+        return not over_ssh()
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def _forwarding(port: int | None) -> str:

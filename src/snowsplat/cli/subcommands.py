@@ -20,6 +20,7 @@ class Subcommand:
 SUBCOMMANDS = {
     name: Subcommand(usage, result, f"snowsplat.cli.{name}")
     for name, usage, result in (
+        ("studio", "[FOLDER]", "all of this in the browser"),
         ("demo", "", "try it, without own photos"),
         ("make", "PHOTOS", "photos or a video -> a scene"),
         ("sfm", "PHOTOS -o DATASET", "photos or a video -> a dataset"),
@@ -55,7 +56,7 @@ _WORDS = {
     "use publish (a web site), or convert SCENE FILE.html": "share upload web site html embed",
     "there are no meshes; convert writes Gaussians in other formats": "mesh obj",
     "use convert": "edit crop merge compress decimate transform resize rotate scale",
-    "use view": "show open play viewer serve gui display",
+    "use view, or studio for all in the browser": "show open play viewer serve gui display",
     "use make": "reconstruct splat build create scan run process new start",
     "use sfm": "colmap poses cameras match dataset process-data convert.py",
     "use train": "fit optimize optimise resume continue simple_trainer splatfacto gsplat",
@@ -86,7 +87,6 @@ def overview() -> str:
 
 
 _OVERVIEW = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
-
 {subcommands}
 
 A dataset: photos with their camera poses. Help for each: snowsplat NAME --help

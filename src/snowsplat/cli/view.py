@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import time
 import webbrowser
@@ -16,7 +14,7 @@ import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.page_flags import AllowHost, for_other_computers, over_ssh
+from snowsplat.cli.page_flags import AllowHost, for_other_computers, has_screen
 from snowsplat.util.errors import UserError
 
 
@@ -58,14 +56,15 @@ class View:
         if self.path is None:
             raise UserError("view needs a scene; add a file or the output folder of a training run")
         from snowsplat.pipeline.view import viewed_scene
-        from snowsplat.viewer.web.server import StaticServer
+        from snowsplat.viewer.http.server import WebServer
+        from snowsplat.viewer.http.static import static_app
 
         with (
             TerminalObserver() as observer,
             viewed_scene(self.path, self.iteration, observer) as scene,
             suppress(KeyboardInterrupt),
-            StaticServer(
-                scene.files, scene.headers, self.host, self.port, self.allow_host
+            WebServer(
+                static_app(scene.files), self.host, self.port, self.allow_host, scene.headers
             ) as server,
         ):
             site = scene.gaussians is None
@@ -77,13 +76,6 @@ class View:
                 open_browser(server.url)
             wait()
         return 0
-
-
-def has_screen() -> bool:
-    """Whether a browser opened here has a screen; otherwise a text browser would take the shell."""
-    if sys.platform in ("win32", "darwin"):
-        return not over_ssh()
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def open_browser(url: str) -> None:

@@ -63,7 +63,8 @@ _PACKAGES = (
         "av", "av", "videos are neither read nor written", "'FFmpeg ' + module.ffmpeg_version_info"
     ),
     _Package("pillow_heif", "pillow-heif", "HEIC photos cannot be read"),
-    _Package("viser", "viser", "train --view and watch do not work; view works"),
+    _Package("uvicorn", "uvicorn", "train, make, watch, view and studio do not work"),
+    _Package("starlette", "starlette", "train, make, watch, view and studio do not work"),
     _Package("zstandard", "zstandard", ".spz files of version 4 cannot be read or written"),
     _Package("safetensors", "safetensors", "evaluate cannot measure LPIPS"),
 )

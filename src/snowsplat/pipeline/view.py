@@ -16,10 +16,10 @@ from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.http.served_file import Served
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import PAGE, is_site, site_files
 from snowsplat.viewer.web.scene import site
-from snowsplat.viewer.web.served_file import Served
 
 #: Larger scenes are shown in levels of detail. The viewer never draws more Gaussians at a time.
 _LARGE = 4_000_000

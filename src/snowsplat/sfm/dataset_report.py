@@ -61,11 +61,9 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     Raises:
         UserError: the model in ``sparse/0`` or an image cannot be read.
     """
-    photos = _photos_with_poses(dataset, facts)
+    photos = _photos_with_poses(dataset, facts["gathered"]["photos"])
     name = _name(facts["inputs"])
-    points = read_points(dataset / "sparse" / "0")
-    xyz = np.empty((0, 3)) if points is None else points.xyz.numpy().astype(np.float64)
-    rgb = np.empty((0, 3), np.uint8) if points is None else points.rgb.numpy()
+    xyz, rgb = _points(dataset)
     more = advice(photos, xyz)
     placement = placement_of(facts["undistorted"])
     body = [
@@ -86,8 +84,24 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     return path
 
 
-def _photos_with_poses(dataset: Path, facts: dict[str, Any]) -> list[PlacedPhoto]:
-    sequences = {photo["name"]: photo["sequence"] for photo in facts["gathered"]["photos"]}
+def draw_from_above(dataset: Path) -> str:
+    """An SVG drawing of the cameras and points of a dataset, from above.
+
+    Raises: UserError: the model in ``sparse/0`` cannot be read.
+    """
+    return draw_scene(_photos_with_poses(dataset, []), *_points(dataset))[0].svg
+
+
+def _points(dataset: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (P, 3) float64, and colours (P, 3) uint8."""
+    points = read_points(dataset / "sparse" / "0")
+    if points is None:
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    return points.xyz.numpy().astype(np.float64), points.rgb.numpy()
+
+
+def _photos_with_poses(dataset: Path, gathered: Sequence[dict[str, Any]]) -> list[PlacedPhoto]:
+    sequences = {photo["name"]: photo["sequence"] for photo in gathered}
     model = read_model(dataset / "sparse" / "0")
     photos, drawn = [], set[str]()
     for image in model.images:

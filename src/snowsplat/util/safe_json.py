@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
@@ -135,7 +136,7 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
     """
     if not isinstance(values, dict):
         raise ValueError(f"not a {kind.__name__}")
-    hints = get_type_hints(kind)
+    hints = _hints(kind)  # type: ignore[arg-type]
     known = {field.name for field in fields(kind) if field.init}  # type: ignore[arg-type]
     if not values.keys() <= known:
         raise ValueError(
@@ -145,6 +146,12 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
         return kind(**{name: _as(hints[name], value) for name, value in values.items()})
     except TypeError as error:  # a field is missing
         raise ValueError(str(error)) from None
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    """The types of the fields. To find them takes longer than the rest of `from_json`."""
+    return get_type_hints(kind)
 
 
 def _as(hint: Any, value: Any) -> Any:

@@ -25,17 +25,6 @@ def test_the_camera_of_a_browser():
     assert 2 * math.atan(120 / camera.fy) == pytest.approx(1.0)
 
 
-def test_is_near_ignores_only_rounding():
-    here = pose()
-    same = Pose(-here.quat, here.position + 1e-6, here.fov, 10, 10)
-    assert here.is_near(same)
-    moved = Pose(here.quat, here.position + 0.01, here.fov, 640, 480)
-    turned = Pose(torch.tensor([1.0, 0, 0, 0]).double(), here.position, here.fov, 640, 480)
-    assert not here.is_near(moved)
-    assert not here.is_near(turned)
-    assert not here.is_near(pose(fov=1.1))
-
-
 def test_fit_keeps_the_aspect_ratio_and_never_enlarges():
     assert fit(1920, 1080, 960) == (960, 540)
     assert fit(400, 300, 960) == (400, 300)

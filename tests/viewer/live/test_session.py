@@ -2,7 +2,9 @@
 
 import threading
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -81,7 +83,7 @@ def test_every_change_needs_a_new_image(session, clock):
     session.move(visitor, pose())
     clock.now += 1
     assert serve(session, clock, 0, 0.01) == "still"
-    for change in ({"look": DisplaySettings("depth")}, {"longest": 320}):
+    for change in ({"display": DisplaySettings("depth")}, {"longest": 320}):
         session.change(visitor, **change)
         clock.now += 1
         assert serve(session, clock, 0, 0.01, training=False) == "still", change
@@ -203,27 +205,17 @@ def test_busy_depends_on_visitors(session):
 # The view at a photo
 
 
-def test_moving_away_leaves_the_photo(session, clock):
+def test_a_photo_is_shown_only_at_its_pose(session, clock):
     visitor = session.enter(1)
-    session.move(visitor, pose())
     camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
-    photo_view = PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
-    session.set_photo_view(visitor, photo_view)
-    clock.now += 0.1
-    session.move(visitor, pose(1))  # sent before the browser was moved
-    assert visitor.photo_view is photo_view
-    session.move(visitor, pose(5))
-    assert visitor.photo_view is photo_view
+    first, second = (PhotoView(i, camera, np.zeros((3, 4, 3), np.uint8)) for i in range(2))
+    session.move(visitor, pose(5), 1)
+    session.show_photo(visitor, first)  # it was read too late
+    assert visitor.photo_view is None
+    session.show_photo(visitor, second)
+    assert session.next_request(0, training=False).photo_view is second
+    session.move(visitor, replace(pose(5), width=800), 1)  # another size of the window
+    assert visitor.photo_view is second
     session.move(visitor, pose(5.1))
     assert visitor.photo_view is None
-
-
-def test_a_browser_that_never_arrives_leaves_the_photo(session, clock):
-    visitor = session.enter(1)
-    camera = Camera(4, 3, 5.0, 5.0, 2.0, 1.5, torch.eye(3, 4).double())
-    session.set_photo_view(
-        visitor, PhotoView(0, camera, torch.zeros(3, 3, 4, dtype=torch.uint8), pose(5))
-    )
-    clock.now += 10
-    session.move(visitor, pose(1))
-    assert visitor.photo_view is None
+    assert session.next_request(0, training=False).photo_view is None

@@ -22,15 +22,20 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.scene.initial_view import InitialView, overview
 from snowsplat.scene.render import render
+from snowsplat.viewer.http.server import WebServer
+from snowsplat.viewer.http.static import static_app
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import ready, site
-from snowsplat.viewer.web.server import StaticServer
 from snowsplat.viewer.web.viewer_page import FILM_SECONDS
 
 from ...browser import Browser, Page
 
 WIDTH, HEIGHT = 480, 360
 LOADED = "!!window.app"  # the viewer sets it after its first complete frame
+
+
+def serve(files, headers) -> WebServer:
+    return WebServer(static_app(files), headers=headers)
 
 
 def camera_of(start: InitialView) -> Camera:
@@ -150,7 +155,10 @@ def test_a_real_browser_shows_our_render(trained, tmp_path):
     gaussians, start, *_ = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
     files, headers = site(Description("scene"), trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
-    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT, frames=5.0) as browser:
+    with (
+        WebServer(static_app(files), headers=headers) as server,
+        Browser(WIDTH, HEIGHT, frames=5.0) as browser,
+    ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         shown = soon(page, lambda shown: psnr(shown, ours) > 30)
@@ -179,7 +187,10 @@ def test_a_real_browser_shows_levels_of_detail(trained, tmp_path):
     about = Description("scene")
     files, headers = site(about, trained.gaussians, trained.cameras, (0.0, 0.0, 0.0), levels)
     assert "scene.compressed.ply" not in files
-    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT, frames=5.0) as browser:
+    with (
+        WebServer(static_app(files), headers=headers) as server,
+        Browser(WIDTH, HEIGHT, frames=5.0) as browser,
+    ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         soon(page, lambda shown: psnr(shown, ours) > 29)
@@ -205,7 +216,10 @@ def test_a_real_browser_shows_an_antialiased_scene(trained, tmp_path):
     ours = picture(shown_scene, camera_of(start))
     unfiltered = dataclasses.replace(shown_scene, antialiased=False)
     files, headers = site(Description("scene"), small, trained.cameras, (0.0, 0.0, 0.0))
-    with StaticServer(files, headers) as server, Browser(WIDTH, HEIGHT, frames=5.0) as browser:
+    with (
+        WebServer(static_app(files), headers=headers) as server,
+        Browser(WIDTH, HEIGHT, frames=5.0) as browser,
+    ):
         page = browser.open(f"{server.url}?webgl&noui")
         page.wait_for(LOADED, 60)
         shown = soon(page, lambda shown: psnr(shown, ours) > 30)
@@ -215,7 +229,7 @@ def test_a_real_browser_shows_an_antialiased_scene(trained, tmp_path):
         assert not page.errors
 
 
-def with_controls(browser: Browser, server: StaticServer, before: np.ndarray) -> None:
+def with_controls(browser: Browser, server: WebServer, before: np.ndarray) -> None:
     """A second viewer at the same time, with its controls.
 
     It begins in orbit. Dragging rotates the scene. The film follows the photos; dragging ends it,

@@ -10,8 +10,8 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.viewer.hosts import LOCAL_HOST, KnownHosts
+from snowsplat.viewer.http.listen import listen
 from snowsplat.viewer.live.curves import SampledPsnr
-from snowsplat.viewer.live.server import free_port
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
@@ -42,7 +42,7 @@ class LivePage:
         self._viewer: NetworkViewer | None = None
         self._training: TrainingViewer | None = None
         self._trainer: Trainer | None = None
-        free_port(self.host, port)
+        listen(self.host, port).close()
 
     def __enter__(self) -> LivePage:
         return self

@@ -1,5 +1,6 @@
-"""The live viewer: a page built with viser, whose images the rasterizer of snowsplat renders.
+"""The live viewer: a page whose images the rasterizer of snowsplat renders.
 
 It shows Gaussians during training. Between two training steps, the images that browsers have
-requested are rendered, without a copy of the Gaussians. `viewer.NetworkViewer` is the page.
+requested are rendered, without a copy of the Gaussians. `viewer.NetworkViewer` is the page; `page/`
+is what runs in the browser.
 """

@@ -55,10 +55,9 @@ class Curve:
     def __len__(self) -> int:
         return len(self._points)
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """The steps and the values of the points, each (N,) float64."""
-        points = np.array(self._points, np.float64).reshape(-1, 2)
-        return points[:, 0].copy(), points[:, 1].copy()
+    def lists(self) -> tuple[list[float], list[float]]:
+        """The steps and the values of the points."""
+        return [step for step, _ in self._points], [value for _, value in self._points]
 
 
 class SampledPsnr:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, rotation_from_quat
+from snowsplat.scene.near_plane import NEAR
 
 Mode = Literal["color", "depth", "alpha", "normals", "points", "ellipsoids", "cost", "error"]
 
@@ -26,8 +27,7 @@ class DisplaySettings:
     mode: Mode = "color"
     sh_degree: int = 3  # degree of the spherical harmonics that are used for colours
     scale: float = 1.0  # factor on the size of every Gaussian
-    # Lower and upper corner (x, y, z) of a box; Gaussians outside are hidden. That of a visitor is
-    # in the frame of the page, see `NetworkViewer`; `draw` needs one in the world.
+    # Lower and upper corner (x, y, z) of a box in the world; Gaussians outside are hidden.
     crop: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     # Fraction of the width, from the left, in which the photo covers the rendering.
     wipe: float = 0.0
@@ -35,7 +35,7 @@ class DisplaySettings:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """The camera pose of a browser, in the frame of the page; see `NetworkViewer`."""
+    """The camera pose of a browser, in the world."""
 
     # (4,) wxyz, float64, rotation of world_from_cam; x right, y down, z forward.
     quat: Tensor = field(repr=False)
@@ -43,20 +43,14 @@ class Pose:
     fov: float  # vertical field of view in radians
     width: int  # of the window, in pixels
     height: int  # of the window, in pixels
+    number: int = 0  # that the browser has given to it
 
-    def camera(self, width: int, height: int) -> Camera:
-        """The camera of an image of this size."""
+    def camera(self, width: int, height: int, near: float = NEAR) -> Camera:
+        """The camera of an image of this size, with the near plane ``near`` (world units)."""
         focal = 0.5 * height / math.tan(0.5 * min(max(self.fov, _NARROWEST), _WIDEST))
         pose = torch.cat([rotation_from_quat(self.quat), self.position[:, None]], 1)
         cx, cy = 0.5 * width, 0.5 * height
-        return Camera(width, height, focal, focal, cx, cy, invert_rigid(pose))
-
-    def is_near(self, other: Pose) -> bool:
-        """Whether both are the same pose, except for rounding in the browser."""
-        turn = abs(float((self.quat * other.quat).sum()))
-        distance = float((self.position - other.position).norm())
-        size = 1.0 + float(self.position.norm())
-        return turn > 1.0 - 1e-6 and distance < 1e-4 * size and abs(self.fov - other.fov) < 1e-3
+        return Camera(width, height, focal, focal, cx, cy, invert_rigid(pose), near)
 
 
 def fit(width: int, height: int, longest: int) -> tuple[int, int]:

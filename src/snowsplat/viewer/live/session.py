@@ -1,7 +1,7 @@
 """The state of the browsers and of the training, and the choice of the next image to render.
 
 The thread of the server changes this state when browsers send messages. The thread of the training
-reads it between two steps. This module does not render or send images and does not depend on viser.
+reads it between two steps. This module does not render or send images.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
-from torch import Tensor
+import numpy as np
 
 from snowsplat.scene.camera import Camera
 from snowsplat.viewer.live.display import DisplaySettings, Pose, fit
 
 STILL = 0.2  # seconds without motion after which a camera counts as still
-MOVE_SECONDS = 2.0  # maximum time until a browser is at the pose of a photo
 # While the camera moves, images are made so small that rendering takes at most this many seconds.
 _MOVING_SECONDS = 0.05
 _MIN_SIDE = 160  # pixels: minimum of the longer side of such an image
@@ -32,12 +31,11 @@ _IDLE_SECONDS = 1.0  # minimum time between two idle images
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """A photo to whose pose a browser was moved, to compare the photo with its rendering."""
+    """A photo at whose pose a browser is, to compare the photo with its rendering."""
 
     index: int  # index of the photo in the viewer's list
     camera: Camera  # camera of the photo
-    photo: Tensor  # (3, H, W) uint8
-    pose: Pose  # pose to which the browser was moved
+    photo: np.ndarray  # (h, w, 3) uint8, of any size
 
 
 @dataclass(frozen=True)
@@ -62,10 +60,8 @@ class Visitor:
 
     pose: Pose | None = None
     display: DisplaySettings = field(default_factory=DisplaySettings)
-    photo_view: PhotoView | None = None
-    # Whether the browser has reached the pose of the photo. If it then moves, the photo view ends.
-    arrived: bool = False
-    photo_view_since: float = 0.0  # time when the browser was moved to the photo
+    photo: int | None = None  # index of the photo at whose pose the browser is
+    photo_view: PhotoView | None = None  # that photo, as soon as it is read
     longest: int = 1280  # pixels of the longer side of a full-size image
     on_the_way: int = 0  # images that were rendered, and have not arrived at the browser
     version: int = 0  # incremented with each change of the attributes above
@@ -75,11 +71,6 @@ class Visitor:
     shown_full: bool = False  # whether it had full size
     shown_scene: int = -1  # the number of the scene
     seconds_per_pixel: float = 0.0  # rendering time, averaged over the last images
-
-    @property
-    def going(self) -> bool:
-        """Whether the browser was moved to a photo and has not sent a pose from there yet."""
-        return self.photo_view is not None and not self.arrived
 
     def request(self, scene: int, now: float) -> RenderRequest | None:
         """The image that the browser needs at the time ``now``; None if it needs none.
@@ -159,24 +150,17 @@ class Session:
             visitor.changed = self._clock()
             self._notify()
 
-    def move(self, visitor: Visitor, pose: Pose) -> None:
-        """Set the pose of a browser. If the browser moves away from the photo, the photo view ends.
+    def move(self, visitor: Visitor, pose: Pose, photo: int | None = None) -> None:
+        """Set the pose of a browser, and the photo at whose pose it is."""
+        kept = visitor.photo_view
+        if kept is not None and kept.index != photo:
+            kept = None
+        self.change(visitor, pose=pose, photo=photo, photo_view=kept)
 
-        While `Visitor.going` is true, a pose that is not near the photo may have been sent before
-        the browser was moved to the photo. Call this method again with the last pose after
-        `MOVE_SECONDS`: if the user has moved the camera at once, the photo view then ends.
-        """
-        photo_view, arrived = visitor.photo_view, visitor.arrived
-        if photo_view is not None:
-            if pose.is_near(photo_view.pose):
-                arrived = True
-            elif arrived or self._clock() - visitor.photo_view_since > MOVE_SECONDS:
-                photo_view = None
-        self.change(visitor, pose=pose, photo_view=photo_view, arrived=arrived)
-
-    def set_photo_view(self, visitor: Visitor, photo_view: PhotoView) -> None:
-        """Record that a browser is moved to the pose of a photo."""
-        self.change(visitor, photo_view=photo_view, arrived=False, photo_view_since=self._clock())
+    def show_photo(self, visitor: Visitor, photo_view: PhotoView) -> None:
+        """Show a photo that was read, if the browser is still at its pose."""
+        if visitor.photo == photo_view.index:
+            self.change(visitor, photo_view=photo_view)
 
     def pause(self) -> None:
         """Pause the training after the current step."""

@@ -7,7 +7,6 @@ import time
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.interrupts import raise_deferred_interrupt
-from snowsplat.viewer.live.controls import TrainingPanel
 from snowsplat.viewer.live.curves import Curve, SampledPsnr
 from snowsplat.viewer.live.viewer import NetworkViewer
 
@@ -24,7 +23,6 @@ class TrainingViewer:
         self.viewer = viewer
         self._session = viewer.session
         self._session.training = True
-        self._panel = TrainingPanel(viewer.server, viewer.session)
         self._sampled_psnr = sampled_psnr
         self._losses, self._psnrs = Curve(), Curve()
         self._loss = math.nan
@@ -32,6 +30,8 @@ class TrainingViewer:
         self._rated = (0, time.monotonic())  # step and time at which the rate was last computed
         self._next = self._next_psnr = 0.0  # times of the next updates
         self._measured = 0  # step of the last PSNR
+        self._points = 0, 0  # of the curves that the page shows
+        self._tell()
 
     def after_step(self, step: int, steps: int, loss: float, gaussians: Gaussians) -> float:
         """Render the requested images and update the page; wait while the training is paused.
@@ -71,12 +71,30 @@ class TrainingViewer:
                 self._psnrs.add(step, psnr)
             took = time.monotonic() - now
             self._next_psnr = now + took / _PSNR_SHARE
-        pace = "paused" if self._session.paused else f"{self._steps_per_second(step):.1f} steps/s"
-        figures = [f"{len(gaussians):,} Gaussians", f"loss {self._loss:.4f}"]
-        if len(self._psnrs):
-            figures.append(f"PSNR {self._psnrs.arrays()[1][-1]:.2f} dB")
-        about = [f"Step {step:,} of {steps:,}, {pace}", ", ".join(figures)]
-        self._panel.show(about, step / steps, self._losses, self._psnrs)
+        psnrs = self._psnrs.lists()[1]
+        self._tell(
+            step=step,
+            steps=steps,
+            rate=None if self._session.paused else self._steps_per_second(step),
+            gaussians=len(gaussians),
+            loss=self._loss,
+            psnr=psnrs[-1] if psnrs else None,
+        )
+        self._tell_curves()
+
+    def _tell(self, **figures: object) -> None:
+        """Show the state of the training on all pages."""
+        session = self._session
+        control = {"paused": session.paused, "share": session.share}
+        self.viewer.tell({"type": "training", **control, **figures})
+
+    def _tell_curves(self) -> None:
+        """Show the curves on all pages, if they have new points."""
+        points = len(self._losses), len(self._psnrs)
+        if points != self._points:
+            self._points = points
+            curves = {"loss": self._losses.lists(), "psnr": self._psnrs.lists()}
+            self.viewer.tell({"type": "curves", **curves})
 
     def _steps_per_second(self, step: int) -> float:
         now = time.monotonic()
@@ -92,7 +110,8 @@ class TrainingViewer:
         """The training has finished: show lines of text about it instead of its controls."""
         self._session.training = False
         self._session.resume()
-        self._panel.end(about)
+        self._tell(finished=about)
+        self._tell_curves()
 
     def show(self, step: int, gaussians: Gaussians) -> None:
         """Show the result of the training until Ctrl-C, which raises KeyboardInterrupt."""

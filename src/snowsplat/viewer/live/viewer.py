@@ -3,42 +3,56 @@
 from __future__ import annotations
 
 import asyncio
-import functools
+import html
+import itertools
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-import viser
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
 
 from snowsplat.data import Dataset
+from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.near_plane import NEAR
-from snowsplat.viewer.live.controls import Controls, ScenePanel
-from snowsplat.viewer.live.display import Pose
-from snowsplat.viewer.live.guard import (
-    Connection,
-    ServerTimeLimit,
-    call_in_server_thread,
-    current_connection,
+from snowsplat.trajectory.focus import focus_of, up_of, viewing_distance
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.http.served_file import ServedFile, served
+from snowsplat.viewer.http.server import WebServer
+from snowsplat.viewer.http.static import static_app
+from snowsplat.viewer.live.browser import Browser
+from snowsplat.viewer.live.messages import (
+    Display,
+    Key,
+    Message,
+    Share,
+    Shown,
+    Thumbnails,
+    Training,
+    View,
+    to_json,
 )
-from snowsplat.viewer.live.key_cameras import KeyCameras
-from snowsplat.viewer.live.photos import Photos, fitted_photo
+from snowsplat.viewer.live.photos import Photos, fitted_photo, jpeg
 from snowsplat.viewer.live.pictures import draw
-from snowsplat.viewer.live.server import start_server, stop_server
-from snowsplat.viewer.live.session import MOVE_SECONDS, RenderRequest, Session, Visitor
-from snowsplat.viewer.live.shortcuts import Shortcuts, set_theme
+from snowsplat.viewer.live.session import RenderRequest, Session
+from snowsplat.viewer.live.time_limit import ServerTimeLimit
 
 _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
 _TICK = 0.02  # seconds between two checks for requested images
 _LONG_TICK = 0.5  # the same without browsers
 _POLL = 2.0  # seconds between two checks for a newer scene
-# The norm of the quaternion of a valid pose is above this value and below its inverse. Its distance
-# from the origin is below the inverse.
-_SMALL = 1e-9
+_PAGE = Path(__file__).parent / "page"
+_TITLE = "<title>snowsplat</title>"
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'self'"
+}
 
 _log = logging.getLogger(__name__)
 
@@ -58,22 +72,11 @@ class Scene:
     about: list[str]
 
 
-@dataclass(frozen=True)
-class _Browser:
-    client: viser.ClientHandle
-    connection: Connection
-    visitor: Visitor
-    controls: Controls
-
-
 class NetworkViewer:
     """A page at `url` that shows Gaussians.
 
     Attributes:
         others: the addresses of the page for other machines, if they differ from `url`.
-
-    In the page, the keys move the camera at a fixed speed, and distances have fixed limits. So its
-    frame is the world in another unit, a power of two, in which the near plane is the usual one.
 
     Images are rendered only in the thread that calls `serve` or `show_newest`. So the Gaussians do
     not change during rendering, and no copy of them is needed.
@@ -104,84 +107,148 @@ class NetworkViewer:
         self.session = Session()
         self.background = torch.tensor(background, dtype=torch.float32)
         views = [*dataset.train, *dataset.test]
-        self._world_from_page = replace(Similarity.identity(), scale=views[0].camera.near / NEAR)
-        change = self._world_from_page.inverse()
-        views = [replace(view, camera=view.camera.transformed(change)) for view in views]
-        self._bounds = change.apply(dataset.bounds)
-        running = start_server(host, port, label, allow_host)
-        self.server, self.url, self.others = running.server, running.url, running.others
-        set_theme(self.server.gui, dark=True)
+        self._near = views[0].camera.near
         self._photos = Photos(
-            self.server,
-            self.session,
-            views[: len(dataset.train)],
-            views[len(dataset.train) :],
-            change.scale * dataset.extent,
-            self._bounds.mean(0),
-            self.background,
+            self.session, dataset.train, dataset.test, dataset.extent, self.background
         )
-        self._browsers: dict[int, _Browser] = {}
-        self._photos.on_click(self._clicked)
-        self.server.on_client_connect(self._entered)
-        self.server.on_client_disconnect(self._left)
-        self._time_limit = ServerTimeLimit(self.server, lambda: self.session.training)
-        running.open()
+        self._told: dict[str, str] = {}  # the newest messages for all browsers, by type
+        self._training: dict[str, Any] = {}  # the newest one about the training
+        self._browsers: set[Browser] = set()
+        self._numbers = itertools.count()  # of browsers
+        cameras = [view.camera for view in views]
+        points = torch.zeros(0, 3) if dataset.points is None else dataset.points.xyz
+        focus = focus_of(cameras, viewing_distance(cameras, points))
+        self._tell(
+            {
+                "type": "scene",
+                "title": label,
+                "up": up_of(cameras).tolist(),
+                "focus": focus.tolist(),
+                "bounds": dataset.bounds.tolist(),
+                "extent": dataset.extent,
+                **self._photos.description(),
+            }
+        )
+        self._time_limit = ServerTimeLimit(lambda: self.session.training)
+        self.server = WebServer(self._app(label), host, port, allow_host, _HEADERS)
+        self.server.call(self._time_limit.measure)
+        self.url, self.others = self.server.url, self.server.others
 
     def close(self) -> None:
         """Close the page."""
         self._photos.close()
-        stop_server(self.server)
+        self.server.close()
+
+    def _app(self, label: str) -> ASGIApp:
+        """What the server serves: the files of the page, and the connections of browsers."""
+        files = served(_PAGE, _PAGE.iterdir())
+        title = f"<title>{html.escape(label)} - snowsplat</title>"
+        page = (_PAGE / "index.html").read_text("utf-8").replace(_TITLE, title, 1)
+        files[""] = ServedFile(page.encode(), "text/html; charset=utf-8")
+        page_app = static_app(files)
+
+        async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+            if scope["type"] == "websocket" and scope["path"] == "/live":
+                await self._connected(WebSocket(scope, receive, send))
+            else:
+                await page_app(scope, receive, send)
+
+        return answer
+
+    def tell(self, message: dict[str, Any]) -> None:
+        """Show a message to all browsers, present and future; its type is that of `page/main.js`.
+
+        It replaces the last one of its type. May be called in any thread.
+        """
+        self.server.call(lambda: self._tell(message))
 
     # The following methods run in the server's thread. Events are processed in order, and the next
     # message is read only after the previous one is processed.
 
-    async def _entered(self, client: viser.ClientHandle) -> None:
-        visitor = self.session.enter(client.client_id)
-        controls = Controls(client, self.session, visitor, self._photos, self._bounds)
-        KeyCameras(client, visitor, self._world_from_page)
-        Shortcuts(client, controls, self._bounds)
-        connection = current_connection.get()
-        connection.on_arrival = functools.partial(self.session.arrived, visitor)
-        self._browsers[client.client_id] = _Browser(client, connection, visitor, controls)
-        self._photos.begin()
+    def _tell(self, message: dict[str, Any]) -> None:
+        kind, text = message["type"], to_json(message)
+        if kind == "training":
+            self._training = message
+        self._told[kind] = text
+        for browser in self._browsers:
+            browser.tell(kind, text)
 
-        def move(pose: Pose) -> None:
-            self.session.move(visitor, pose)
-            controls.follow()
-            if visitor.going:
-                asyncio.get_running_loop().call_later(MOVE_SECONDS, move_again, pose)
+    def _tell_control(self) -> None:
+        """Show at once what a browser has set."""
+        if self._training:
+            session = self.session
+            self._tell({**self._training, "paused": session.paused, "share": session.share})
 
-        def move_again(pose: Pose) -> None:
-            if visitor.going and visitor.pose is pose:
-                move(pose)
+    async def _connected(self, socket: WebSocket) -> None:
+        """Serve a browser until it disconnects."""
+        number = next(self._numbers)
+        browser = Browser(socket, self.session.enter(number), self._photos)
+        self._browsers.add(browser)
+        try:
+            await socket.accept()
+            for kind, text in self._told.items():
+                browser.tell(kind, text)
+            await browser.run(lambda message: self._take(browser, message))
+        finally:
+            self._browsers.discard(browser)
+            self.session.leave(number)
 
-        async def moved(camera: viser.CameraHandle) -> None:
-            pose = _pose(camera)
-            if pose is not None:
-                move(pose)
+    def _wake(self) -> None:
+        for browser in self._browsers:
+            browser.wake()
 
-        await moved(client.camera)
-        client.camera.on_update(moved)
+    def _take(self, browser: Browser, message: Message) -> None:
+        """Process a message of a browser."""
+        session, visitor = self.session, browser.visitor
+        if isinstance(message, View):
+            self._move(browser, message)
+        elif isinstance(message, Shown):
+            session.arrived(visitor, browser.arrived(message.number))
+        elif isinstance(message, Thumbnails):
+            self._photos.begin(lambda: self.server.call(self._wake))
+            browser.want_thumbnails(message.count)
+        elif isinstance(message, Display):
+            longest = message.longest_side
+            session.change(visitor, display=message.settings(), longest=longest)
+        elif isinstance(message, Key) and visitor.pose is not None:
+            pose = visitor.pose
+            camera = pose.camera(pose.width, pose.height, self._near)
+            browser.tell_key(entries_of([("", camera)])[0])
+        elif isinstance(message, Training):
+            {"pause": session.pause, "resume": session.resume, "step": session.step}[message.do]()
+            self._tell_control()
+        elif isinstance(message, Share):
+            session.share = message.limited()
+            self._tell_control()
 
-    async def _left(self, client: viser.ClientHandle) -> None:
-        self.session.leave(client.client_id)
-        self._browsers.pop(client.client_id, None)
+    def _move(self, browser: Browser, view: View) -> None:
+        photo = view.photo
+        if photo is not None and not 0 <= photo < len(self._photos.views):
+            photo = None
+        self.session.move(browser.visitor, view.pose(), photo)
+        if photo is not None and (browser.reading is None or browser.reading.done()):
+            browser.reading = asyncio.create_task(self._read_photos(browser))
 
-    def _clicked(self, client: viser.ClientHandle, index: int) -> None:
-        browser = self._browsers.get(client.client_id)
-        if browser is not None:
-            browser.controls.go_to_photo(index)
+    async def _read_photos(self, browser: Browser) -> None:
+        """Read the photo at which a browser is, and then the one at which it is meanwhile."""
+        visitor, tried = browser.visitor, None
+        while visitor.photo is not None and visitor.photo != tried:
+            tried = visitor.photo
+            if visitor.photo_view is not None:
+                continue
+            try:
+                self.session.show_photo(visitor, await self._photos.read(tried))
+            except UserError as error:
+                message = {"type": "photo", "index": tried, "error": str(error)}
+                browser.tell("photo", to_json(message))
 
     def _send(self, request: RenderRequest, image: np.ndarray, drawing: float) -> None:
         started = time.monotonic()
-        browser = next((b for b in self._browsers.values() if b.visitor is request.visitor), None)
+        browser = next((b for b in self._browsers if b.visitor is request.visitor), None)
         try:
             if browser is not None:  # None: the browser has disconnected
-                scene, quality = browser.client.scene, _QUALITY[request.kind]
                 with self._time_limit.uncounted():
-                    scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
-                browser.connection.image_handed()
-                browser.client.flush()
+                    browser.show(jpeg(image, _QUALITY[request.kind]), request.pose.number)
         except Exception:
             self.session.arrived(request.visitor, 1)
             raise
@@ -204,25 +271,20 @@ class NetworkViewer:
             image = self._draw(request, gaussians)
             self.session.begin_sending(request.visitor)
             seconds = time.monotonic() - started
-            call_in_server_thread(self.server, lambda: self._send(request, image, seconds))
+            self.server.call(lambda: self._send(request, image, seconds))
         except Exception:  # an invalid request of a browser must not end the training
             _log.debug("an image was not rendered", exc_info=True)
         self.session.record_rendering(request, scene, time.monotonic() - started)
         return True
 
     def _draw(self, request: RenderRequest, gaussians: Gaussians) -> np.ndarray:
-        width, height, display, photo = request.width, request.height, request.display, None
+        width, height, photo = request.width, request.height, None
         if request.photo_view is None:
-            camera = request.pose.camera(width, height)
+            camera = request.pose.camera(width, height, self._near)
         else:
             photo = fitted_photo(request.photo_view, width, height)
             camera = photo.placed.camera(request.photo_view.camera, width, height)
-        if display.crop is not None:
-            box = self._world_from_page.apply(torch.tensor(display.crop, dtype=torch.float64))
-            (x, y, z), (u, v, w) = box.tolist()
-            display = replace(display, crop=((x, y, z), (u, v, w)))
-        camera = camera.transformed(self._world_from_page)
-        return draw(gaussians, camera, display, self.background, photo)
+        return draw(gaussians, camera, request.display, self.background, photo)
 
     def wait(self) -> None:
         """Wait for a change, or a fraction of a second."""
@@ -230,28 +292,15 @@ class NetworkViewer:
 
     def show_newest(self, newest: Callable[[], Scene]) -> None:
         """Show the scene that ``newest`` returns, until Ctrl-C, which raises KeyboardInterrupt."""
-        panel = ScenePanel(self.server)
         scene, checked = None, 0.0
         while True:
             if time.monotonic() - checked > _POLL:
                 before, scene = scene, newest()
                 checked = time.monotonic()
                 if scene != before:
-                    panel.show(scene.about)
+                    self.tell({"type": "about", "lines": scene.about})
             assert scene is not None
             if scene.gaussians is None or not self.serve(
                 scene.gaussians, scene.number, training=False
             ):
                 self.wait()
-
-
-def _pose(camera: viser.CameraHandle) -> Pose | None:
-    """The pose of a browser; None if it is not valid."""
-    quat, position = torch.from_numpy(camera.wxyz.copy()), torch.from_numpy(camera.position.copy())
-    turned = _SMALL < float(quat.norm()) < 1.0 / _SMALL
-    inside = float(position.norm()) < 1.0 / _SMALL
-    if not (turned and inside) or min(camera.image_width, camera.image_height) < 1:
-        return None
-    if not camera.fov > 0:
-        return None
-    return Pose(quat, position, camera.fov, camera.image_width, camera.image_height)

@@ -18,9 +18,9 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
+from snowsplat.viewer.http.served_file import Served, served
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene, ready
-from snowsplat.viewer.web.served_file import Served, served
 from snowsplat.viewer.web.viewer_page import asset, content_policy, page
 
 PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
@@ -97,7 +97,7 @@ def is_site(folder: Path) -> bool:
 
 
 def site_files(folder: Path) -> tuple[dict[str, Served], dict[str, str]]:
-    """The files of a site for a `StaticServer`, and the HTTP headers for them."""
+    """The files of a site for `static_app`, and the HTTP headers for them."""
     files = served(folder, sorted(file for file in folder.rglob("*") if file.is_file()))
     # The page contains the rest of its policy.
     return {"": files[PAGE], **files}, {"Content-Security-Policy": "frame-ancestors 'none'"}

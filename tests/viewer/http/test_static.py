@@ -13,9 +13,10 @@ import pytest
 
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.hosts import NO_TOKEN, KnownHosts
-from snowsplat.viewer.web import server as static_server
-from snowsplat.viewer.web.served_file import FileOnDisk, ServedFile
-from snowsplat.viewer.web.server import StaticServer
+from snowsplat.viewer.http import guard
+from snowsplat.viewer.http.served_file import FileOnDisk, ServedFile
+from snowsplat.viewer.http.server import WebServer
+from snowsplat.viewer.http.static import static_app
 
 from .. import clients
 
@@ -27,14 +28,18 @@ FILES = {
 POLICY = {"Content-Security-Policy": "default-src 'none'"}
 
 
+def serve(files, headers, **options) -> WebServer:
+    return WebServer(static_app(files), headers=headers, **options)
+
+
 @pytest.fixture(scope="module")
 def server():
-    with StaticServer(FILES, POLICY) as server:
+    with serve(FILES, POLICY) as server:
         yield server
 
 
 def ask(
-    server: StaticServer,
+    server: WebServer,
     name: str = "",
     method: str = "GET",
     path: str | None = None,
@@ -54,7 +59,7 @@ def ask(
 
 def test_address(server):
     assert re.fullmatch(rf"http://127\.0\.0\.1:{server.port}/[\w-]{{20,}}/", server.url)
-    with StaticServer(FILES, POLICY) as other:
+    with serve(FILES, POLICY) as other:
         assert other.url.split("/")[3] != server.url.split("/")[3]
 
 
@@ -121,7 +126,7 @@ def test_a_range_of_a_changed_file_returns_the_whole_file(server):
 def test_files_on_disk(tmp_path):
     path = tmp_path / "levels.webp"
     path.write_bytes(SCENE)
-    with StaticServer({"0_0/levels.webp": FileOnDisk(path, "image/webp")}, POLICY) as server:
+    with serve({"0_0/levels.webp": FileOnDisk(path, "image/webp")}, POLICY) as server:
         response, body = ask(server, "0_0/levels.webp")
         assert (response.status, response.getheader("Content-Type")) == (200, "image/webp")
         assert body == SCENE
@@ -138,7 +143,7 @@ def test_files_on_disk(tmp_path):
 def test_only_the_given_files_are_served(server):
     prefix = "/" + server.url.split("/", 3)[3]
     for path in (
-        *("/scene.ply", "/favicon.ico", prefix[:-1], prefix[:-2] + "/", "*"),
+        *("/scene.ply", "/favicon.ico", prefix[:-2], prefix[:-2] + "/", "*"),
         *(prefix + name for name in ("absent", "scene.ply/", ".", "..", "/", "SCENE.PLY", "%00")),
         *(prefix + up + "etc/passwd" for up in ("../" * 9, "..%2f" * 9, "%2e%2e/" * 9, "..\\" * 9)),
         *(prefix + name for name in ("%2Fetc%2Fpasswd", "//etc/passwd", "....//etc/passwd")),
@@ -146,6 +151,12 @@ def test_only_the_given_files_are_served(server):
     ):
         response, body = ask(server, path=path)
         assert (response.status, body) == (404, b""), path
+
+
+def test_an_address_without_its_last_slash_leads_to_the_page(server):
+    token = server.url.split("/")[3]
+    response, _ = ask(server, path=f"/{token}")
+    assert (response.status, response.headers["Location"]) == (308, f"{token}/")
 
 
 @pytest.mark.parametrize(
@@ -184,7 +195,7 @@ def test_hosts_if_other_machines_can_connect():
 
 def test_a_proxy_with_a_public_name(caplog):
     public, inner = "abc-80.proxy.example", "scenes.example"
-    with StaticServer(FILES, POLICY, allow_host=[f"{public}, {inner.upper()}."]) as server:
+    with serve(FILES, POLICY, allow_host=[f"{public}, {inner.upper()}."]) as server:
         assert server.others == [
             server.url.replace(f"http://127.0.0.1:{server.port}", f"https://{name}")
             for name in (public, inner)
@@ -262,8 +273,8 @@ def test_two_requests_at_once_have_two_responses(server):
 
 def test_an_incomplete_request_times_out(monkeypatch):
     """The time limit also applies if the request arrives byte by byte."""
-    monkeypatch.setattr(static_server, "_REQUEST_SECONDS", 0.5)
-    with StaticServer(FILES, POLICY) as server, clients.open_socket(server.url) as client:
+    monkeypatch.setattr(guard, "_REQUEST_SECONDS", 0.5)
+    with serve(FILES, POLICY) as server, clients.open_socket(server.url) as client:
         began = time.monotonic()
         with contextlib.suppress(ConnectionError):
             for byte in b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 100:
@@ -273,10 +284,10 @@ def test_an_incomplete_request_times_out(monkeypatch):
 
 
 def test_a_client_that_does_not_read_is_disconnected(monkeypatch):
-    monkeypatch.setattr(static_server._Handler, "timeout", 0.5)
+    monkeypatch.setattr(guard, "_SEND_SECONDS", 0.5)
     threads = threading.active_count()
     big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
-    with StaticServer(big, {}) as server:
+    with serve(big, {}) as server:
         path = "/" + server.url.split("/", 3)[3] + "big"
         stuck = [clients.open_socket(server.url) for _ in range(20)]
         for client in stuck:
@@ -305,7 +316,7 @@ def test_a_thousand_connections(server):
             strangers.append(client)
             if i % 100 == 99:
                 assert ask(server)[0].status == 200
-        most = static_server._CONNECTIONS
+        most = guard._CONNECTIONS
         assert threading.active_count() - threads <= most + 20
         own = len(os.listdir("/proc/self/fd")) - descriptors - len(strangers)
         assert own <= most + 20
@@ -336,7 +347,7 @@ def test_two_clients_and_many_requests_per_connection(server):
 
 def test_a_browser_that_disconnects_during_a_download(capfd, caplog):
     big = {"big": ServedFile(bytes(64 << 20), "application/octet-stream")}
-    with StaticServer(big, {}) as server:
+    with serve(big, {}) as server:
         path = "/" + server.url.split("/", 3)[3] + "big"
         for _ in range(5):
             with socket.create_connection(("127.0.0.1", server.port)) as client:
@@ -358,9 +369,8 @@ def test_a_browser_that_disconnects_during_a_download(capfd, caplog):
 
 def test_close_stops_the_server():
     threads = threading.active_count()
-    server = StaticServer(FILES, POLICY)
+    server = serve(FILES, POLICY)
     server.close()
-    server._thread.join(5)
     assert threading.active_count() <= threads
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", server.port)).close()
@@ -368,10 +378,10 @@ def test_close_stops_the_server():
 
 def test_unavailable_ports_and_hosts(server):
     with pytest.raises(UserError, match=f"port: {server.port} is in use; choose another"):
-        StaticServer(FILES, POLICY, port=server.port)
+        serve(FILES, POLICY, port=server.port)
     with pytest.raises(UserError, match="0 to 65535"):
-        StaticServer(FILES, POLICY, port=70_000)
+        serve(FILES, POLICY, port=70_000)
     with pytest.raises(UserError, match="not a name or address of this machine|cannot listen at"):
-        StaticServer(FILES, POLICY, host="no-such-host.invalid")
+        serve(FILES, POLICY, host="no-such-host.invalid")
     with pytest.raises(UserError, match=r"192\.0\.2\.1"):
-        StaticServer(FILES, POLICY, host="192.0.2.1")
+        serve(FILES, POLICY, host="192.0.2.1")

@@ -1,4 +1,4 @@
-"""The files of a `StaticServer`: in memory or on disk."""
+"""Files that `static_app` serves: in memory or on disk."""
 
 from __future__ import annotations
 
@@ -68,16 +68,21 @@ _TYPES = {
     ".jpg": "image/jpeg",
     ".js": "text/javascript; charset=utf-8",
     ".json": "application/json",
+    ".png": "image/png",
+    ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
     ".webp": "image/webp",
 }
 
 
+def content_type(file: Path) -> str:
+    """The content type of a file, by its suffix."""
+    return _TYPES.get(file.suffix, "application/octet-stream")
+
+
 def served(folder: Path, files: Iterable[Path]) -> dict[str, Served]:
     """Files in a folder, by their quoted paths in it."""
     return {
-        quote(file.relative_to(folder).as_posix()): FileOnDisk(
-            file, _TYPES.get(file.suffix, "application/octet-stream")
-        )
+        quote(file.relative_to(folder).as_posix()): FileOnDisk(file, content_type(file))
         for file in files
     }

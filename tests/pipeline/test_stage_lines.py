@@ -1,6 +1,6 @@
 """The lines about finished stages."""
 
-from snowsplat.cli.stage_lines import described
+from snowsplat.pipeline.stage_lines import described
 
 
 def test_what_is_fixed_to_the_frame_follows_the_number_of_photos():

@@ -1,0 +1,410 @@
+"""`studio_app`: the requests of the page of the studio.
+
+    GET  /                            the page, and its modules
+    GET  /about                       addresses for other devices
+    GET  /browse?path=                folders of this machine
+    GET  /scenes                      all scenes; POST makes a new one
+    GET  /scenes/NAME                 a scene: its settings, progress and result
+    GET  /scenes/NAME/uploads         what has arrived; PUT adds a part
+    POST /scenes/NAME/survey          what the photos are, and how long it takes
+    POST /scenes/NAME/start, /stop    its job
+    GET  /scenes/NAME/photos          names of its photos; /photos/N is a small one
+    GET  /scenes/NAME/map             the cameras and points from above
+    POST /scenes/NAME/exports/KIND    writes a file; GET sends it
+    GET  /scenes/NAME/site/…, /made/… the scene in the viewer, its reports
+    GET  /scenes/NAME/live/…          the page of the running training, with its WebSocket
+
+Answers are JSON; an error is ``{"error": …}``, one line for people.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import math
+import os
+import socket
+from collections import defaultdict
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import segno
+from PIL import Image, ImageOps
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from snowsplat.studio import job
+from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
+from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
+from snowsplat.studio.relay import relay_file, relay_socket
+from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import is_file, printable
+from snowsplat.viewer.http.served_file import FileOnDisk, content_type
+from snowsplat.viewer.http.static import send_file
+
+_PAGES = Path(__file__).parent / "pages"
+_QUALITIES = ("draft", "normal", "best")
+_LONGEST_MINUTES = 7 * 24 * 60
+_PHOTOS = 120  # of which small pictures are shown
+_SMALL = 240  # pixels of their longer side
+_FOLDERS = 500  # that are listed
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff", ".mp4", ".mov", ".zip")
+#: The content security policy of the page.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+# The site has the rest of its policy in its page.
+_SITE_POLICY = "frame-ancestors 'self'"
+_REPORT_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src 'self' data:; frame-ancestors 'self'"
+)
+
+_Answer = Callable[[Request, Scene], Awaitable[Any]]
+
+
+def studio_app(library: Library, addresses: Callable[[], list[str]]) -> Starlette:
+    """The app. ``addresses``: the URLs of the page for other machines."""
+    app = Starlette(routes=_Studio(library, addresses).routes())
+    app.router.redirect_slashes = False  # the address would lack the token
+    return app
+
+
+class _File:
+    """A response with a file, and further headers."""
+
+    def __init__(self, path: Path, **headers: str) -> None:
+        self._path, self._headers = path, headers
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        file = FileOnDisk(self._path, content_type(self._path)) if is_file(self._path) else None
+        await send_file(file, scope, receive, send, self._headers)
+
+
+class _Studio:
+    def __init__(self, library: Library, addresses: Callable[[], list[str]]) -> None:
+        self._library, self._addresses = library, addresses
+        # By scene ("": all) and kind of work: a second request waits for the first one.
+        self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
+
+    def routes(self) -> list[BaseRoute]:
+        page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
+        scene = [
+            ("", "GET", self._scene),
+            ("/uploads", "GET", self._received),
+            ("/uploads", "PUT", self._upload),
+            ("/survey", "POST", self._survey),
+            ("/start", "POST", self._start),
+            ("/stop", "POST", self._stop),
+            ("/photos", "GET", self._photos),
+            ("/photos/{number:int}", "GET", self._photo),
+            ("/map", "GET", self._map),
+            ("/exports/{kind}", "POST", self._export),
+            ("/exports/{kind}", "GET", self._exported),
+            ("/site/{path:path}", "GET", self._site),
+            ("/made/{path:path}", "GET", self._made),
+            ("/live/{path:path}", "GET", self._live),
+        ]
+        return [
+            *page,
+            WebSocketRoute("/scenes/{name}/live/live", self._live_images),
+            Route("/about", _answering(self._about)),
+            Route("/browse", _answering(self._browse)),
+            Route("/scenes", _answering(self._scenes), methods=["GET"]),
+            Route("/scenes", _answering(self._new), methods=["POST"]),
+            *(
+                Route(f"/scenes/{{name}}{path}", _answering(self._of(answer)), methods=[method])
+                for path, method, answer in scene
+            ),
+        ]
+
+    def _of(self, answer: _Answer) -> Callable[[Request], Awaitable[Any]]:
+        async def find(request: Request) -> Any:
+            return await answer(request, self._library.find(request.path_params["name"]))
+
+        return find
+
+    async def _page(self, request: Request) -> Any:
+        return _File(_PAGES / (request.url.path.strip("/") or "index.html"))
+
+    async def _about(self, request: Request) -> Any:
+        path = request.query_params.get("path", "")
+        urls = [f"{url}{path}" for url in self._addresses()]
+        codes = [segno.make(url, error="m").svg_data_uri(scale=4, border=2) for url in urls]
+        return {
+            "folder": str(self._library.folder),
+            "addresses": [{"url": u, "code": c} for u, c in zip(urls, codes, strict=True)],
+        }
+
+    async def _browse(self, request: Request) -> Any:
+        path = request.query_params.get("path") or str(self._library.folder.parent)
+        return _listing(Path(os.path.expanduser(path)))
+
+    async def _scenes(self, request: Request) -> Any:
+        return [_summary(scene) for scene in self._library.scenes()]
+
+    async def _new(self, request: Request) -> Any:
+        wanted = await _object(request)
+        path = str(wanted.get("path") or "").strip()
+        inputs = [Path(os.path.expanduser(path))] if path else []
+        if inputs and not inputs[0].is_absolute():
+            raise UserError(f"{printable(path)}: write the whole path, such as /home/me/photos")
+        names = [path.name if _is_folder(path) else path.stem for path in inputs]
+        title = str(wanted.get("title") or "".join(names))
+        return {"name": self._library.new(title, inputs).name}
+
+    async def _scene(self, request: Request, scene: Scene) -> Any:
+        state, made = scene.state(), scene.job
+        has_page = state.pop("page", None) is not None  # its address is a secret of the job
+        return {
+            "name": scene.name,
+            "title": made.title,
+            "inputs": made.inputs,
+            "quality": made.quality,
+            "minutes": made.minutes,
+            "status": _status(scene, state),
+            "state": state,
+            "has_page": has_page,
+            "has_map": (scene.folder / "map.svg").is_file(),
+            "command": make_command(scene, made),
+            "exports": {kind: export_command(scene, kind) for kind in FORMATS},
+        }
+
+    async def _received(self, request: Request, scene: Scene) -> Any:
+        return await asyncio.to_thread(received, scene)
+
+    async def _upload(self, request: Request, scene: Scene) -> Any:
+        query = request.query_params
+        size, start = (_whole(query.get(name)) for name in ("size", "start"))
+        if job.is_running(scene):
+            raise UserError("the scene is being made; stop it, then add photos")
+        if scene.job.inputs:
+            raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
+        data = await request.body()
+        path = query.get("path", "")
+        async with self._locks[scene.name, "upload"]:
+            return {"received": await asyncio.to_thread(write_part, scene, path, size, start, data)}
+
+    async def _survey(self, request: Request, scene: Scene) -> Any:
+        async with self._locks["", "survey"]:
+            return await asyncio.to_thread(job.work, "survey", scene.folder)
+
+    async def _start(self, request: Request, scene: Scene) -> Any:
+        wanted = await _object(request)
+        quality, minutes = wanted.get("quality"), wanted.get("minutes")
+        if quality is not None and quality not in _QUALITIES:
+            raise UserError(f"quality: choose from {', '.join(_QUALITIES)}")
+        if minutes is not None and not (
+            isinstance(minutes, int | float)
+            and math.isfinite(minutes)
+            and 0 < minutes <= _LONGEST_MINUTES
+        ):
+            raise UserError(f"minutes: use a number above 0, at most {_LONGEST_MINUTES}")
+        scene.inputs()
+        async with self._locks[scene.name, "start"]:
+            if not job.is_running(scene):
+                title = safe_title(str(wanted.get("title") or scene.job.title))
+                scene.change(title=title, quality=quality, minutes=minutes)
+            job.start(scene)
+        return {}
+
+    async def _stop(self, request: Request, scene: Scene) -> Any:
+        job.stop(scene)
+        return {}
+
+    async def _photos(self, request: Request, scene: Scene) -> Any:
+        return [path.name for path in await asyncio.to_thread(_shown_photos, scene)]
+
+    async def _photo(self, request: Request, scene: Scene) -> Any:
+        shown = await asyncio.to_thread(_shown_photos, scene)
+        number = request.path_params["number"]
+        if number >= len(shown):
+            raise UnknownScene("there is no such photo")
+        return Response(await asyncio.to_thread(_small, shown[number]), media_type="image/jpeg")
+
+    async def _map(self, request: Request, scene: Scene) -> Any:
+        return _File(scene.folder / "map.svg")
+
+    async def _export(self, request: Request, scene: Scene) -> Any:
+        kind = _kind(request)
+        async with self._locks["", "export"]:
+            return await asyncio.to_thread(job.work, "export", scene.folder, kind)
+
+    async def _exported(self, request: Request, scene: Scene) -> Any:
+        file = export_file(scene, _kind(request))
+        name = f"attachment; filename*=UTF-8''{quote(file.name)}"
+        return _File(file, **{"Content-Disposition": name})
+
+    async def _site(self, request: Request, scene: Scene) -> Any:
+        path = request.path_params["path"] or "index.html"
+        file = _inside(scene.site, path)
+        return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
+
+    async def _made(self, request: Request, scene: Scene) -> Any:
+        file = _inside(scene.made, request.path_params["path"])
+        return _File(file, **{"Content-Security-Policy": _REPORT_POLICY})
+
+    async def _live(self, request: Request, scene: Scene) -> Any:
+        page = scene.state().get("page")
+        if page is None:
+            raise UnknownScene("no training runs")
+        return await relay_file(page, quote(request.path_params["path"]))
+
+    async def _live_images(self, socket: WebSocket) -> None:
+        try:
+            page = self._library.find(socket.path_params["name"]).state().get("page")
+        except UnknownScene:
+            page = None
+        if page is None:
+            await socket.close()
+        else:
+            await relay_socket(socket, page)
+
+
+def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
+    """An endpoint: what ``answer`` returns as JSON, or its error."""
+
+    async def endpoint(request: Request) -> Any:
+        try:
+            value = await answer(request)
+            fresh = {"Cache-Control": "no-store"}
+            return value if callable(value) else JSONResponse(value, headers=fresh)
+        except WrongPart as error:
+            return JSONResponse({"error": str(error), "received": error.received}, 409)
+        except UserError as error:
+            codes = {UnknownScene: 404, NoSpace: 507}
+            return JSONResponse({"error": str(error)}, codes.get(type(error), 400))
+        except OSError as error:
+            where = f"{printable(str(error.filename))}: " if error.filename else ""
+            return JSONResponse({"error": f"{where}{error.strerror or error}"}, 500)
+
+    return endpoint
+
+
+def _page_files() -> list[str]:
+    return sorted(path.name for path in _PAGES.iterdir())
+
+
+def _summary(scene: Scene) -> dict[str, Any]:
+    """A scene in the list of all; one whose file is damaged does not hide the others."""
+    try:
+        about = {"title": scene.job.title, "created": scene.job.created}
+        about["status"] = _status(scene, scene.state())
+    except UserError:
+        about = {"title": scene.name, "created": "", "status": "failed"}
+    picture = (scene.site / "poster.jpg").is_file()
+    return {"name": scene.name, "picture": picture, **about}
+
+
+def _status(scene: Scene, state: dict[str, Any]) -> str:
+    """One of new, running, done, stopped, failed or, if the process was killed, interrupted."""
+    if job.is_running(scene):
+        return "running"
+    if not state and scene.job.quality is None and scene.job.minutes is None:
+        return "new"
+    return str(state.get("outcome", "interrupted"))
+
+
+async def _object(request: Request) -> dict[str, Any]:
+    try:
+        wanted = await request.json()
+    except (ValueError, RecursionError):
+        wanted = None
+    if not isinstance(wanted, dict):
+        raise UserError("the request is no JSON object")
+    return wanted
+
+
+def _whole(text: str | None) -> int:
+    if text is None or not (text.isascii() and text.isdecimal()) or len(text) > 18:
+        raise UserError("size and start are whole numbers of bytes")
+    return int(text)
+
+
+def _kind(request: Request) -> str:
+    kind = str(request.path_params["kind"])
+    if kind not in FORMATS:
+        raise UnknownScene(f"the formats are {', '.join(FORMATS)}")
+    return kind
+
+
+def _inside(folder: Path, path: str) -> Path:
+    """A file in a folder. Raises UnknownScene: the path leads elsewhere."""
+    try:
+        file = (folder / path).resolve()
+        inside = file.is_relative_to(folder.resolve())
+    except (OSError, ValueError):
+        inside = False
+    if not inside:
+        raise UnknownScene("there is no such file")
+    return file
+
+
+def _listing(path: Path) -> dict[str, Any]:
+    """The folders in a folder of this machine, and how many photos, videos and zip files it has."""
+    try:
+        entries = sorted(path.iterdir(), key=lambda entry: entry.name.casefold())
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"{printable(str(path))}: {getattr(error, 'strerror', None) or 'no such folder'}"
+        ) from None
+    shown = [entry for entry in entries if not entry.name.startswith(".")]
+    folders = [entry.name for entry in shown if _is_folder(entry)]
+    return {
+        "path": str(path),
+        "parent": str(path.parent),
+        "folders": folders[:_FOLDERS],
+        "files": [e.name for e in shown if e.suffix.lower() in (".mp4", ".mov", ".zip")][:_FOLDERS],
+        "photos": sum(entry.suffix.lower() in _SUFFIXES for entry in shown),
+    }
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
+
+
+def _shown_photos(scene: Scene) -> list[Path]:
+    """The photos of the dataset: those with a pose as soon as they are known, before that all."""
+    for name in ("images", "input"):
+        folder = scene.made / "dataset" / name
+        if folder.is_dir():
+            found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
+            step = max(1, math.ceil(len(found) / _PHOTOS))
+            return found[::step]
+    return []
+
+
+def _small(path: Path) -> bytes:
+    """A small picture as a JPEG file. Raises UserError: the file is no photo."""
+    try:
+        with Image.open(path) as photo:
+            photo.draft("RGB", (2 * _SMALL, 2 * _SMALL))  # faster JPEG decoding
+            small = ImageOps.exif_transpose(photo)
+            small.thumbnail((_SMALL, _SMALL))
+            file = io.BytesIO()
+            small.convert("RGB").save(file, "JPEG", quality=80)
+            return file.getvalue()
+    except (OSError, ValueError, SyntaxError):
+        raise UserError(f"{printable(path.name)}: cannot be shown") from None
+
+
+def own_address() -> str | None:
+    """The address of this machine in its network, for phones that do not know its name."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+            return str(probe.getsockname()[0])
+        except OSError:
+            return None

@@ -1,0 +1,40 @@
+"""The formats in which a finished scene is handed on, and the command lines that do the same."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from snowsplat.studio.library import Job, Scene, safe_name
+
+#: By kind: the end of the file's name.
+FORMATS = {
+    "ply": ".ply",
+    "spz": ".spz",
+    "sog": ".sog",
+    "glb": ".glb",
+    "html": ".html",
+    "zip": ".zip",
+}
+
+
+def export_file(scene: Scene, kind: str) -> Path:
+    """The file of a scene in one of `FORMATS`; it need not exist."""
+    return scene.exports / (safe_name(scene.job.title) + FORMATS[kind])
+
+
+def export_command(scene: Scene, kind: str) -> str:
+    """The command line that writes it."""
+    if kind == "zip":
+        return shlex.join(["snowsplat", "publish", str(scene.made), "-o", "site"])
+    file = scene.scene_file() or scene.made
+    return shlex.join(["snowsplat", "convert", str(file), export_file(scene, kind).name])
+
+
+def make_command(scene: Scene, job: Job) -> str:
+    """The command line that makes the scene."""
+    inputs = job.inputs or [str(scene.photos)]
+    words = ["snowsplat", "make", *inputs, "-o", str(scene.made)]
+    words += ["--quality", job.quality] if job.quality else []
+    words += ["--minutes", f"{job.minutes:g}"] if job.minutes else []
+    return shlex.join(words)

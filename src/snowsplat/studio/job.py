@@ -1,0 +1,95 @@
+"""The processes of a scene: `start` and `stop` a job, ask whether one runs, and run other work."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from snowsplat.studio.library import Scene
+from snowsplat.util.errors import UserError
+from snowsplat.util.run_lock import InUse, locked
+
+_WORKER = [sys.executable, "-m", "snowsplat.studio.worker"]
+# Jobs that this process has started: they are asked whether they have ended, or they would stay
+# in the table of processes.
+_started: dict[Path, subprocess.Popen[bytes]] = {}
+
+
+def start(scene: Scene) -> None:
+    """Start the job of a scene, or resume it. It goes on if this process ends.
+
+    Raises: UserError: it runs already.
+    """
+    if is_running(scene):
+        raise UserError("this scene is being made already")
+    with open(scene.log, "wb") as log:
+        _started[scene.folder] = subprocess.Popen(
+            [*_WORKER, "make", str(scene.folder)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+
+
+def is_running(scene: Scene) -> bool:
+    """Whether a process, started here or elsewhere, makes the scene."""
+    process = _started.get(scene.folder)
+    if process is not None and process.poll() is None:
+        return True
+    _started.pop(scene.folder, None)
+    if not scene.lock.exists():
+        return False
+    try:
+        with locked(scene.lock, "", wait=0.0):
+            return False
+    except InUse:
+        return True
+
+
+def stop(scene: Scene) -> None:
+    """Ask the job to save what it has, and to end; does nothing if none runs.
+
+    Raises: UserError: it runs on another computer.
+    """
+    if not is_running(scene):
+        return
+    process = _started.get(scene.folder)
+    state = scene.state()
+    if process is not None:
+        process.terminate()
+    elif state.get("host") == socket.gethostname():
+        os.kill(int(state["process"]), signal.SIGTERM)
+    else:
+        raise UserError(f"this scene is being made on {state.get('host', 'another computer')}")
+
+
+def work(*words: str | Path) -> dict[str, Any]:
+    """Run another task of the worker, and wait for its answer; see `snowsplat.studio.worker`.
+
+    Raises: UserError: what the worker has said.
+    """
+    command = [*_WORKER, *map(str, words)]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True)
+    answer = _last_line(done.stdout.decode("utf-8", "replace").splitlines())
+    if answer is None:
+        lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        raise UserError(f"an unexpected fault: {lines[-1] if lines else 'the process was killed'}")
+    if "error" in answer:
+        raise UserError(answer["error"])
+    return answer
+
+
+def _last_line(lines: Sequence[str]) -> dict[str, Any] | None:
+    """Libraries may print other lines before it."""
+    try:
+        return dict(json.loads(lines[-1]))
+    except (IndexError, ValueError, TypeError):
+        return None

@@ -1,0 +1,105 @@
+// Elements, requests and numbers, for all parts of the page.
+
+import { say } from "./text.js";
+
+/**
+ * A new element.
+ * @param {string} tag name, with classes: "p.soft"
+ * @param {Record<string, any>} [attributes] functions are listeners: {click: …}
+ * @param {...(Node | string | null | undefined | false)} children
+ * @returns {HTMLElement}
+ */
+export function make(tag, attributes = {}, ...children) {
+    const [name, ...classes] = tag.split(".");
+    const element = document.createElement(name);
+    element.classList.add(...classes);
+    for (const [key, value] of Object.entries(attributes)) {
+        if (typeof value === "function") element.addEventListener(key, value);
+        else if (value === true) element.setAttribute(key, "");
+        else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, String(value));
+    }
+    element.append(...children.filter(child => child !== null && child !== undefined && child !== false));
+    return element;
+}
+
+/** An error that the server has told in one line. */
+export class Refused extends Error {
+    /**
+     * @param {string} message
+     * @param {number} status
+     * @param {any} answer
+     */
+    constructor(message, status, answer) {
+        super(message);
+        this.status = status;
+        this.answer = answer;
+    }
+}
+
+/**
+ * The JSON answer of the server.
+ * @param {string} path relative to the page
+ * @param {string} [method]
+ * @param {any} [body] an object is sent as JSON
+ * @returns {Promise<any>}
+ */
+export async function ask(path, method = "GET", body = undefined) {
+    const raw = body === undefined || body instanceof Blob;
+    const response = await fetch(path, { method, body: raw ? body : JSON.stringify(body) });
+    const answer = await response.json().catch(() => ({}));
+    if (!response.ok) throw new Refused(answer.error ?? `${response.status}`, response.status, answer);
+    return answer;
+}
+
+/** @param {string} text shown for some seconds; "" hides it */
+export function notice(text) {
+    const element = /** @type {HTMLElement} */ (document.getElementById("notice"));
+    element.textContent = text;
+    element.hidden = !text;
+    clearTimeout(hiding);
+    hiding = setTimeout(() => (element.hidden = true), 12000);
+}
+/** @type {ReturnType<typeof setTimeout> | undefined} */
+let hiding;
+
+/** Runs an action of a button, which is disabled meanwhile; tells an error. */
+export function action(/** @type {() => Promise<any>} */ run) {
+    return async (/** @type {Event} */ event) => {
+        const button = /** @type {HTMLButtonElement} */ (event.currentTarget);
+        event.preventDefault();
+        button.disabled = true;
+        try {
+            await run();
+        } catch (error) {
+            notice(error instanceof Refused ? error.message : say("offline"));
+        } finally {
+            button.disabled = false;
+        }
+    };
+}
+
+/** A command line that does the same, to copy. */
+export function command(/** @type {string} */ line) {
+    return make(
+        "div.command",
+        {},
+        make("code", {}, line),
+        // Browsers give the clipboard only to pages of this machine, or with https.
+        navigator.clipboard && make("button.plain", { type: "button", click: () => navigator.clipboard.writeText(line) }, say("copy")),
+    );
+}
+
+/** @param {number} count of bytes */
+export function bytes(count) {
+    for (const [unit, name] of /** @type {[number, string][]} */ ([[1e9, "GB"], [1e6, "MB"], [1e3, "kB"]])) {
+        if (count >= unit) return `${(count / unit).toFixed(count < 10 * unit ? 1 : 0)} ${name}`;
+    }
+    return `${count} B`;
+}
+
+/** @param {number} seconds */
+export function duration(seconds) {
+    if (seconds < 60) return say("seconds", Math.max(1, Math.round(seconds)));
+    if (seconds < 3600) return say("minutes", Math.round(seconds / 60));
+    return say("hours", (seconds / 3600).toFixed(1));
+}

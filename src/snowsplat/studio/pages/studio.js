@@ -1,0 +1,147 @@
+// The start page, and which page is shown.
+
+import { action, ask, make, notice } from "./page.js";
+import { showScene, upload } from "./scene.js";
+import { say, speak } from "./text.js";
+import { chosen, dropped, titleOf } from "./upload.js";
+
+const main = /** @type {HTMLElement} */ (document.getElementById("main"));
+let closing = new AbortController();
+
+function route() {
+    closing.abort();
+    closing = new AbortController();
+    notice("");
+    const name = decodeURIComponent(location.hash.slice(1));
+    if (name) showScene(main, name, closing.signal);
+    else showStart(closing.signal);
+    main.scrollIntoView();
+}
+
+function showStart(/** @type {AbortSignal} */ closed) {
+    document.title = "snowsplat studio";
+    const files = make("input", { type: "file", multiple: true, change: picked });
+    const folder = make("input", { type: "file", webkitdirectory: true, change: picked });
+    const zone = make(
+        "section.drop",
+        {},
+        make("h1", {}, say("title")),
+        make("p", {}, say("drop")),
+        make(
+            "div.row",
+            {},
+            make("label.button.main", {}, say("choose_files"), files),
+            make("label.button.plain", {}, say("choose_folder"), folder),
+        ),
+        make("p.soft", {}, say("private")),
+    );
+    const grid = make("div.grid");
+    const kept = make("p.soft");
+    main.replaceChildren(zone, machinePart(), make("h2", {}, say("recent")), grid, kept);
+
+    const over = (/** @type {boolean} */ on) => (/** @type {Event} */ event) => {
+        event.preventDefault();
+        zone.classList.toggle("over", on);
+    };
+    main.addEventListener("dragover", over(true), { signal: closed });
+    main.addEventListener("dragleave", over(false), { signal: closed });
+    main.addEventListener("drop", event => {
+        over(false)(event);
+        if (event.dataTransfer) dropped(event.dataTransfer).then(begin);
+    }, { signal: closed });
+
+    Promise.all([ask("scenes"), ask("about")]).then(
+        ([scenes, about]) => {
+            grid.replaceChildren(...(scenes.length ? scenes.map(tile) : [make("p.soft", {}, say("none"))]));
+            kept.textContent = say("kept", about.folder);
+        },
+        () => notice(say("offline")),
+    );
+}
+
+function tile(/** @type {any} */ scene) {
+    const address = `scenes/${encodeURIComponent(scene.name)}`;
+    return make(
+        "a.tile",
+        { href: `#${encodeURIComponent(scene.name)}` },
+        scene.picture ? make("img", { src: `${address}/site/poster.jpg`, alt: "", loading: "lazy" }) : make("div.empty"),
+        make("b", {}, scene.title),
+        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString()}`}`),
+    );
+}
+
+function picked(/** @type {Event} */ event) {
+    const input = /** @type {HTMLInputElement} */ (event.target);
+    if (input.files) begin(chosen(input.files));
+}
+
+async function begin(/** @type {import("./upload.js").Item[]} */ items) {
+    if (!items.length) return;
+    try {
+        const { name } = await ask("scenes", "POST", { title: titleOf(items) });
+        upload(name, items);
+        location.hash = encodeURIComponent(name);
+    } catch {
+        notice(say("offline"));
+    }
+}
+
+/** Chooses a folder of the machine where the studio runs. */
+function machinePart() {
+    const path = /** @type {HTMLInputElement} */ (make("input", { type: "text", autocomplete: "off", spellcheck: "false", "aria-label": say("path"), placeholder: say("path") }));
+    const list = make("div.folders");
+    const use = async () => {
+        const { name } = await ask("scenes", "POST", { path: path.value });
+        location.hash = encodeURIComponent(name);
+    };
+    const look = async (/** @type {string} */ where) => {
+        const found = await ask(`browse?path=${encodeURIComponent(where)}`);
+        path.value = found.path;
+        const inside = (/** @type {string} */ name) => `${found.path.replace(/[/\\]$/, "")}/${name}`;
+        list.replaceChildren(
+            make("button.plain", { type: "button", click: action(() => look(found.parent)) }, `↑ ${say("up")}`),
+            ...(found.photos > 0 ? [make("button.main", { type: "button", click: action(use) }, say("use_this", found.photos))] : []),
+            ...found.folders.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: action(() => look(inside(name))) }, `${name}/`)),
+            ...found.files.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: () => (path.value = inside(name)) }, name)),
+        );
+    };
+    return make(
+        "details.card",
+        {},
+        make("summary", {}, say("on_machine")),
+        make(
+            "form.row",
+            {},
+            path,
+            make("button.plain", { type: "button", click: action(() => look(path.value)) }, say("browse")),
+            make("button.main", { type: "submit", click: action(use) }, say("use")),
+        ),
+        list,
+    );
+}
+
+// Language and colours are kept in the browser.
+
+const themes = ["auto", "light", "dark"];
+const chosenTheme = () => localStorage.getItem("theme") ?? "auto";
+const chosenLanguage = () => localStorage.getItem("language") ?? (navigator.language.startsWith("zh") ? "zh" : "en");
+
+function dress() {
+    document.documentElement.dataset.theme = chosenTheme();
+    speak(chosenLanguage());
+    /** @type {HTMLElement} */ (document.getElementById("theme")).textContent = say(chosenTheme());
+    /** @type {HTMLElement} */ (document.getElementById("language")).textContent = say("other");
+}
+
+document.getElementById("theme")?.addEventListener("click", () => {
+    localStorage.setItem("theme", themes[(themes.indexOf(chosenTheme()) + 1) % themes.length]);
+    dress();
+});
+document.getElementById("language")?.addEventListener("click", () => {
+    localStorage.setItem("language", chosenLanguage() === "zh" ? "en" : "zh");
+    dress();
+    route();
+});
+dress();
+addEventListener("hashchange", route);
+route();

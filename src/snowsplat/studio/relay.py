@@ -1,0 +1,70 @@
+"""Passes the page of a running training on: its files, and the connection with its images.
+
+The job serves this page at a port of its own, on the loopback interface. Browsers of the studio
+may be elsewhere, so that they reach the studio only.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import urllib.request
+from contextlib import suppress
+
+from starlette.responses import Response
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import WebSocketException
+
+_SECONDS = 20.0  # to answer; a training step may block the process
+
+
+async def relay_file(url: str, name: str) -> Response:
+    """The file ``name`` of the page at ``url``; 404 if there is none, or no page."""
+
+    def load() -> Response:
+        with urllib.request.urlopen(url + name, timeout=_SECONDS) as answer:
+            kept = {key: answer.headers[key] for key in ("Content-Type", "Content-Security-Policy")}
+            return Response(answer.read(), headers=kept)
+
+    try:
+        return await asyncio.to_thread(load)
+    except (OSError, ValueError):  # also urllib.error.URLError, and a malformed name
+        return Response(status_code=404)
+
+
+async def relay_socket(browser: WebSocket, url: str) -> None:
+    """Connect a browser with the WebSocket of the page at ``url``, until one of them ends it.
+
+    A message is read when the one before it is sent, so that neither can flood the other.
+    """
+    address = f"{url.replace('http', 'ws', 1)}live"
+    try:
+        async with connect(
+            address, max_size=None, compression=None, proxy=None, open_timeout=_SECONDS
+        ) as page:
+            await browser.accept()
+            ways = [
+                asyncio.ensure_future(way) for way in (_to(page, browser), _from(page, browser))
+            ]
+            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+    except (OSError, TimeoutError, WebSocketException):
+        pass  # the training has just ended
+    with suppress(RuntimeError, WebSocketDisconnect):  # the browser has ended it
+        await browser.close()
+
+
+async def _to(page: ClientConnection, browser: WebSocket) -> None:
+    while (message := await browser.receive())["type"] == "websocket.receive":
+        data = message.get("bytes")
+        await page.send(message["text"] if data is None else data)
+
+
+async def _from(page: ClientConnection, browser: WebSocket) -> None:
+    async for message in page:
+        if isinstance(message, bytes):
+            await browser.send_bytes(message)
+        else:
+            await browser.send_text(message)

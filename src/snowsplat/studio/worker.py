@@ -1,0 +1,260 @@
+"""What the studio does in other processes: all that takes long, or needs torch.
+
+    python -m snowsplat.studio.worker make FOLDER          the job of a scene of the library
+    python -m snowsplat.studio.worker survey FOLDER        what its photos are, and the time needed
+    python -m snowsplat.studio.worker export FOLDER KIND   a file in another format
+
+The first one writes its progress to state.json in the folder. The others print one line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import socket
+import sys
+import time
+import traceback
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from snowsplat.pipeline.convert import convert
+from snowsplat.pipeline.describe_photos import describe_photos
+from snowsplat.pipeline.make import MakeOptions, MakeResult, make
+from snowsplat.pipeline.observer import Observer, Page
+from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.publish import PublishOptions, publish
+from snowsplat.pipeline.quality import PRESETS
+from snowsplat.pipeline.run.live_page import LivePage
+from snowsplat.pipeline.stage_lines import described
+from snowsplat.sfm.colmap.options import thread_count
+from snowsplat.sfm.cost import Step, measure_speed, steps_of
+from snowsplat.sfm.dataset_report import draw_from_above
+from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.progress import Report
+from snowsplat.sfm.survey import survey
+from snowsplat.studio.hand_on import export_file
+from snowsplat.studio.library import Scene
+from snowsplat.training.core.progress import Progress
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path, write_text
+from snowsplat.util.interrupts import ended_by_signals
+from snowsplat.util.run_lock import InUse, locked
+from snowsplat.util.safe_json import printable
+from snowsplat.util.stages import Outcome
+
+_PAUSE = 1.0  # seconds between two files of the state
+_CURVE = 400  # points of the curve of the loss
+#: Shown beside the progress while the scene is trained.
+MAP = "map.svg"
+
+
+class _Recorder(Observer):
+    """Writes the progress of a job to the state of its scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._written = 0.0
+        self._every = 1  # steps between two points of the curve
+        self.state: dict[str, Any] = {
+            "process": os.getpid(),
+            "host": socket.gethostname(),
+            "started": time.time(),
+            "stages": [],
+            "notes": [],
+            "curve": [],
+        }
+        self.write()
+
+    def write(self, now: bool = True) -> None:
+        """Write the state; unless ``now``, only if the last time is a moment ago."""
+        if now or time.monotonic() - self._written > _PAUSE:
+            with suppress(OSError):  # a full disk is for the job to tell
+                self._scene.write_state(self.state)
+            self._written = time.monotonic()
+
+    def note(self, line: str) -> None:
+        self.state["notes"].append(printable(line))
+        self.write()
+
+    def begin(self, stage: str) -> Report:
+        self.state["now"] = now = {"stage": stage, "began": time.time()}
+        self.write()
+
+        def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
+            now.update({"done": done, "total": total, "what": what, "left": left})
+            self.write(now=False)
+
+        return report
+
+    def end(self, stage: str, outcome: Outcome) -> None:
+        lines = [printable(line) for line in described(stage, outcome.result)]
+        self.state["stages"].append(
+            {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
+        )
+        if stage == "images":
+            self._draw_map()
+        self.leave()
+
+    def leave(self) -> None:
+        self.state.pop("now", None)
+        self.write()
+
+    def step(self, progress: Progress) -> None:
+        self.state["steps"] = {
+            "step": progress.step,
+            "iterations": progress.iterations,
+            "gaussians": progress.gaussians,
+            "left": progress.seconds_left,
+        }
+        if progress.metrics is not None:
+            self.state["steps"]["psnr"] = progress.metrics.psnr
+        curve = self.state["curve"]
+        if progress.step % self._every == 0:
+            curve.append([progress.step, progress.loss])
+            if len(curve) > _CURVE:
+                del curve[::2]
+                self._every *= 2
+        self.write(now=False)
+
+    def page_opened(self, page: Page) -> None:
+        self.state["page"] = page.url
+        self.write()
+
+    def steps_end(self) -> None:
+        self.state.pop("page", None)
+        self.write()
+
+    def _draw_map(self) -> None:
+        try:
+            drawing = draw_from_above(self._scene.made / DATASET)
+            write_text(self._scene.folder / MAP, drawing)
+        except (UserError, OSError) as error:  # the job goes on without it
+            self.note(f"there is no map of the cameras: {error}")
+
+
+def run_job(scene: Scene) -> int:
+    """Make the scene and its page, or resume; returns the exit code."""
+    try:
+        with locked(scene.lock, f"{scene.folder}: in use by"):
+            recorder = _Recorder(scene)
+            code, outcome = _outcome(scene, recorder)
+            for name in ("now", "page"):
+                recorder.state.pop(name, None)
+            recorder.state |= outcome
+            recorder.write()
+            return code
+    except InUse as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
+    """The exit code of the job, and what it adds to the state."""
+    try:
+        with ended_by_signals():
+            job = scene.job
+            options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
+            with LivePage(port=0) as page:
+                made = make(
+                    scene.inputs(),
+                    scene.made,
+                    options,
+                    overwrite=True,
+                    observer=recorder,
+                    page=page,
+                )
+            recorder.begin("page")
+            site = publish(scene.made, scene.site, PublishOptions(job.title), overwrite=True)
+            recorder.leave()
+        return 0, {"outcome": "done", "result": _result(scene, made, site.gaussians)}
+    except KeyboardInterrupt:
+        return 130, {"outcome": "stopped"}
+    except (UserError, OSError, MemoryError) as error:
+        message = str(error) or "out of memory; choose draft, or fewer photos"
+        return 2, {"outcome": "failed", "error": printable(" ".join(message.split()))}
+    except Exception as error:
+        traceback.print_exc()
+        about = f"an unexpected fault: {type(error).__name__}: {error}; details are in {scene.log}"
+        return 1, {"outcome": "failed", "error": printable(about)}
+
+
+def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
+    reports = {"training": made.folder.report, "photos": made.dataset_report}
+    return {
+        "file": made.scene.name,
+        "bytes": made.scene.stat().st_size,
+        "gaussians": gaussians,
+        # With gains of exposure, the scene has the mean exposure of the photos.
+        "psnr": made.psnr_aligned if made.exposures else made.psnr,
+        "aligned": made.exposures,
+        "seconds": made.seconds,
+        "verdict": [] if made.verdict is None else made.verdict.lines("The scene"),
+        "reports": {
+            name: path.relative_to(scene.made).as_posix()
+            for name, path in reports.items()
+            if path is not None and path.is_relative_to(scene.made) and path.is_file()
+        },
+    }
+
+
+def survey_photos(scene: Scene) -> dict[str, Any]:
+    """What `make` would use of the inputs, and the seconds that it takes at each quality.
+
+    Raises: UserError: there is nothing to use.
+    """
+    sources = find_sources(scene.inputs())
+    photos = survey(sources)
+    speed = measure_speed(thread_count(None))
+    seconds = {}
+    for quality, preset in PRESETS.items():
+        steps = [Step(preset.training)]
+        if sources.posed is None:
+            steps += steps_of(photos, preset.photos, quality).values()
+        seconds[quality] = round(sum(step.seconds(speed) for step in steps))
+    facts = describe_photos(sources) | {"poses": sources.posed is not None}
+    return {"facts": facts, "count": photos.count, "seconds": seconds}
+
+
+def export(scene: Scene, kind: str) -> dict[str, Any]:
+    """Write the scene in another format, unless that is done; returns the name of the file.
+
+    Raises: UserError: the scene is not finished.
+    """
+    file = scene.scene_file()
+    if file is None:
+        raise UserError("the scene is not finished")
+    target = export_file(scene, kind)
+    if not target.is_file() or target.stat().st_mtime_ns < file.stat().st_mtime_ns:
+        target.parent.mkdir(exist_ok=True)
+        if kind == "zip":
+            with atomic_path(target) as temporary:
+                archive = shutil.make_archive(str(temporary), "zip", scene.site)
+                os.replace(archive, temporary)
+        else:
+            convert(file, target, overwrite=True)
+    return {"file": target.name}
+
+
+def _printed(scene: Scene, words: list[str]) -> int:
+    try:
+        answer = survey_photos(scene) if words[0] == "survey" else export(scene, words[1])
+    except (UserError, OSError) as error:
+        answer = {"error": printable(" ".join(str(error).split()))}
+    print("\n" + json.dumps(answer))
+    return 0
+
+
+def main(words: list[str]) -> int:
+    logging.basicConfig(level=logging.WARNING)
+    scene = Scene(Path(words[1]))
+    if words[0] == "make":
+        return run_job(scene)
+    return _printed(scene, [words[0], *words[2:]])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,77 @@
+"""A library, and a studio that serves it."""
+
+import http.client
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from snowsplat.studio import job
+from snowsplat.studio.app import POLICY, studio_app
+from snowsplat.studio.library import Library
+from snowsplat.viewer.http.server import WebServer
+
+#: A worker that only holds the lock of a job, and saves when it is asked to end.
+HOLDER = """
+import os, signal, socket, sys, time
+from pathlib import Path
+from snowsplat.studio.library import Scene
+from snowsplat.util.run_lock import InUse, locked
+scene = Scene(Path(sys.argv[2]))
+def end(*_):
+    scene.write_state({"outcome": "stopped"})
+    sys.exit(130)
+signal.signal(signal.SIGTERM, end)
+try:
+    with locked(scene.lock, "", wait=0.0):
+        scene.write_state({"process": os.getpid(), "host": socket.gethostname()})
+        time.sleep(60)
+except InUse:
+    sys.exit(2)
+"""
+
+
+@dataclass
+class Studio:
+    library: Library
+    server: WebServer
+
+    def ask(
+        self, path: str, method: str = "GET", body: Any = None, **headers: str
+    ) -> tuple[int, Any]:
+        """Status and answer; an object is sent and received as JSON."""
+        data = json.dumps(body) if isinstance(body, dict) else body
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
+        base = urlsplit(self.server.url).path
+        connection.request(method, base + path, data, headers)
+        response = connection.getresponse()
+        answer = response.read()
+        connection.close()
+        is_json = response.headers.get("Content-Type") == "application/json"
+        return response.status, json.loads(answer) if is_json else answer
+
+
+@pytest.fixture
+def library(tmp_path, monkeypatch) -> Library:
+    monkeypatch.setattr(job, "_started", {})
+    return Library(tmp_path / "library")
+
+
+@pytest.fixture
+def studio(library) -> Iterator[Studio]:
+    policy = {"Content-Security-Policy": POLICY}
+    app = studio_app(library, lambda: ["http://192.168.1.7:80/token/"])
+    with WebServer(app, headers=policy) as server:
+        yield Studio(library, server)
+
+
+@pytest.fixture
+def holder(monkeypatch, tmp_path) -> None:
+    """Replaces the worker: jobs hold their lock until they are stopped."""
+    script = tmp_path / "holder.py"
+    script.write_text(HOLDER)
+    monkeypatch.setattr(job, "_WORKER", [sys.executable, str(script)])

@@ -1,0 +1,146 @@
+"""Jobs: one per folder, stopped, killed; what a worker tells."""
+
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from snowsplat.pipeline.quality import PRESETS
+from snowsplat.sfm.cost import Speed
+from snowsplat.studio import job, worker
+from snowsplat.studio.library import Scene
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
+from snowsplat.training.core.progress import Progress
+from snowsplat.util.errors import UserError
+
+
+def wait_for(true, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def begun(scene: Scene) -> int:
+    """The process of the job, when it has the lock."""
+    wait_for(lambda: "process" in scene.state())
+    return scene.state()["process"]
+
+
+def test_two_jobs_in_one_folder_are_refused(library, holder):
+    scene = library.new("a", [])
+    job.start(scene)
+    with pytest.raises(UserError, match="is being made already"):
+        job.start(scene)
+    process = begun(scene)
+    # A studio that has not started it knows it, too; and so does a second worker.
+    job._started.clear()
+    assert job.is_running(scene)
+    with pytest.raises(UserError, match="is being made already"):
+        job.start(scene)
+    second = [*job._WORKER, "make", str(scene.folder)]
+    assert subprocess.run(second, check=False).returncode == 2
+    assert scene.state()["process"] == process
+    job.stop(scene)
+    wait_for(lambda: not job.is_running(scene))
+    os.waitpid(process, 0)
+    assert scene.state() == {"outcome": "stopped"}
+    job.stop(scene)  # nothing to do
+
+
+def test_a_killed_job_leaves_no_lock(library, holder):
+    scene = library.new("a", [])
+    job.start(scene)
+    os.kill(begun(scene), signal.SIGKILL)
+    wait_for(lambda: not job.is_running(scene))
+    assert "outcome" not in scene.state()
+    (scene.folder / "state.json").unlink()
+    job.start(scene)
+    begun(scene)
+    job.stop(scene)
+    wait_for(lambda: scene.state() == {"outcome": "stopped"})
+
+
+def test_a_job_of_another_computer_is_not_stopped(library, holder):
+    scene = library.new("a", [])
+    job.start(scene)
+    process = begun(scene)
+    started = job._started.pop(scene.folder)
+    scene.write_state({"process": os.getpid(), "host": "elsewhere"})
+    with pytest.raises(UserError, match="is being made on elsewhere"):
+        job.stop(scene)
+    os.kill(process, signal.SIGKILL)
+    started.wait()
+
+
+def test_errors_of_the_worker_are_one_line(library, tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    scene = library.new("a", [empty])
+    with pytest.raises(UserError, match="empty"):
+        job.work("survey", scene.folder)
+    with pytest.raises(UserError, match="the scene is not finished"):
+        job.work("export", scene.folder, "spz")
+    job.start(scene)
+    wait_for(lambda: not job.is_running(scene), 60)
+    state = scene.state()
+    assert state["outcome"] == "failed"
+    assert "empty" in state["error"]
+    assert "\n" not in state["error"]
+
+
+def test_what_the_photos_are(library, tmp_path):
+    """In a zip file, which is unpacked; again, it is the same."""
+    scene = library.new("a", [])
+    scene.photos.mkdir()
+    with zipfile.ZipFile(scene.photos / "tour.zip", "w") as archive:
+        for number in range(3):
+            picture = io.BytesIO()
+            colours = np.random.default_rng(number).integers(0, 255, (48, 64, 3), np.uint8)
+            Image.fromarray(colours).save(picture, "JPEG")
+            archive.writestr(f"tour/{number}.jpg", picture.getvalue())
+    for _ in range(2):
+        found = job.work("survey", scene.folder)
+        assert (found["count"], found["facts"]["photos"]) == (3, 3)
+        assert 0 < found["seconds"]["draft"] < found["seconds"]["best"]
+
+
+def test_poses_that_are_given_take_no_time(library, tmp_path, monkeypatch):
+    dataset = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 9, 48, 36, n_points=300)
+    photos = tmp_path / "photos"
+    shutil.copytree(dataset / "images", photos)
+    monkeypatch.setattr(worker, "measure_speed", lambda _: Speed())
+    given, unknown = (worker.survey_photos(library.new("a", [each])) for each in (dataset, photos))
+    assert (given["facts"]["poses"], unknown["facts"]["poses"]) == (True, False)
+    assert given["seconds"]["draft"] == PRESETS["draft"].training < unknown["seconds"]["draft"]
+
+
+def test_progress_is_bounded(library):
+    """The curve has a limited number of points, over all steps; numbers are those of the steps."""
+    scene = library.new("a", [])
+    recorder = worker._Recorder(scene)
+    for step in range(1, 5001):
+        recorder.step(Progress(step, 1.0 / step, 100 + step, 5000, 1, seconds_left=7.0))
+    recorder.note("a line\x1b[0m")
+    state = scene.state()
+    assert state["steps"] == {"step": 5000, "iterations": 5000, "gaussians": 5100, "left": 7.0}
+    assert len(state["curve"]) <= 400
+    steps = [step for step, _ in state["curve"]]
+    assert steps == sorted(steps)
+    assert steps[-1] > 4900
+    assert steps[0] < 100
+    assert "\x1b" not in state["notes"][0]
+
+
+def test_a_worker_that_is_killed_is_an_error(library, monkeypatch):
+    monkeypatch.setattr(job, "_WORKER", [sys.executable, "-c", "import os; os.abort()"])
+    with pytest.raises(UserError, match="unexpected fault"):
+        job.work("survey", library.folder)

@@ -1,0 +1,86 @@
+"""The page in a real browser: by clicks, from an empty page to a downloaded file."""
+
+import zipfile
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+from snowsplat.formats import read_gaussians
+from snowsplat.studio import job
+
+from ..browser import Browser, Page
+from ..sfm.colmap import scenes
+
+pytestmark = [pytest.mark.browser, pytest.mark.sfm]
+
+
+def drop(page: Page, path: Path) -> None:
+    """Drop a file or folder on the page."""
+    data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        page.call("Input.dispatchDragEvent", type=kind, x=400, y=200, data=data)
+
+
+def click(page: Page, text: str, within: str = "main") -> None:
+    """Click the button with this text."""
+    page.evaluate(
+        f"[...document.querySelectorAll('{within} button')]"
+        f".find(each => each.textContent === {text!r}).click()"
+    )
+
+
+def status(page: Page) -> str:
+    return page.evaluate("document.querySelector('.status')?.dataset.status ?? ''")
+
+
+def test_from_photos_to_a_file(studio, tmp_path):
+    """The browser is closed and the job is killed on the way; nothing is lost."""
+    photos = scenes.write_photos(tmp_path / "Häuser am See", 9)
+    asked: set[str] = set()
+    with Browser(1280, 800, frames=2.0) as browser:
+        page = browser.open(studio.server.url)
+        page.wait_for("!!document.querySelector('.drop')")
+        drop(page, photos)
+        page.wait_for("!!document.querySelector('form.card:not([hidden]) .main')", 120)
+        assert page.evaluate("document.querySelector('.facts dd').textContent") == "9"
+        assert page.evaluate("document.querySelector('h1').textContent") == "Häuser am See"
+        page.evaluate(
+            "(() => { const form = document.querySelector('form.card');"
+            "form.querySelector('input[type=text]').value = 'My tour';"
+            "form.querySelector('input[type=number]').focus();"
+            "form.querySelector('input[type=number]').value = '0.5'; })()"
+        )
+        click(page, "Make the scene")
+        page.wait_for("!!document.querySelector('.stages li[data-state=now]')", 60)
+        (scene,) = studio.library.scenes()
+        hash_ = page.evaluate("location.hash")
+    job._started[scene.folder].kill()
+    job._started[scene.folder].wait()
+    with Browser(1280, 800, frames=2.0) as browser:
+        page = browser.open(studio.server.url + hash_)
+        page.wait_for("document.querySelector('.status')?.dataset.status === 'interrupted'", 30)
+        click(page, "Continue")
+        page.wait_for("!!document.querySelector('iframe.viewer:not([hidden])')", 180)
+        # Images of the running training arrive.
+        page.wait_for("!!document.querySelector('iframe.viewer').contentDocument?.body", 30)
+        page.wait_for("document.querySelector('.status').dataset.status === 'done'", 240)
+        page.wait_for("!!document.querySelector('iframe.viewer').contentWindow?.app", 90)
+        click(page, "SPZ")
+        file = scene.exports / "My tour.spz"
+        page.wait_for("!document.querySelector('.export button:disabled')", 60)
+        assert len(read_gaussians(file)) > 100
+        click(page, "ZIP")
+        page.wait_for("!document.querySelector('.export button:disabled')", 60)
+        assert "index.html" in zipfile.ZipFile(scene.exports / "My tour.zip").namelist()
+        asked |= set(
+            page.evaluate("performance.getEntriesByType('resource').map(each => each.name)")
+        )
+        page.evaluate("document.querySelector('#language').click()")
+        page.wait_for("document.documentElement.lang === 'zh'")
+        page.wait_for("document.querySelector('.status')?.textContent === '已完成'", 30)
+        page.evaluate("document.querySelector('.brand').click()")
+        page.wait_for("document.querySelector('.tile b')?.textContent === 'My tour'", 30)
+        assert not page.errors
+    assert all(name.startswith(studio.server.url) for name in asked)
+    assert studio.ask(f"scenes/{quote(scene.name)}")[1]["state"]["result"]["psnr"] > 15
