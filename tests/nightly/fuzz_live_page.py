@@ -9,7 +9,7 @@ At the end,
 - memory must have grown by less than BOUND;
 - the well-behaved client must have received images all the time.
 
-    python tests/nightly/fuzz_live_page.py --messages 100000
+    python tests/nightly/fuzz_live_page.py --messages 650000
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def value(rng: random.Random, depth: int = 0) -> object:
 def message(rng: random.Random) -> str | bytes:
     kind = rng.randrange(8)
     if kind == 0:
-        return os.urandom(rng.randrange(200))
+        return rng.randbytes(rng.randrange(200))
     if kind == 1:
         return rng.choice(wrong)
     if kind == 2:
@@ -117,8 +117,9 @@ def fuzz(url: str, count: int, seed: int) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--messages", type=int, default=100_000)
+    parser.add_argument("--messages", type=int, default=650_000)
     parser.add_argument("--connections", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         root = write_toy_dataset(Path(folder, "toy"), "colmap-bin", 6, 96, 72, n_points=500)
@@ -128,7 +129,8 @@ def main() -> int:
         hook = TrainingViewer(viewer, SampledPsnr(dataset.train, viewer.background))
         each = arguments.messages // arguments.connections
         threads = []
-        for seed in range(arguments.connections):
+        for number in range(arguments.connections):
+            seed = arguments.seed + number
             sent[seed] = 0
             threads.append(threading.Thread(target=fuzz, args=(viewer.url, each, seed)))
         read = [0]
