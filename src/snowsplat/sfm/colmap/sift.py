@@ -6,9 +6,8 @@ instructions of the processor, and computes descriptors only of features that ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +16,9 @@ from PIL import Image
 
 from snowsplat.data.image_file import scaled_size
 from snowsplat.sfm.ingest.photo_files import open_image
+from snowsplat.util import array_kernels
 from snowsplat.util.machine import memory_bytes
+from snowsplat.util.native_library import ArrayPointer
 
 # Parameters of the detection; their values are the defaults of COLMAP.
 _CONTRAST_THRESHOLD = 0.02  # for pixels in [0, 1]; divided by the number of layers in an octave
@@ -85,29 +86,26 @@ def detect_in_grey(
     """The ``count`` largest features of a grey image (H, W), in pixels of this image.
 
     ``allowed`` (H, W) is 0 where no feature is wanted.
+
+    Raises:
+        MemoryError: not enough memory.
+        UserError: the native library is missing or outdated.
     """
-    sift = new_detector()
-    if grey.size <= _PIXELS_PER_FEATURE * count:
-        found, histograms = sift.detectAndCompute(grey, allowed)
-        order = sorted(range(len(found)), key=lambda i: -found[i].size)[:count]
-        found = [found[i] for i in order]
-        histograms = None if histograms is None else histograms[order]
-    else:
-        found = sorted(sift.detect(grey, allowed), key=lambda keypoint: -keypoint.size)[:count]
-        found, histograms = sift.compute(grey, found)
-    if not found:
-        return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8))
-    return Features(_as_rows(found), _root_sift(np.asarray(histograms)))
-
-
-def new_detector() -> cv2.SIFT:
-    """The detector that `detect_sift` uses. Each thread needs its own."""
-    return cv2.SIFT.create(
-        nOctaveLayers=_LAYERS,
-        contrastThreshold=_CONTRAST_THRESHOLD,
-        edgeThreshold=_EDGE_THRESHOLD,
-        enable_precise_upscale=True,  # without it, all positions have an error of 1/4 pixel
+    height, width = grey.shape
+    keypoints, descriptors = np.empty((count, 6), np.float32), np.empty((count, 128), np.uint8)
+    params = array_kernels.DetectSiftParams(
+        width=width,
+        height=height,
+        grey=ArrayPointer(np.ascontiguousarray(grey)),
+        allowed=None if allowed is None else ArrayPointer(np.ascontiguousarray(allowed)),
+        count=count,
+        keypoints=ArrayPointer(keypoints),
+        descriptors=ArrayPointer(descriptors),
     )
+    found = array_kernels.call("detect_sift", params)
+    if found < 0:
+        raise MemoryError("not enough memory to detect features in a photo")
+    return Features(keypoints[:found], descriptors[:found])
 
 
 def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
@@ -128,18 +126,3 @@ def read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = grey.shape
     with open_image(mask) as image:
         return np.asarray(image.convert("L").resize((width, height), Image.Resampling.NEAREST))
-
-
-def _as_rows(keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
-    """Keypoints (N, 6), as in `Features`. OpenCV measures positions from the centre of the first
-    pixel."""
-    position = np.array([k.pt for k in keypoints]) + 0.5
-    scale = np.array([k.size for k in keypoints]) / 2  # OpenCV has the diameter
-    angle = np.radians([k.angle for k in keypoints])
-    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
-    return np.column_stack([position, cos, -sin, sin, cos]).astype(np.float32)
-
-
-def _root_sift(histograms: NDArray[Any]) -> NDArray[np.uint8]:
-    total = np.maximum(histograms.sum(1, keepdims=True), 1)
-    return np.rint(_NORM * np.sqrt(histograms / total)).clip(0, 255).astype(np.uint8)
