@@ -14,7 +14,12 @@
 #include <memory>
 #include <new>
 #include <tuple>
+#include <utility>
 #include <vector>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #include "cpu/entry.h"
 #include "simd.h"
@@ -43,8 +48,9 @@ constexpr float kCellSize = 3;  // in scales of the feature
 constexpr float kClamp = 0.2f;  // of the norm of a descriptor
 constexpr float kNorm = 512;    // of a descriptor in bytes
 
-constexpr int kMargin = 64;  // numbers beside a row that whole vectors may access
-constexpr int kAlign = 64;   // bytes
+constexpr int kMargin = 64;             // numbers beside a row that whole vectors may access
+constexpr size_t kAlign = 64;           // bytes
+constexpr size_t kLargePage = 1 << 21;  // bytes
 constexpr double kPi = 3.14159265358979323846;
 
 // A Gaussian of which the weights of −radius … radius are not negligible.
@@ -64,32 +70,36 @@ Blur blur_between(double from, double to) { return Blur(std::sqrt(to * to - from
 
 int64_t padded(int64_t width) { return (width + kMargin - 1) / kMargin * kMargin; }
 
-// Numbers that are not initialised, with a margin at both ends.
+// Numbers that are not initialised, with a margin at both ends. Large pages, where the system has
+// them, save a fifth of the time of `detect_sift`: each page is an interruption by the system.
 class Buffer {
  public:
-  explicit Buffer(int64_t size) : memory_(new float[size + 2 * kMargin + kAlign / sizeof(float)]) {
-    const auto start = reinterpret_cast<uintptr_t>(memory_.get() + kMargin);
-    data_ = reinterpret_cast<float*>((start + kAlign - 1) / kAlign * kAlign);
+  explicit Buffer(int64_t size) {
+    const size_t bytes = size_t(size + 2 * kMargin) * sizeof(float);
+    const auto align = std::align_val_t(bytes < kLargePage ? kAlign : kLargePage);
+    memory_ = Memory(static_cast<float*>(::operator new(bytes, align)), Delete{align});
+#if defined(__linux__)
+    if (bytes >= kLargePage) madvise(memory_.get(), bytes, MADV_HUGEPAGE);  // may be refused
+#endif
   }
-  float* data() const { return data_; }
+  float* data() const { return memory_.get() + kMargin; }
 
  private:
-  std::unique_ptr<float[]> memory_;
-  float* data_;
+  struct Delete {
+    std::align_val_t align;
+    void operator()(float* p) const { ::operator delete(p, align); }
+  };
+  using Memory = std::unique_ptr<float, Delete>;
+  Memory memory_{nullptr, {}};
 };
 
 // Rows of an image; of a ring of rows, the last ones.
-class Level {
- public:
-  Level(int64_t width, int64_t rows)
-      : stride_(padded(width)), rows_(rows), buffer_(stride_ * rows) {}
-  float* row(int64_t y) const { return buffer_.data() + y % rows_ * stride_; }
+struct Level {
+  float* data;
+  int64_t stride, mask;  // row y is at y & mask
+  int64_t done = 0;      // the number of rows that were computed
 
-  int64_t done = 0;  // the number of rows that were computed
-
- private:
-  int64_t stride_, rows_;
-  Buffer buffer_;
+  float* row(int64_t y) const { return data + (y & mask) * stride; }
 };
 
 // The pixel at i of an image of n pixels that is reflected about its first and its last pixel.
@@ -102,8 +112,9 @@ int64_t reflected(int64_t i, int64_t n) {
 template <class V>
 class Octave {
  public:
-  // `source` writes a row. It is blurred before it is the first level, unless `first` is null.
-  Octave(int64_t width, int64_t height, std::function<void(int64_t, float*)> source,
+  // `source` writes a row. It is blurred before it is the first level, unless `first` is null. `kept`
+  // is memory for `kept_size` numbers.
+  Octave(int64_t width, int64_t height, float* kept, std::function<void(int64_t, float*)> source,
          const Blur* first)
       : width(width), height(height), source_(std::move(source)), first_(first ? 1 : 0),
         column_(padded(width)) {
@@ -112,30 +123,43 @@ class Octave {
     for (int i = 1; i < kLevels; i++)
       blurs_.push_back(blur_between(kSigma * std::exp2((i - 1.0) / kLayers),
                                     kSigma * std::exp2(double(i) / kLayers)));
-    int64_t lead = 0;
+    const int64_t stride = padded(width);
+    int64_t lead = 0, rows = 0;  // of a level before the last one; of all rings
     for (int i = int(blurs_.size()) - 1; i >= 0; i--) {
-      const int level = i - first_;
-      const bool kept = level >= 1 && level <= kLayers;
-      const int64_t rows = lead + 2 * kReach + 2;  // also enough for the kernel of the next level
-      levels_.emplace_back(width, kept ? height : std::min(height, rows));
+      if (is_kept(i - first_)) {
+        levels_.push_back({kept, stride, -1});
+        kept += height * stride;
+      } else {
+        int64_t ring = 1;  // also has the rows under the kernel of the next level
+        while (ring < lead + 2 * kReach + 2) ring *= 2;
+        levels_.push_back({nullptr, stride, ring - 1});
+        rows += ring;
+      }
       lead += i ? blurs_[i].radius : 0;
     }
     std::reverse(levels_.begin(), levels_.end());
+    rings_ = std::make_unique<Buffer>(rows * stride);
+    float* ring = rings_->data();
+    for (Level& level : levels_)
+      if (!level.data) level.data = ring, ring += (level.mask + 1) * stride;
   }
 
+  static int64_t kept_size(int64_t width, int64_t height) {
+    return kLayers * height * padded(width);
+  }
   // A row of a level; rows are computed in ascending order.
   const float* row(int level, int64_t y) const { return levels_[level + first_].row(y); }
   // Computes the rows of all levels up to y.
   void advance(int64_t y) { advance(int(levels_.size()) - 1, y); }
   // Frees the levels that are not kept.
-  void keep() {
-    for (int i = 0; i < int(levels_.size()); i++)
-      if (i < 1 + first_ || i > kLayers + first_) levels_[i] = Level(0, 0);
-  }
+  void finish() { rings_.reset(); }
 
   const int64_t width, height;
 
  private:
+  // Gradients are computed of the levels of the layers.
+  static bool is_kept(int level) { return level >= 1 && level <= kLayers; }
+
   void advance(int i, int64_t until) {
     Level& to = levels_[i];
     until = std::min(until, height - 1);
@@ -189,6 +213,7 @@ class Octave {
   const int first_;  // number of the first level in `levels_`
   std::vector<Blur> blurs_;
   std::vector<Level> levels_;
+  std::unique_ptr<Buffer> rings_;
   Buffer column_;
   std::vector<const float*> rows_;
 };
@@ -200,9 +225,21 @@ struct Extremum {
   float scale;          // the same in pixels of the octave
   int octave, layer;    // the Gaussian with the gradients of the feature
   int64_t column, row;  // its pixel there
-
-  auto key() const { return std::make_tuple(-size, y, x, octave, layer, row, column); }
 };
+
+// An extremum with one of its orientations.
+struct Feature : Extremum {
+  float orientation;  // turns, counterclockwise
+  int64_t place;      // in the results
+};
+
+bool larger_first(const Extremum& a, const Extremum& b) {
+  return std::tie(b.size, a.y, a.x, a.octave) < std::tie(a.size, b.y, b.x, b.octave);
+}
+bool neighbours_first(const Extremum& a, const Extremum& b) {
+  return std::tie(a.octave, a.layer, a.row, a.column, a.size) <
+         std::tie(b.octave, b.layer, b.row, b.column, b.size);
+}
 
 // Finds the extrema of one octave.
 template <class V>
@@ -266,18 +303,16 @@ class Search {
     return V::load(rows[slot].data() + x);
   }
 
-  double difference(int i, int64_t y, int64_t x) const {
-    return octave_.row(i + 1, y)[x] - octave_.row(i, y)[x];
-  }
-
   // The extremum of a quadratic function through the pixels around the one that was found; see
   // Brown and Lowe, "Invariant features from interest point groups", BMVC 2002.
   void refine(int layer, int64_t y, int64_t x) {
     for (int step = 0; step < kSteps; step++) {
       double d[3][3][3];  // difference, row, column
-      for (int i = 0; i < 27; i++)
-        d[i / 9][i / 3 % 3][i % 3] =
-            difference(layer - 1 + i / 9, y - 1 + i / 3 % 3, x - 1 + i % 3);
+      for (int i = 0; i < 9; i++) {
+        const float* more = octave_.row(layer + i / 3, y - 1 + i % 3) + x - 1;
+        const float* less = octave_.row(layer - 1 + i / 3, y - 1 + i % 3) + x - 1;
+        for (int k = 0; k < 3; k++) d[i / 3][i % 3][k] = more[k] - less[k];
+      }
       const double middle = d[1][1][1];
       const double gx = (d[1][1][2] - d[1][1][0]) / 2, gy = (d[1][2][1] - d[1][0][1]) / 2;
       const double gs = (d[2][1][1] - d[0][1][1]) / 2;
@@ -324,22 +359,23 @@ template <class V>
 class Describer {
   static constexpr int W = V::width;
   static constexpr int kMaxRadius = 40;  // pixels; that of the largest descriptor is 38
-  static constexpr int kMaxRow = 2 * kMaxRadius + 1 + W;
-  static constexpr int kTwoCells = 2 * kDirections;
+  static constexpr int kChunk = 512;     // pixels that are gathered, about
+  static constexpr int kMost = kChunk + 2 * kMaxRadius + 1 + W;  // at most
+  static constexpr int kPrefetched = 4;                          // rows
+  static constexpr float kHalf = (kCells + 1) / 2.f;  // of a descriptor with a border, in cells
+  static constexpr int kCopies = 4;  // of a histogram: additions to different copies can overlap
+  using D = Simd<float, W == 4 ? 4 : 8>;    // of directions
   static constexpr int kSide = kCells + 2;  // of the cells, with a border
 
  public:
   Describer() {
     for (int i = 0; i <= kDirections; i++)
-      for (int k = 0; k < kTwoCells; k++) {
+      for (int k = 0; k < kDirections; k++) {
         const auto is = [&](int direction) {
           return float(direction % kDirections == k % kDirections);
         };
-        direction_[i][k] = is(i), next_direction_[i][k] = is(i + 1) - is(i);
+        tents_[i][k] = is(i), tents_[i][kDirections + k] = is(i + 1) - is(i);
       }
-    for (int k = 0; k < kTwoCells; k++) {
-      cell_[k] = float(k < kDirections), next_cell_[k] = k < kDirections ? -1.f : 1.f;
-    }
   }
 
   // Sets the extremum to which the other functions refer, and its octave.
@@ -349,20 +385,16 @@ class Describer {
   std::vector<float> orientations() {
     const Extremum& e = *at_;
     const int radius = int(std::lrint(4.5f * e.scale));
-    set_weights(1.5f * e.scale, radius);
-    constexpr int kCopies = 4;  // of the histogram: additions to different copies can overlap
+    set_window(1.5f * e.scale, radius);
     float histograms[kCopies][kBins + 1] = {};
-    float bins[kMaxRow], values[kMaxRow];
-    for (int i = -radius; i <= radius; i++) {
-      const Row row = row_of(i, -radius, radius);
-      for (int k = 0; k < row.count; k += W) {
-        const Gradient g = gradient(row, k);
-        (g.turns * V(float(kBins)) + V(0.5f)).store(bins + k);
-        (g.magnitude * V(weight_[i + kMaxRadius]) * V::load(weight_ + row.first + k + kMaxRadius))
-            .store(values + k);
+    visit(radius, 0, 0, [&](int count) {
+      for (int k = 0; k < count; k += W) {
+        const Gradient g = gradient(k);
+        (g.turns * V(float(kBins)) + V(0.5f)).store(turned_ + k);
+        g.magnitude.store(weight_ + k);
       }
-      for (int k = 0; k < row.count; k++) histograms[k % kCopies][int(bins[k])] += values[k];
-    }
+      for (int k = 0; k < count; k++) histograms[k % kCopies][int(turned_[k])] += weight_[k];
+    });
     float sum[kBins] = {}, smooth[kBins];
     for (int i = 0; i <= kBins; i++)
       for (auto& histogram : histograms) sum[i % kBins] += histogram[i];
@@ -387,68 +419,82 @@ class Describer {
     const float angle = float(2 * kPi) * orientation;
     const float cos = std::cos(angle) / cell, sin = std::sin(angle) / cell;
     const int radius = int(std::lrint(cell * float(std::sqrt(2.0) * (kCells + 1) / 2)));
-    set_weights(cell * (kCells / 2), radius);
-    constexpr float half = (kCells + 1) / 2.f;  // cells from the middle to the end of the border
-    float cells[2][kSide * kSide * kDirections] = {};  // of even and of odd pixels
-    for (int i = -radius; i <= radius; i++) {
-      // The part of the row inside of the square |j sin + i cos| < half, |j cos - i sin| < half.
-      float begin = -float(radius), end = float(radius);
-      limit(sin, float(i) * cos, half, begin, end);
-      limit(cos, -float(i) * sin, half, begin, end);
-      if (!(begin <= end)) continue;
-      const Row row = row_of(i, int(std::floor(begin)), int(std::ceil(end)));
-      for (int k = 0; k < row.count; k += W) {
-        const V j = V::iota() + V(float(row.first + k));
-        const V down = j * V(sin) + V(float(i) * cos + half);
-        const V across = j * V(cos) + V(half - float(i) * sin);
-        const auto inside = (down > V(0.f)) & (V(2 * half) > down) & (across > V(0.f)) &
-                            (V(2 * half) > across);
-        const Gradient g = gradient(row, k);
-        V turns = g.turns - V(orientation);
-        turns = turns - floor(turns);
-        const V weight = V(weight_[i + kMaxRadius]) * V::load(weight_ + row.first + k + kMaxRadius);
-        const V magnitude = zero_unless(inside, g.magnitude * weight);
-        const V y = zero_unless(inside, down), x = zero_unless(inside, across);
-        const V cell_y = floor(y), cell_x = floor(x);
-        const V direction = turns * V(float(kDirections)), whole = floor(direction);
-        const V lower = magnitude * (y - cell_y);
-        (magnitude - lower).store(upper_ + k), lower.store(lower_ + k);
-        (x - cell_x).store(right_ + k), (direction - whole).store(turned_ + k);
-        ((cell_y * V(float(kSide)) + cell_x) * V(float(kDirections))).store(cell_index_ + k);
-        whole.store(direction_index_ + k);
-      }
-      for (int k = 0; k < row.count; k++) add(k, cells[k % 2]);
-    }
+    set_window(cell * (kCells / 2), radius);
+    float cells[kCopies][kSide * kSide * kDirections] = {};
+    visit(radius, sin, cos, [&](int count) {
+      for (int k = 0; k < count; k += W) spread(k, orientation);
+      for (int k = 0; k < count; k++) add(k, cells[k % kCopies]);
+    });
     write(cells, out);
   }
 
  private:
-  // A row of pixels beside an extremum.
-  struct Row {
-    const float *above, *middle, *below;  // at the first pixel
-    int first;                            // relative to the extremum
-    int count;                            // at most 0: none
-  };
   struct Gradient {
-    V turns, magnitude;  // direction, counterclockwise, 0 to 1; length in grey values of two pixels
+    V turns, magnitude;  // counterclockwise, 0 to 1; in grey values of two pixels, times the weight
   };
 
-  // Pixels `begin` to `end` of row i beside an extremum, as far as they have four neighbours.
-  Row row_of(int i, int begin, int end) const {
+  // Gathers the pixels around the extremum that have four neighbours, within `radius` rows and
+  // columns and inside of the square |j sin + i cos| < kHalf, |j cos − i sin| < kHalf of column j and
+  // row i. Calls visit(count) with as many as fit into the cache.
+  template <class Visit>
+  SNOW_INLINE void visit(int radius, float sin, float cos, Visit visit) {
     const Extremum& e = *at_;
-    const int64_t y = e.row + i;
-    if (y < 1 || y > octave_->height - 2) return {nullptr, nullptr, nullptr, 0, 0};
-    const int first = int(std::max<int64_t>(begin, 1 - e.column));
-    const int last = int(std::min<int64_t>(end, octave_->width - 2 - e.column));
-    const int64_t x = e.column + first;
-    const auto at = [&](int64_t row) { return octave_->row(e.layer, row) + x; };
-    return {at(y - 1), at(y), at(y + 1), first, last - first + 1};
+    int count = 0;
+    const int top = int(std::max<int64_t>(-radius, 1 - e.row));
+    const int bottom = int(std::min<int64_t>(radius, octave_->height - 2 - e.row));
+    for (int i = top; i <= bottom; i++) {
+      float begin = float(std::max<int64_t>(-radius, 1 - e.column));
+      float end = float(std::min<int64_t>(radius, octave_->width - 2 - e.column));
+      limit(sin, float(i) * cos, begin, end);
+      limit(cos, -float(i) * sin, begin, end);
+      const int first = int(std::ceil(begin)), last = int(std::floor(end));
+      const auto row = [&](int j) { return octave_->row(e.layer, e.row + j) + e.column + first; };
+      const float *above = row(i - 1), *middle = row(i), *below = row(i + 1);
+      const float* soon = row(std::min(i + kPrefetched, bottom));
+      const V weight(window_[i + kMaxRadius]), down(float(i) * cos + kHalf);
+      const V across(kHalf - float(i) * sin);
+      for (int j = first; j <= last; j += W, count += W) {
+        const int k = j - first;
+        prefetch(soon + k);
+        (V::load(middle + k + 1) - V::load(middle + k - 1)).store(x_ + count);
+        (V::load(above + k) - V::load(below + k)).store(y_ + count);
+        (weight * V::load(window_ + j + kMaxRadius)).store(weight_ + count);
+        const V column = V::iota() + V(float(j));
+        (column * V(sin) + down).store(down_ + count);
+        (column * V(cos) + across).store(across_ + count);
+      }
+      // The next row overwrites lanes beyond the last column.
+      if (first <= last) count -= (W - (last - first + 1) % W) % W;
+      if (count > kChunk) visit(count), count = 0;
+    }
+    visit(count);
   }
 
-  SNOW_INLINE static Gradient gradient(const Row& row, int k) {
-    const V x = V::load(row.middle + k + 1) - V::load(row.middle + k - 1);
-    const V y = V::load(row.above + k) - V::load(row.below + k);
-    return {turns_of(y, x), sqrt(x * x + y * y)};
+  SNOW_INLINE Gradient gradient(int k) const {
+    const V x = V::load(x_ + k), y = V::load(y_ + k), squares = x * x + y * y;
+    const V magnitude = squares * rsqrt(max(squares, V(1e-30f)));
+    return {turns_of(y, x), magnitude * V::load(weight_ + k)};
+  }
+
+  // Prepares W gradients for `add`.
+  SNOW_INLINE void spread(int k, float orientation) {
+    const V down = V::load(down_ + k), across = V::load(across_ + k);
+    const auto inside =
+        (down > V(0.f)) & (V(2 * kHalf) > down) & (across > V(0.f)) & (V(2 * kHalf) > across);
+    const Gradient g = gradient(k);
+    V turns = g.turns - V(orientation);
+    turns = turns - floor(turns);
+    const V magnitude = zero_unless(inside, g.magnitude);
+    const V y = zero_unless(inside, down), x = zero_unless(inside, across);
+    const V cell_y = floor(y), cell_x = floor(x);
+    const V direction = turns * V(float(kDirections)), whole = floor(direction);
+    const V below = magnitude * (y - cell_y), above = magnitude - below;
+    const V right = x - cell_x, above_right = above * right, below_right = below * right;
+    (above - above_right).store(parts_[0] + k), above_right.store(parts_[1] + k);
+    (below - below_right).store(parts_[2] + k), below_right.store(parts_[3] + k);
+    (direction - whole).store(turned_ + k);
+    const V cell = (cell_y * V(float(kSide)) + cell_x) * V(float(kDirections));
+    for (int l = 0; l < W; l++) cell_[k + l] = int(cell.v[l]), direction_[k + l] = int(whole.v[l]);
   }
 
   // The angle of (x, y) in turns, 0 to 1, with an error of 2e-6.
@@ -473,47 +519,46 @@ class Describer {
   }
 
   // Gaussian weights of the distances −radius … radius along one axis.
-  void set_weights(float sigma, int radius) {
+  void set_window(float sigma, int radius) {
     const V scale(-0.5f / (sigma * sigma));
     for (int i = -radius; i <= radius; i += W) {
       const V distance = V::iota() + V(float(i));
-      exp(distance * distance * scale).store(weight_ + i + kMaxRadius);
+      exp(distance * distance * scale).store(window_ + i + kMaxRadius);
     }
   }
 
-  // Limits j to |j slope + offset| <= half.
-  static void limit(float slope, float offset, float half, float& begin, float& end) {
+  // Limits j to |j slope + offset| <= kHalf.
+  static void limit(float slope, float offset, float& begin, float& end) {
     if (std::abs(slope) < 1e-6f) {
-      if (std::abs(offset) > half) end = begin - 1;
+      if (std::abs(offset) > kHalf) end = begin - 1;
       return;
     }
-    const float a = (-half - offset) / slope, b = (half - offset) / slope;
+    const float a = (-kHalf - offset) / slope, b = (kHalf - offset) / slope;
     begin = std::max(begin, std::min(a, b)), end = std::min(end, std::max(a, b));
   }
 
   // Adds a gradient to the two nearest directions of the four nearest cells.
   SNOW_INLINE void add(int k, float* cells) const {
-    float* to = cells + int(cell_index_[k]);
-    const int direction = int(direction_index_[k]);
-    const V turned(turned_[k]), right(right_[k]), upper(upper_[k]), lower(lower_[k]);
-    for (int i = 0; i < kTwoCells; i += W) {
-      const V directions =
-          V::load(direction_[direction] + i) + turned * V::load(next_direction_[direction] + i);
-      const V value = directions * (V::load(cell_ + i) + right * V::load(next_cell_ + i));
-      float* below = to + kSide * kDirections;
-      (V::load(to + i) + value * upper).store(to + i);
-      (V::load(below + i) + value * lower).store(below + i);
+    float* to = cells + cell_[k];
+    const float *nearest = tents_[direction_[k]], *next = nearest + kDirections;
+    const D turned(turned_[k]);
+    for (int i = 0; i < kDirections; i += D::width) {
+      const D value = D::load(nearest + i) + turned * D::load(next + i);
+      for (int cell = 0; cell < 4; cell++) {
+        float* at = to + (cell / 2 * kSide + cell % 2) * kDirections + i;
+        (D::load(at) + value * D(parts_[cell][k])).store(at);
+      }
     }
   }
 
   // RootSIFT: the square roots of a histogram with the sum 1.
-  static void write(const float (&cells)[2][kSide * kSide * kDirections], uint8_t* out) {
+  static void write(const float (&cells)[kCopies][kSide * kSide * kDirections], uint8_t* out) {
     float values[kValues];
     float squares = 0, sum = 0;
     for (int i = 0; i < kValues; i++) {
       const int cell = i / kDirections, row = cell / kCells + 1, column = cell % kCells + 1;
       const int at = (row * kSide + column) * kDirections + i % kDirections;
-      values[i] = cells[0][at] + cells[1][at];
+      values[i] = cells[0][at] + cells[1][at] + cells[2][at] + cells[3][at];
       squares += values[i] * values[i];
     }
     const float most = kClamp * std::sqrt(squares);
@@ -525,15 +570,15 @@ class Describer {
 
   const Octave<V>* octave_;
   const Extremum* at_;
-  float weight_[kMaxRow];
-  // Of the pixels of a row: the weights in the upper and the lower cells; the part of the cells to
-  // the right, and of the next direction; the cell and the direction.
-  float upper_[kMaxRow], lower_[kMaxRow], right_[kMaxRow], turned_[kMaxRow];
-  float cell_index_[kMaxRow], direction_index_[kMaxRow];
-  alignas(64) float direction_[kDirections + 1][kTwoCells];
-  alignas(64) float next_direction_[kDirections + 1][kTwoCells];
-  alignas(64) float cell_[kTwoCells];
-  alignas(64) float next_cell_[kTwoCells];
+  float window_[2 * kMaxRadius + 1 + W];  // Gaussian weights along an axis
+  // Of the pixels that `visit` gathers: gradient, weight, position in cells of the descriptor.
+  float x_[kMost], y_[kMost], weight_[kMost], down_[kMost], across_[kMost];
+  // Of these pixels: the number of the upper left cell and the parts of the magnitude in the four
+  // cells; a direction, and the part that belongs to the next direction.
+  int32_t cell_[kMost], direction_[kMost];
+  float parts_[4][kMost], turned_[kMost];
+  // Of each direction: 1 for itself; the difference of the next direction and this one.
+  alignas(64) float tents_[kDirections + 1][2 * kDirections];
 };
 
 // Row y of the photo at twice its size: pixel 2x is pixel x of the photo.
@@ -551,45 +596,69 @@ void doubled(const DetectSiftParams& p, int64_t y, float* to) {
 template <class V>
 int64_t detect(const DetectSiftParams& p) {
   const Blur first = blur_between(2 * kPhotoSigma, kSigma);
+  std::vector<std::pair<int64_t, int64_t>> sizes;  // of the octaves
+  int64_t kept_size = 0;
+  for (int64_t w = 2 * p.width, h = 2 * p.height; std::min(w, h) > 2 * kBorder; w /= 2, h /= 2) {
+    sizes.emplace_back(w, h);
+    kept_size += Octave<V>::kept_size(w, h);
+  }
+  const Buffer memory(kept_size);
+  float* kept = memory.data();
   std::vector<std::unique_ptr<Octave<V>>> octaves;
   std::vector<Extremum> found;
-  int64_t width = 2 * p.width, height = 2 * p.height;
-  for (int number = 0; std::min(width, height) > 2 * kBorder; number++) {
-    const Octave<V>* larger = number ? octaves.back().get() : nullptr;
+  for (const auto& [w, h] : sizes) {
+    const int64_t width = w, height = h;
+    const Octave<V>* larger = octaves.empty() ? nullptr : octaves.back().get();
     const auto source = [&p, larger, width](int64_t y, float* to) {
       if (!larger) return doubled(p, y, to);
       const float* from = larger->row(kLayers, 2 * y);
       for (int64_t x = 0; x < width; x++) to[x] = from[2 * x];
     };
+    const int number = int(octaves.size());
     octaves.push_back(
-        std::make_unique<Octave<V>>(width, height, source, number ? nullptr : &first));
+        std::make_unique<Octave<V>>(width, height, kept, source, larger ? nullptr : &first));
+    kept += Octave<V>::kept_size(width, height);
     Search<V>(*octaves.back(), number, found).run();
-    octaves.back()->keep();
-    width /= 2, height /= 2;
+    octaves.back()->finish();
   }
   const auto masked = [&](const Extremum& e) {
     return p.allowed && !p.allowed[int64_t(e.y + 0.5f) * p.width + int64_t(e.x + 0.5f)];
   };
   found.erase(std::remove_if(found.begin(), found.end(), masked), found.end());
   // Several pixels may lead to the same extremum.
-  std::sort(found.begin(), found.end(),
-            [](const Extremum& a, const Extremum& b) { return a.key() < b.key(); });
-  const auto same = [](const Extremum& a, const Extremum& b) { return a.key() == b.key(); };
+  std::sort(found.begin(), found.end(), larger_first);
+  const auto same = [](const Extremum& a, const Extremum& b) {
+    return !larger_first(a, b) && !larger_first(b, a);
+  };
   found.erase(std::unique(found.begin(), found.end(), same), found.end());
+
+  // Neighbours are processed one after the other, so many of their pixels are in the cache.
   Describer<V> describer;
-  int64_t count = 0;
-  for (const Extremum& e : found) {
-    describer.look_at(*octaves[size_t(e.octave)], e);
-    for (float orientation : describer.orientations()) {
-      if (count == p.count) return count;
-      describer.describe(orientation, p.descriptors + count * kValues);
-      const float angle = float(-2 * kPi) * orientation;
-      const float cos = e.size * std::cos(angle), sin = e.size * std::sin(angle);
-      const float keypoint[6] = {e.x + 0.5f, e.y + 0.5f, cos, -sin, sin, cos};
-      std::copy_n(keypoint, 6, p.keypoints + 6 * count++);
+  std::vector<Feature> features;
+  const size_t wanted = size_t(p.count);
+  for (size_t done = 0; done < found.size() && features.size() < wanted;) {
+    const auto begin = found.begin() + done;
+    const auto end = begin + std::min(found.size() - done, wanted - features.size());
+    std::sort(begin, end, neighbours_first);
+    for (auto e = begin; e != end; e++) {
+      describer.look_at(*octaves[size_t(e->octave)], *e);
+      for (float orientation : describer.orientations()) features.push_back({*e, orientation, 0});
     }
+    done = size_t(end - found.begin());
   }
-  return count;
+  std::stable_sort(features.begin(), features.end(), larger_first);
+  if (features.size() > wanted) features.resize(wanted);
+  for (size_t i = 0; i < features.size(); i++) features[i].place = int64_t(i);
+  std::sort(features.begin(), features.end(), neighbours_first);
+  for (const Feature& f : features) {
+    describer.look_at(*octaves[size_t(f.octave)], f);
+    describer.describe(f.orientation, p.descriptors + kValues * f.place);
+    const float angle = float(-2 * kPi) * f.orientation;
+    const float cos = f.size * std::cos(angle), sin = f.size * std::sin(angle);
+    const float keypoint[6] = {f.x + 0.5f, f.y + 0.5f, cos, -sin, sin, cos};
+    std::copy_n(keypoint, 6, p.keypoints + 6 * f.place);
+  }
+  return int64_t(features.size());
 }
 
 }  // namespace
