@@ -1,7 +1,6 @@
-"""Detects SIFT features in a photo (Lowe 2004), with OpenCV.
+"""Detects SIFT features in a photo (Lowe 2004), with a native function.
 
-OpenCV is three to five times as fast as COLMAP's own detection on the CPU: it uses the vector
-instructions of the processor, and computes descriptors only of features that are kept.
+The parameters of the detection are the defaults of COLMAP.
 """
 
 from __future__ import annotations
@@ -20,21 +19,10 @@ from snowsplat.util import array_kernels
 from snowsplat.util.machine import memory_bytes
 from snowsplat.util.native_library import ArrayPointer
 
-# Parameters of the detection; their values are the defaults of COLMAP.
-_CONTRAST_THRESHOLD = 0.02  # for pixels in [0, 1]; divided by the number of layers in an octave
-_EDGE_THRESHOLD = 10
-_LAYERS = 3  # in an octave. The scale doubles from one octave to the next
-_NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
-
-# Up to this number of pixels for each feature that is wanted, descriptors are computed of all
-# features that are found: usually these are not many more. Otherwise, the largest features are
-# chosen first, and OpenCV makes the pyramid of the photo twice, which takes 0.06 s for 800x533.
-_PIXELS_PER_FEATURE = 100
-
-# Memory for each pixel of the resized photo: all octaves of its pyramid, float32. The first octave
-# has 4 pixels for each pixel of the photo, with 6 levels of blur and 5 differences between them.
-# The other octaves together have a third of the pixels of the first one.
-_BYTES_PER_PIXEL = 4 * 4 * (_LAYERS + 3 + _LAYERS + 2) * 4 // 3
+# Memory for each pixel of the resized photo. The first octave has 4 pixels for each pixel of the
+# photo; three levels of blur are kept, float32. The other octaves together have a third of its
+# pixels.
+_BYTES_PER_PIXEL = 4 * 3 * 4 * 4 // 3
 # The part of the machine's memory that all these pyramids may use.
 _MEMORY_PART = 0.25
 
@@ -69,9 +57,9 @@ def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> 
     Raises:
         OSError: a file is missing.
         Exception: any other that Pillow raises for a damaged file.
-        cv2.error: not enough memory.
+        MemoryError: not enough memory.
+        UserError: the native library is missing or outdated.
     """
-    cv2.setNumThreads(1)  # other photos are processed in parallel
     grey, size = read_grey(photo, image_size)
     found = detect_in_grey(grey, None if mask is None else read_mask(mask, grey), count)
     stretch = np.array(size, np.float32) / grey.shape[::-1]
@@ -117,6 +105,7 @@ def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[in
         image.draft("L", size)
         grey = np.asarray(image.convert("L"))
     if grey.shape[::-1] != size:
+        cv2.setNumThreads(1)  # other photos are processed in parallel
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     return grey, (width, height)
 
