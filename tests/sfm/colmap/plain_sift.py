@@ -8,7 +8,7 @@ CONTRAST, EDGE = 0.02 * 255 / LAYERS, 10
 
 def features(grey):
     """All features of a grey image (H, W) uint8, the largest first: keypoints (N, 6), and RootSIFT
-    descriptors (N, 128) that are not rounded."""
+    descriptors (N, 128)."""
     found = []
     for octave, levels in enumerate(octaves(grey)):
         pixel = 0.5 * 2**octave
@@ -81,7 +81,9 @@ def extrema(levels):
                 if abs(contrast) >= CONTRAST and EDGE * trace**2 < (EDGE + 1) ** 2 * product:
                     yield int(layer), int(row), int(column), tuple(offset)
                 break
-            place = place + np.clip(np.trunc(2 * offset), -1, 1).astype(int)
+            if np.abs(offset).max() >= 2.5:
+                break
+            place = place + np.rint(offset).astype(int)
 
 
 def inside(place, shape):
@@ -145,4 +147,5 @@ def descriptor(level, row, column, scale, turns):
         np.add.at(histogram, (index[0], index[1], index[2] % 8), np.prod(shares, 0) * weight[used])
     values = histogram[1:5, 1:5].reshape(-1)
     values = np.minimum(values, 0.2 * np.linalg.norm(values))
-    return 512 * np.sqrt(values / values.sum())
+    values = np.rint(512 * values / np.linalg.norm(values))
+    return np.rint(512 * np.sqrt(values / values.sum()))

@@ -34,10 +34,11 @@ constexpr double kSigma = 1.6;       // pixels, of the first level of an octave
 constexpr double kPhotoSigma = 0.5;  // pixels, the blur that a photo is assumed to have
 constexpr float kContrast = 0.02f * 255 / kLayers;  // of a feature, in grey values
 constexpr float kLeastDifference = kContrast / 2;   // of its pixel
-constexpr double kEdge = 10;        // the largest ratio of the two principal curvatures
-constexpr int kBorder = 5;          // pixels of an octave where no features are searched
-constexpr int kSteps = 5;           // of a pixel, in the search for an extremum
-constexpr int kReach = kSteps + 1;  // rows beside that of an extremum
+constexpr double kEdge = 10;  // the largest ratio of the two principal curvatures
+constexpr int kBorder = 5;    // pixels of an octave where no features are searched
+constexpr int kSteps = 5;     // in the search for an extremum
+constexpr int kFurthest = 2;  // pixels of a step
+constexpr int kReach = kFurthest * (kSteps - 1) + 2;  // rows beside that of an extremum
 
 constexpr int kBins = 36;       // of the histogram of orientations
 constexpr float kPeak = 0.8f;   // of the largest bin: a further orientation
@@ -130,8 +131,11 @@ class Octave {
         levels_.push_back({kept, stride, -1});
         kept += height * stride;
       } else {
-        int64_t ring = 1;  // also has the rows under the kernel of the next level
-        while (ring < lead + 2 * kReach + 2) ring *= 2;
+        // The search needs rows around the present one; a row of the next level, those under its
+        // kernel, which are fewer.
+        const int64_t needed = i < first_ ? 2 * blurs_[i + 1].radius + 1 : lead + 2 * kReach + 2;
+        int64_t ring = 1;
+        while (ring < needed) ring *= 2;
         levels_.push_back({nullptr, stride, ring - 1});
         rows += ring;
       }
@@ -326,7 +330,6 @@ class Search {
       const double axx = yy * ss - ys * ys, ayy = xx * ss - xs * xs, ass = xx * yy - xy * xy;
       const double axy = xs * ys - xy * ss, axs = xy * ys - xs * yy, ays = xy * xs - xx * ys;
       const double determinant = xx * axx + xy * axy + xs * axs;
-      if (determinant == 0) return;
       const double to_x = -(axx * gx + axy * gy + axs * gs) / determinant;
       const double to_y = -(axy * gx + ayy * gy + ays * gs) / determinant;
       const double to_s = -(axs * gx + ays * gy + ass * gs) / determinant;
@@ -340,8 +343,9 @@ class Search {
                           float(scale * pixel), float(scale), number_, layer, x, y});
         return;
       }
-      const auto step_of = [](double to) { return to >= 0.5 ? 1 : to <= -0.5 ? -1 : 0; };
-      x += step_of(to_x), y += step_of(to_y), layer += step_of(to_s);
+      const double furthest = std::max({std::abs(to_x), std::abs(to_y), std::abs(to_s)});
+      if (!(furthest < kFurthest + 0.5)) return;
+      x += std::lrint(to_x), y += std::lrint(to_y), layer += int(std::lrint(to_s));
       if (layer < 1 || layer > kLayers || x < kBorder || x >= octave_.width - kBorder ||
           y < kBorder || y >= octave_.height - kBorder)
         return;
@@ -551,7 +555,8 @@ class Describer {
     }
   }
 
-  // RootSIFT: the square roots of a histogram with the sum 1.
+  // RootSIFT: the square roots of a histogram with the sum 1. The histogram is rounded first, which
+  // removes the noise of small values; their roots are not small.
   static void write(const float (&cells)[kCopies][kSide * kSide * kDirections], uint8_t* out) {
     float values[kValues];
     float squares = 0, sum = 0;
@@ -562,10 +567,12 @@ class Describer {
       squares += values[i] * values[i];
     }
     const float most = kClamp * std::sqrt(squares);
-    for (float& value : values) sum += value = std::min(value, most);
-    const float scale = sum > 0 ? kNorm * kNorm / sum : 0;
+    squares = 0;
+    for (float& value : values) value = std::min(value, most), squares += value * value;
+    const float scale = squares > 0 ? kNorm / std::sqrt(squares) : 0;
+    for (float& value : values) sum += value = std::min(std::rint(value * scale), 255.f);
     for (int i = 0; i < kValues; i++)
-      out[i] = uint8_t(std::min(std::sqrt(values[i] * scale) + 0.5f, 255.f));
+      out[i] = uint8_t(std::min(kNorm * std::sqrt(values[i] / std::max(sum, 1.f)) + 0.5f, 255.f));
   }
 
   const Octave<V>* octave_;
