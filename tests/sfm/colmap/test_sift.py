@@ -102,6 +102,30 @@ def test_photos_that_are_processed_in_parallel():
         assert np.array_equal(a.descriptors, b.descriptors)
 
 
+@pytest.mark.isa
+def test_images_may_have_any_strides():
+    grey = grey_picture(101, 80)
+    allowed = np.ones_like(grey)
+    allowed[:, :50] = 0
+    expected = detect_in_grey(grey[::2].copy(), allowed[::2].copy(), ALL)
+    found = detect_in_grey(grey[::2], np.asfortranarray(allowed[::2]), ALL)
+    assert len(found.keypoints) > 5
+    assert np.array_equal(found.keypoints, expected.keypoints)
+    assert np.array_equal(found.descriptors, expected.descriptors)
+
+
+def test_invalid_input():
+    good = np.zeros((20, 30), np.uint8)
+    for grey, allowed, message in (
+        (good[0], None, r"grey must be an image \(H, W\) uint8 .*, got \(30,\) uint8"),
+        (good.astype(np.float32), None, r"grey .*, got \(20, 30\) float32"),
+        (good, good[1:], r"allowed .*, got \(19, 30\) uint8"),
+        (good, good > 0, r"allowed .*, got \(20, 30\) bool"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            detect_in_grey(grey, allowed, 10)
+
+
 def test_not_enough_memory(monkeypatch):
     monkeypatch.setattr(array_kernels, "call", lambda name, params: -1)
     with pytest.raises(MemoryError, match="not enough memory to detect features in a photo"):

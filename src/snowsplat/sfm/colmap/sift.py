@@ -76,9 +76,16 @@ def detect_in_grey(
     ``allowed`` (H, W) is 0 where no feature is wanted.
 
     Raises:
+        ValueError: a wrong shape or dtype.
         MemoryError: not enough memory.
         UserError: the native library is missing or outdated.
     """
+    for name, array in (("grey", grey), ("allowed", grey if allowed is None else allowed)):
+        if array.ndim != 2 or array.shape != grey.shape or array.dtype != np.uint8:
+            raise ValueError(
+                f"detect_in_grey: {name} must be an image (H, W) uint8 of the same size, "
+                f"got {array.shape} {array.dtype}"
+            )
     height, width = grey.shape
     keypoints, descriptors = np.empty((count, 6), np.float32), np.empty((count, 128), np.uint8)
     params = array_kernels.DetectSiftParams(
