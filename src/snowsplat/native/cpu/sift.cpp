@@ -383,7 +383,8 @@ class Describer {
   // Sets the extremum to which the other functions refer, and its octave.
   void look_at(const Octave<V>& octave, const Extremum& e) { octave_ = &octave, at_ = &e; }
 
-  // The directions of the gradients around the extremum in turns, counterclockwise.
+  // The directions of the gradients around the extremum in turns, counterclockwise; the largest angle
+  // first, as in OpenCV.
   std::vector<float> orientations() {
     const Extremum& e = *at_;
     const int radius = int(std::lrint(4.5f * e.scale));
@@ -406,7 +407,7 @@ class Describer {
                   (at(sum, i - 1) + at(sum, i + 1)) * (4.f / 16) + sum[i] * (6.f / 16);
     const float least = kPeak * *std::max_element(smooth, smooth + kBins);
     std::vector<float> found;
-    for (int i = 0; i < kBins; i++) {
+    for (int i = kBins - 1; i >= 0; i--) {
       const float left = at(smooth, i - 1), middle = smooth[i], right = at(smooth, i + 1);
       if (middle > left && middle > right && middle >= least)
         found.push_back((float(i) + 0.5f * (left - right) / (left - 2 * middle + right)) / kBins);
