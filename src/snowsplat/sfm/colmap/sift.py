@@ -105,6 +105,7 @@ def detect_in_grey(
 
 def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
     """The grey photo (H, W), resized, and its original width and height."""
+    cv2.setNumThreads(1)  # other photos are processed in parallel
     with open_image(photo) as image:
         width, height = image.size
         size = scaled_size(width, height, image_size)
@@ -112,7 +113,6 @@ def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[in
         image.draft("L", size)
         grey = np.asarray(image.convert("L"))
     if grey.shape[::-1] != size:
-        cv2.setNumThreads(1)  # other photos are processed in parallel
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     return grey, (width, height)
 
