@@ -370,6 +370,19 @@ struct PointsInFrustaParams {
   T* counts;          // out, (n,) the number of views that contain the point
   T* rates;           // out, (n,) the largest focal / depth of these views, or 0
   SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
+// ---- detect_sift (CPU only) ---------------------------------------------------------------------
+
+// The `count` largest features of a photo, or fewer; returns their number, −1 if memory is missing.
+struct DetectSiftParams {
+  int64_t width;           // pixels, at least 1
+  int64_t height;          // at least 1
+  const uint8_t* grey;     // (height, width)
+  const uint8_t* allowed;  // (height, width): 0 where no feature is wanted; or null
+  int64_t count;           // at most
+  float* keypoints;        // out, (count, 6): x, y from the corner of the photo; (2, 2) scale in
+                           // pixels times rotation
+  uint8_t* descriptors;    // out, (count, 128): RootSIFT, with the norm 512
+  SNOW_FIELDS(width, height, grey, allowed, count, keypoints, descriptors)
 };
 
 // ---- match_descriptors (CPU only) ---------------------------------------------------------------
