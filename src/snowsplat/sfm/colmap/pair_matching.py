@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features import SEED, WorkerProgress
-from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors
+from snowsplat.sfm.colmap.guided_matching import Described, match
+from snowsplat.sfm.colmap.matching import LENGTH
 from snowsplat.util import native_library
 
 # Number of pairs that are matched or verified before the results are written to the database. If
@@ -49,26 +50,36 @@ Side = tuple[pycolmap.Camera, _Floats]
 
 
 def match_pairs(
-    database: Path, pairs: list[tuple[int, int]], threads: int, progress: WorkerProgress
+    database: Path,
+    pairs: list[tuple[int, int]],
+    max_error: float,
+    threads: int,
+    progress: WorkerProgress,
 ) -> None:
-    """Match those ``pairs`` (two indices of photos each) that have no matches in the database."""
-    native_library.set_num_threads(threads)
-    with closing_database(database) as opened:
+    """Match those ``pairs`` (two indices of photos each) that have no matches in the database.
+
+    ``max_error`` as in `verified`.
+    """
+    native_library.set_num_threads(1)  # pairs are matched at the same time
+    with closing_database(database) as opened, ThreadPoolExecutor(threads) as pool:
+        cameras = _cameras(opened)
 
         @functools.lru_cache(_CACHED_PHOTOS)
-        def descriptors(index: int) -> NDArray[np.uint8]:
-            if not opened.exists_descriptors(index + 1):
-                return np.zeros((0, LENGTH), np.uint8)
-            return np.asarray(opened.read_descriptors(index + 1).data).reshape(-1, LENGTH)
+        def described(image: int) -> Described:
+            if not opened.exists_descriptors(image):
+                return Described(cameras[image], np.zeros((0, 2)), np.zeros((0, LENGTH), np.uint8))
+            descriptors = np.asarray(opened.read_descriptors(image).data).reshape(-1, LENGTH)
+            return Described(cameras[image], _positions(opened, image), descriptors)
 
-        remaining = [(i, j) for i, j in pairs if not opened.exists_matches(i + 1, j + 1)]
+        ids = [(i + 1, j + 1) for i, j in pairs]
+        remaining = [pair for pair in ids if not opened.exists_matches(*pair)]
         for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
-            done = len(pairs) - len(remaining) + start
-            progress.report(done, len(pairs), "matched pairs")
+            progress.report(len(ids) - len(remaining) + start, len(ids), "matched pairs")
+            block = remaining[start : start + _PAIRS_PER_BLOCK]
+            jobs = [pool.submit(match, described(i), described(j), max_error) for i, j in block]
             transaction = pycolmap.DatabaseTransaction(opened)
-            for i, j in remaining[start : start + _PAIRS_PER_BLOCK]:
-                matches = match_descriptors(descriptors(i), descriptors(j))
-                opened.write_matches(i + 1, j + 1, matches)
+            for pair, job in zip(block, jobs, strict=True):
+                opened.write_matches(*pair, job.result())
             del transaction  # the destructor ends the transaction
 
 
@@ -84,17 +95,11 @@ def verify_pairs(
     The lenses are those in the database.
     """
     with closing_database(database) as opened, ThreadPoolExecutor(threads) as pool:
-        cameras = {
-            image.image_id: opened.read_camera(image.camera_id)
-            for image in opened.read_all_images()
-        }
+        cameras = _cameras(opened)
 
         @functools.lru_cache(_CACHED_PHOTOS)
-        def positions(image: int) -> _Floats:
-            return np.asarray(opened.read_keypoints(image)[:, :2], np.float64)
-
         def side(image: int) -> Side:
-            return cameras[image], positions(image)
+            return cameras[image], _positions(opened, image)
 
         ids = [(i + 1, j + 1) for i, j in pairs]
         remaining = [pair for pair in ids if not opened.exists_two_view_geometry(*pair)]
@@ -110,6 +115,17 @@ def verify_pairs(
                 opened.write_two_view_geometry(*pair, job.result())
             del transaction  # the destructor ends the transaction
         progress.report(len(ids), len(ids), "verified pairs")
+
+
+def _cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
+    """The camera of each photo, by image id."""
+    images = database.read_all_images()
+    return {image.image_id: database.read_camera(image.camera_id) for image in images}
+
+
+def _positions(database: pycolmap.Database, image: int) -> _Floats:
+    """(N, 2) float64, of the features of a photo."""
+    return np.asarray(database.read_keypoints(image)[:, :2], np.float64)
 
 
 def verified(

@@ -347,14 +347,15 @@ class PoseEstimation:
             for photo in self.photos
         ]
         scale = max(1.0, float(np.median(scales)))
-        match_pairs(database, choice.pairs, self.threads, self.progress)
+        match_pairs(database, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress)
         return Matched(database, effort, choice, scale)
 
     def _with_pairs(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
         """Match and verify those pairs of ``choice`` that are not matched yet."""
         if choice.pairs == matched.choice.pairs:
             return matched
-        match_pairs(matched.database, choice.pairs, self.threads, self.progress)
+        error = _MAX_ERROR * matched.scale
+        match_pairs(matched.database, choice.pairs, error, self.threads, self.progress)
         more = dataclasses.replace(matched, choice=choice)
         self._verify(more, lens)
         return more
