@@ -39,11 +39,19 @@ _MAX_TRIALS = 3000
 _FEW = 100
 # If more than this share of the matches agrees with one model, no other one is tried.
 _MOST = 0.5
+# A model of all matches is estimated with this number of them; then all are compared with it.
+_SAMPLE = 300
 # The kind of a pair is found among matches that agree with one model already: at least this share
 # of them agrees with the right kind of model, and this number of them is enough.
 _AGREEING, _ENOUGH, _FEWEST_TRIALS = 0.75, 200, 30
+# If a smaller share of these agrees with a homography, they are those of a scene with depth.
+_FLAT = 0.7
 
-_UNCALIBRATED = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+_KINDS = pycolmap.TwoViewGeometryConfiguration
+_USUAL = [  # not the photos of one watermark, and not those without any relative pose
+    getattr(_KINDS, name).value
+    for name in ("CALIBRATED", "UNCALIBRATED", "PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
+]
 _Floats = NDArray[np.floating[Any]]
 #: The camera of a photo, and (N, 2) the positions of its features in pixels of the photo.
 Side = tuple[pycolmap.Camera, _Floats]
@@ -155,12 +163,26 @@ def verified(
         calibrated = one.has_prior_focal_length and other.has_prior_focal_length
         pixels = points[matches[:, 0]], others[matches[:, 1]]
         lenses = (one, other) if calibrated else None
-        matches = matches[_consensus(*pixels, lenses, ransac)]
+        matrix, agreeing = _consensus(*pixels, lenses, ransac)
+        matches, pixels = matches[agreeing], (pixels[0][agreeing], pixels[1][agreeing])
         ransac.min_inlier_ratio, ransac.min_num_trials = _AGREEING, _FEWEST_TRIALS
-        if len(matches) > _ENOUGH and not calibrated:
-            some = matches[np.linspace(0, len(matches) - 1, _ENOUGH).astype(int)]
-            found = pycolmap.estimate_two_view_geometry(one, points, other, others, some, options)
-            if found.config == _UNCALIBRATED.value:
+        some = np.linspace(0, len(matches) - 1, min(_ENOUGH, len(matches))).astype(int)
+        if matrix is not None and not calibrated and _has_depth(*(p[some] for p in pixels), ransac):
+            found = pycolmap.TwoViewGeometry()
+            found.config, found.F = _KINDS.UNCALIBRATED.value, matrix
+            found.inlier_matches = matches
+            return found
+        if len(matches) > _ENOUGH:
+            found = pycolmap.estimate_two_view_geometry(
+                one, points, other, others, matches[some], options
+            )
+            if found.config in _USUAL:
+                if calibrated and found.E is not None:
+                    rays = one.cam_from_img(pixels[0]), other.cam_from_img(pixels[1])
+                    focal = 0.5 * (one.mean_focal_length() + other.mean_focal_length())
+                    agreeing = _errors(found.E, *rays) <= max_error / focal
+                    if agreeing.mean() > options.min_E_F_inlier_ratio:
+                        matches = matches[agreeing]
                 found.inlier_matches = matches
                 return found
     if len(matches) < _MIN_INLIERS:
@@ -183,12 +205,19 @@ def _consensus(
     second: _Floats,
     lenses: tuple[pycolmap.Camera, pycolmap.Camera] | None,
     options: pycolmap.RANSACOptions,
-) -> NDArray[np.bool_]:
-    """(M,) the largest set of matches that agrees with one model; ``first``, ``second`` (M, 2).
+) -> tuple[_Floats | None, NDArray[np.bool_]]:
+    """The largest set of matches that agrees with one model; ``first``, ``second`` (M, 2).
 
     A homography, and an essential matrix if the ``lenses`` are known, are tried if only a small
     share agrees with a fundamental matrix: they need fewer matches in a sample.
+
+    Returns:
+        (3, 3) the fundamental matrix, None if another kind of model is better, and (M,) the set.
     """
+    some = np.linspace(0, len(first) - 1, min(_SAMPLE, len(first))).astype(int)
+    found = pycolmap.estimate_fundamental_matrix(first[some], second[some], options)
+    if found is not None and found["num_inliers"] > _MOST * len(some):
+        return found["F"], _errors(found["F"], first, second) <= options.max_error
     estimates: list[Callable[[], dict[str, Any] | None]] = [
         lambda: pycolmap.estimate_fundamental_matrix(first, second, options),
         lambda: pycolmap.estimate_homography_matrix(first, second, options),
@@ -197,11 +226,27 @@ def _consensus(
         estimates.append(
             lambda: pycolmap.estimate_essential_matrix(first, second, *lenses, options)
         )
-    best = np.zeros(len(first), bool)
+    matrix, best = None, np.zeros(len(first), bool)
     for estimate in estimates:
         found = estimate()
         if found is not None and found["num_inliers"] > best.sum():
-            best = np.asarray(found["inlier_mask"], bool)
+            matrix, best = found.get("F"), np.asarray(found["inlier_mask"], bool)
         if best.mean() > _MOST:
             break
-    return best
+    return matrix, best
+
+
+def _has_depth(first: _Floats, second: _Floats, options: pycolmap.RANSACOptions) -> bool:
+    """Whether few of the matches agree with a homography, as they do in photos of a plane, in
+    photos from one place, and if the matches are those of a logo in the photos."""
+    found = pycolmap.estimate_homography_matrix(first, second, options)
+    return found is None or found["num_inliers"] < _FLAT * len(first)
+
+
+def _errors(matrix: _Floats, first: _Floats, second: _Floats) -> _Floats:
+    """(M,) the Sampson distances of ``first`` and ``second`` (M, 2) with the ``matrix`` (3, 3): an
+    estimate of the distances of the matches from their epipolar lines, in the unit of the points."""
+    one, two = (np.column_stack([points, np.ones(len(points))]) for points in (first, second))
+    lines, others = one @ matrix.T, two @ matrix
+    squares = (lines[:, :2] ** 2).sum(1) + (others[:, :2] ** 2).sum(1)
+    return np.abs((two * lines).sum(1)) / np.sqrt(np.maximum(squares, 1e-300))
