@@ -406,7 +406,8 @@ class PoseEstimation:
         agreement = 0.0
         if models:
             error = _MAX_ERROR * matched.scale
-            agreement = agreement_of_model(models[0], matched.database, error)
+            pairs = repaired.pairs if models[0] is repaired.model else None
+            agreement = agreement_of_model(models[0], matched.database, error, pairs)
         attempt = Attempt(matched, lens, mapping, models, agreement, left_out, doubts)
         self.attempts.append(attempt)
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
