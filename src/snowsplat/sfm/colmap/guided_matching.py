@@ -184,8 +184,10 @@ def _along_lines(
     every, angle = every[row_order], angle[row_order]
     begin = np.where(every, 0, start[levels(angle - reach)])
     end = np.where(every, len(second.positions), start[levels(angle + reach) + 1])
-    return row_order, column_order, Searched(
-        int(near.sum()), begin.astype(np.int32), end.astype(np.int32)
+    return (
+        row_order,
+        column_order,
+        Searched(int(near.sum()), begin.astype(np.int32), end.astype(np.int32)),
     )
 
 

@@ -68,9 +68,7 @@ def look_alikes(descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
     """(N,) dot product of each of ``descriptors`` (N, 128) with the nearest of the others; 0 if
     there is none. Raises as `two_nearest`."""
     count = len(descriptors)
-    later = Searched(
-        0, np.arange(1, count + 1, dtype=np.int32), np.full(count, count, np.int32)
-    )
+    later = Searched(0, np.arange(1, count + 1, dtype=np.int32), np.full(count, count, np.int32))
     rows, columns = two_nearest(descriptors, descriptors, later)
     return np.maximum(np.maximum(rows.best, columns.best), 0)
 

@@ -244,8 +244,8 @@ def _has_depth(first: _Floats, second: _Floats, options: pycolmap.RANSACOptions)
 
 
 def _errors(matrix: _Floats, first: _Floats, second: _Floats) -> _Floats:
-    """(M,) the Sampson distances of ``first`` and ``second`` (M, 2) with the ``matrix`` (3, 3): an
-    estimate of the distances of the matches from their epipolar lines, in the unit of the points."""
+    """(M,) the Sampson distances of the matches of ``first`` and ``second`` (M, 2) from the epipolar
+    lines of the ``matrix`` (3, 3), in the unit of the points."""
     one, two = (np.column_stack([points, np.ones(len(points))]) for points in (first, second))
     lines, others = one @ matrix.T, two @ matrix
     squares = (lines[:, :2] ** 2).sum(1) + (others[:, :2] ** 2).sum(1)

@@ -84,9 +84,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if not models:
             break
         model = models[0]
-    model, left_out, checked = max(
-        reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1])
-    )
+    model, left_out, checked = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
     if left_out:
         model, checked = mapping.without(model, left_out), None
     registered = set(model.reg_image_ids())
