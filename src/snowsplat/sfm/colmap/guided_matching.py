@@ -127,7 +127,7 @@ def _fundamental_matrix(
     if found is None or found["num_inliers"] < max(_LEAST, _AGREEING * len(some)):
         return None
     agreeing = found["inlier_mask"]
-    flat = pycolmap.estimate_homography_matrix(*(side[agreeing] for side in pixels), options)
+    flat = pycolmap.estimate_homography_matrix(pixels[0][agreeing], pixels[1][agreeing], options)
     if flat is not None and found["num_inliers"] - flat["num_inliers"] < _OFF_PLANE:
         return None
     return np.asarray(found["F"], np.float64)

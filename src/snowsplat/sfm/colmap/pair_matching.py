@@ -44,7 +44,8 @@ _SAMPLE = 300
 # The kind of a pair is found among matches that agree with one model already: at least this share
 # of them agrees with the right kind of model, and this number of them is enough.
 _AGREEING, _ENOUGH, _FEWEST_TRIALS = 0.75, 200, 30
-# If a smaller share of these agrees with a homography, they are those of a scene with depth.
+# If a smaller share of these agrees with a homography, they are not those of a plane, of photos
+# from one place, or of a logo in the photos.
 _FLAT = 0.7
 
 _KINDS = pycolmap.TwoViewGeometryConfiguration
@@ -144,8 +145,9 @@ def verified(
     COLMAP looks for an essential matrix, a fundamental matrix and a homography among all matches.
     Most pairs are not flat, so for the homography, this takes many samples of RANSAC in vain. So a
     fundamental matrix is estimated first, which agrees with the matches of all kinds of pairs.
-    Then COLMAP looks among the matches that agree with it, where a few samples are enough to find
-    each kind of model, or to reject it. With few matches, COLMAP looks among all of them at once.
+    Among the matches that agree with it, a few samples are enough to find each kind of model, or
+    to reject it. Each model is estimated with a part of the matches, and all are compared with it.
+    With few matches, COLMAP looks among all of them at once.
 
     Args:
         matches: (M, 2) indices of features.
@@ -159,35 +161,58 @@ def verified(
     ransac.max_num_trials, ransac.max_error, ransac.random_seed = _MAX_TRIALS, max_error, SEED
     ransac.min_inlier_ratio = _inlier_ratio(len(matches))
     pinholes = one.is_perspective_pinhole() and other.is_perspective_pinhole()
+    found = None
     if len(matches) >= _FEW and pinholes:
         calibrated = one.has_prior_focal_length and other.has_prior_focal_length
         pixels = points[matches[:, 0]], others[matches[:, 1]]
-        lenses = (one, other) if calibrated else None
-        matrix, agreeing = _consensus(*pixels, lenses, ransac)
-        matches, pixels = matches[agreeing], (pixels[0][agreeing], pixels[1][agreeing])
+        matrix, agreeing = _consensus(*pixels, (one, other) if calibrated else None, ransac)
+        matches = matches[agreeing]
         ransac.min_inlier_ratio, ransac.min_num_trials = _AGREEING, _FEWEST_TRIALS
-        some = np.linspace(0, len(matches) - 1, min(_ENOUGH, len(matches))).astype(int)
-        if matrix is not None and not calibrated and _has_depth(*(p[some] for p in pixels), ransac):
+        if len(matches) >= _MIN_INLIERS:
+            found = _from_a_part(first, second, matches, None if calibrated else matrix, options)
+    if found is not None:
+        return found
+    if len(matches) < _MIN_INLIERS:
+        return pycolmap.TwoViewGeometry()
+    return pycolmap.estimate_two_view_geometry(one, points, other, others, matches, options)
+
+
+def _from_a_part(
+    first: Side,
+    second: Side,
+    matches: NDArray[np.uint32],
+    matrix: _Floats | None,
+    options: pycolmap.TwoViewGeometryOptions,
+) -> pycolmap.TwoViewGeometry | None:
+    """The kind of a pair, from `_ENOUGH` of its ``matches``; None: all of them are needed.
+
+    ``matrix``: the fundamental matrix of the ``matches``, if both focal lengths are only guessed.
+    """
+    (one, points), (other, others) = first, second
+    some = matches[np.linspace(0, len(matches) - 1, min(_ENOUGH, len(matches))).astype(int)]
+    if matrix is not None:
+        flat = pycolmap.estimate_homography_matrix(
+            points[some[:, 0]], others[some[:, 1]], options.ransac
+        )
+        if flat is None or flat["num_inliers"] < _FLAT * len(some):
             found = pycolmap.TwoViewGeometry()
             found.config, found.F = _KINDS.UNCALIBRATED.value, matrix
             found.inlier_matches = matches
             return found
-        if len(matches) > _ENOUGH:
-            found = pycolmap.estimate_two_view_geometry(
-                one, points, other, others, matches[some], options
-            )
-            if found.config in _USUAL:
-                if calibrated and found.E is not None:
-                    rays = one.cam_from_img(pixels[0]), other.cam_from_img(pixels[1])
-                    focal = 0.5 * (one.mean_focal_length() + other.mean_focal_length())
-                    agreeing = _errors(found.E, *rays) <= max_error / focal
-                    if agreeing.mean() > options.min_E_F_inlier_ratio:
-                        matches = matches[agreeing]
-                found.inlier_matches = matches
-                return found
-    if len(matches) < _MIN_INLIERS:
-        return pycolmap.TwoViewGeometry()
-    return pycolmap.estimate_two_view_geometry(one, points, other, others, matches, options)
+    if len(some) == len(matches):
+        return None
+    found = pycolmap.estimate_two_view_geometry(one, points, other, others, some, options)
+    if found.config not in _USUAL:
+        return None
+    if matrix is None and found.E is not None:
+        rays = one.cam_from_img(points[matches[:, 0]]), other.cam_from_img(others[matches[:, 1]])
+        focal = 0.5 * (one.mean_focal_length() + other.mean_focal_length())
+        errors = _errors(found.E, np.asarray(rays[0]), np.asarray(rays[1]))
+        agreeing = errors <= options.ransac.max_error / focal
+        if agreeing.mean() > options.min_E_F_inlier_ratio:
+            matches = matches[agreeing]
+    found.inlier_matches = matches
+    return found
 
 
 def _inlier_ratio(matches: int) -> float:
@@ -236,15 +261,8 @@ def _consensus(
     return matrix, best
 
 
-def _has_depth(first: _Floats, second: _Floats, options: pycolmap.RANSACOptions) -> bool:
-    """Whether few of the matches agree with a homography, as they do in photos of a plane, in
-    photos from one place, and if the matches are those of a logo in the photos."""
-    found = pycolmap.estimate_homography_matrix(first, second, options)
-    return found is None or found["num_inliers"] < _FLAT * len(first)
-
-
 def _errors(matrix: _Floats, first: _Floats, second: _Floats) -> _Floats:
-    """(M,) the Sampson distances of the matches of ``first`` and ``second`` (M, 2) from the epipolar
+    """(M,) the Sampson distances of the matches ``first`` and ``second`` (M, 2) from the epipolar
     lines of the ``matrix`` (3, 3), in the unit of the points."""
     one, two = (np.column_stack([points, np.ones(len(points))]) for points in (first, second))
     lines, others = one @ matrix.T, two @ matrix
