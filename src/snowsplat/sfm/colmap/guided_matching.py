@@ -13,8 +13,7 @@ thousands of unrelated features is equally near in any photo of the scene.
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -58,11 +57,16 @@ class Described:
     camera: pycolmap.Camera
     positions: _Floats  # (N, 2) pixels of the photo
     descriptors: NDArray[np.uint8]  # (N, 128)
+    image: int = 0
+    # `alike` of photos, by ``image``. It is small, and kept when the descriptors are not.
+    known: dict[int, NDArray[np.int32]] = field(default_factory=dict)
 
-    @functools.cached_property
+    @property
     def alike(self) -> NDArray[np.int32]:
         """`look_alikes` of the descriptors."""
-        return look_alikes(self.descriptors)
+        if self.image not in self.known:
+            self.known[self.image] = look_alikes(self.descriptors)
+        return self.known[self.image]
 
 
 def match(first: Described, second: Described, max_error: float) -> NDArray[np.uint32]:

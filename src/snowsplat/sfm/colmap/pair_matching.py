@@ -72,13 +72,15 @@ def match_pairs(
     native_library.set_num_threads(1)  # pairs are matched at the same time
     with closing_database(database) as opened, ThreadPoolExecutor(threads) as pool:
         cameras = _cameras(opened)
+        alike: dict[int, NDArray[np.int32]] = {}
 
         @functools.lru_cache(_CACHED_PHOTOS)
         def described(image: int) -> Described:
             if not opened.exists_descriptors(image):
                 return Described(cameras[image], np.zeros((0, 2)), np.zeros((0, LENGTH), np.uint8))
             descriptors = np.asarray(opened.read_descriptors(image).data).reshape(-1, LENGTH)
-            return Described(cameras[image], _positions(opened, image), descriptors)
+            positions = _positions(opened, image)
+            return Described(cameras[image], positions, descriptors, image, alike)
 
         ids = [(i + 1, j + 1) for i, j in pairs]
         remaining = [pair for pair in ids if not opened.exists_matches(*pair)]
