@@ -33,14 +33,15 @@ from snowsplat.sfm.colmap.matching import (
 _SHARE = 1 / 3  # of the features, which are matched first
 # The epipolar lines are known if at least this number of the first matches, and this share of them,
 # agrees with a fundamental matrix.
-_LEAST, _AGREEING, _CONFIDENCE = 40, 0.6, 0.99
+_LEAST, _AGREEING, _CONFIDENCE = 40, 0.7, 0.99
 _SAMPLE = 300  # of these matches; more of them take more time
 # At least this number of these matches must not agree with a homography. The points of a plane do
 # not determine the lines.
 _OFF_PLANE = 20
-# Distance from the line at which features are compared, in units of ``max_error`` of `match`. The
-# lens may have a distortion.
-_BAND = 3.0
+# Distance from the line at which features are compared, in units of ``max_error`` of `match`. If a
+# smaller share than `_MOST` agrees with the lines, the lens may be a fisheye. The lines are then
+# not straight, and the matches must not be only those of a pinhole camera: they tell the lens.
+_BAND, _WIDE_BAND, _MOST = 3.0, 8.0, 0.9
 # The lines meet in the epipole. Features nearer to it than this share of half the diagonal of the
 # photo are compared with all features.
 _NEAR = 0.2
@@ -86,13 +87,13 @@ def match(first: Described, second: Described, max_error: float) -> NDArray[np.u
     if min(some, others) < _LEAST:
         return match_descriptors(first.descriptors, second.descriptors)
     part = two_nearest(first.descriptors[:some], second.descriptors[:others])
-    matrix = _fundamental_matrix(first, second, mutual(*part), max_error)
-    if matrix is None:
+    lines = _epipolar_lines(first, second, mutual(*part), max_error)
+    if lines is None:
         begin = np.where(np.arange(n) < some, others, 0).astype(np.int32)
         rest = Searched(0, begin, np.full(n, m, np.int32))
         whole = two_nearest(first.descriptors, second.descriptors, rest)
         return mutual(_joined(part[0], whole[0]), _joined(part[1], whole[1]))
-    row_order, column_order, searched = _along_lines(first, second, matrix, _BAND * max_error)
+    row_order, column_order, searched = _along_lines(first, second, *lines)
     found = two_nearest(first.descriptors[row_order], second.descriptors[column_order], searched)
     alike = first.alike[row_order], second.alike[column_order]
     matches = mutual(_with_look_alikes(found[0], *alike), _with_look_alikes(found[1], *alike[::-1]))
@@ -113,10 +114,11 @@ def _joined(part: Nearest, rest: Nearest) -> Nearest:
     return made
 
 
-def _fundamental_matrix(
+def _epipolar_lines(
     first: Described, second: Described, matches: NDArray[np.uint32], max_error: float
-) -> _Floats | None:
-    """(3, 3) float64, of ``matches`` (K, 2); None if they do not determine the epipolar lines."""
+) -> tuple[_Floats, float] | None:
+    """The fundamental matrix (3, 3) of ``matches`` (K, 2), and the distance from the lines at which
+    features are compared, in pixels; None if the matches do not determine the lines."""
     if len(matches) < _LEAST:
         return None
     if not (first.camera.is_perspective_pinhole() and second.camera.is_perspective_pinhole()):
@@ -134,7 +136,8 @@ def _fundamental_matrix(
     flat = pycolmap.estimate_homography_matrix(pixels[0][agreeing], pixels[1][agreeing], options)
     if flat is not None and found["num_inliers"] - flat["num_inliers"] < _OFF_PLANE:
         return None
-    return np.asarray(found["F"], np.float64)
+    wide = found["num_inliers"] < _MOST * len(some)
+    return np.asarray(found["F"]), (_WIDE_BAND if wide else _BAND) * max_error
 
 
 def _with_look_alikes(
