@@ -206,7 +206,12 @@ def _from_a_part(
     found = pycolmap.estimate_two_view_geometry(one, points, other, others, some, options)
     if found.config not in _USUAL:
         return None
-    if matrix is None and found.E is not None:
+    if matrix is not None and found.H is not None and found.config != _KINDS.UNCALIBRATED.value:
+        # On a plane, a false match may be on its epipolar line: a repeated window, for example.
+        moved = np.column_stack([points[matches[:, 0]], np.ones(len(matches))]) @ found.H.T
+        distance = np.hypot(*(moved[:, :2] / moved[:, 2:] - others[matches[:, 1]]).T)
+        matches = matches[distance <= options.ransac.max_error]
+    elif matrix is None and found.E is not None:
         rays = one.cam_from_img(points[matches[:, 0]]), other.cam_from_img(others[matches[:, 1]])
         focal = 0.5 * (one.mean_focal_length() + other.mean_focal_length())
         errors = _errors(found.E, np.asarray(rays[0]), np.asarray(rays[1]))
