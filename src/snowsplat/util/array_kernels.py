@@ -38,6 +38,9 @@ class MatchDescriptorsParams(Params):
     m: int
     first: ArrayPointer
     second: ArrayPointer
+    common: int
+    begin: ArrayPointer
+    end: ArrayPointer
     row_index: ArrayPointer
     row_best: ArrayPointer
     row_second: ArrayPointer

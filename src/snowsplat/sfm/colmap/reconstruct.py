@@ -347,14 +347,15 @@ class PoseEstimation:
             for photo in self.photos
         ]
         scale = max(1.0, float(np.median(scales)))
-        match_pairs(database, choice.pairs, self.threads, self.progress)
+        match_pairs(database, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress)
         return Matched(database, effort, choice, scale)
 
     def _with_pairs(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
         """Match and verify those pairs of ``choice`` that are not matched yet."""
         if choice.pairs == matched.choice.pairs:
             return matched
-        match_pairs(matched.database, choice.pairs, self.threads, self.progress)
+        error = _MAX_ERROR * matched.scale
+        match_pairs(matched.database, choice.pairs, error, self.threads, self.progress)
         more = dataclasses.replace(matched, choice=choice)
         self._verify(more, lens)
         return more
@@ -405,7 +406,8 @@ class PoseEstimation:
         agreement = 0.0
         if models:
             error = _MAX_ERROR * matched.scale
-            agreement = agreement_of_model(models[0], matched.database, error)
+            pairs = repaired.pairs if models[0] is repaired.model else None
+            agreement = agreement_of_model(models[0], matched.database, error, pairs)
         attempt = Attempt(matched, lens, mapping, models, agreement, left_out, doubts)
         self.attempts.append(attempt)
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
