@@ -370,6 +370,8 @@ struct PointsInFrustaParams {
   T* counts;          // out, (n,) the number of views that contain the point
   T* rates;           // out, (n,) the largest focal / depth of these views, or 0
   SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
+};
+
 // ---- detect_sift (CPU only) ---------------------------------------------------------------------
 
 // The `count` largest features of a photo, or fewer; returns their number, −1 if memory is missing.
