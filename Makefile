@@ -156,6 +156,7 @@ nightly: native $(ENVIRONMENT)
 # The kernels for Arm (NEON), in an emulator. The loader of the library, which test_native.py tests, is not
 # used for them.
 NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py \
+    tests/sfm/colmap/test_sift.py \
     --ignore tests/ops/test_native.py -k 'not ($(SAME))'
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
@@ -170,7 +171,7 @@ pytest-repeated:
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
-ISA_TESTS := tests/ops tests/sfm/colmap/test_matching.py \
+ISA_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_sift.py \
     tests/training/test_pose_refinement.py tests/training/test_step_runner.py -k 'not ($(SAME))'
 pytest-isas:
 	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \

@@ -372,23 +372,42 @@ struct PointsInFrustaParams {
   SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
 };
 
+// ---- detect_sift (CPU only) ---------------------------------------------------------------------
+
+// The `count` largest features of a photo, or fewer; returns their number, −1 if memory is missing.
+struct DetectSiftParams {
+  int64_t width;           // pixels, at least 1
+  int64_t height;          // at least 1
+  const uint8_t* grey;     // (height, width)
+  const uint8_t* allowed;  // (height, width): 0 where no feature is wanted; or null
+  int64_t count;           // at most
+  float* keypoints;        // out, (count, 6): x, y from the corner of the photo; (2, 2) scale in
+                           // pixels times rotation
+  uint8_t* descriptors;    // out, (count, 128): RootSIFT, with the norm 512
+  SNOW_FIELDS(width, height, grey, allowed, count, keypoints, descriptors)
+};
+
 // ---- match_descriptors (CPU only) ---------------------------------------------------------------
 
 // For each row, a descriptor of the first image, the column with the largest dot product, this
-// product, and that of the second best column; 0 if there is none. The same for each column.
+// product, and that of the second best column; 0 if there is none. The same for each column. A row is
+// compared with the first `common` columns, and with those of its range.
 struct MatchDescriptorsParams {
   int64_t n;               // descriptors of the first image, below 2^31
   int64_t m;               // descriptors of the second image, below 2^31, at least 1 if n is
   const uint8_t* first;    // (n, 128)
   const uint8_t* second;   // (m, 128)
-  int32_t* row_index;      // out, (n,); the smallest of the columns with the largest product
+  int64_t common;          // 0 to m
+  const int32_t* begin;    // (n,) of the range of each row, 0 to m
+  const int32_t* end;      // (n,) of this range, 0 to m; the column `end` is not part of it
+  int32_t* row_index;      // out, (n,); the smallest of the columns with the largest product, or -1
   int32_t* row_best;       // out, (n,)
   int32_t* row_second;     // out, (n,)
   int32_t* column_index;   // out, (m,)
   int32_t* column_best;    // out, (m,)
   int32_t* column_second;  // out, (m,)
-  SNOW_FIELDS(n, m, first, second, row_index, row_best, row_second, column_index, column_best,
-              column_second)
+  SNOW_FIELDS(n, m, first, second, common, begin, end, row_index, row_best, row_second,
+              column_index, column_best, column_second)
 };
 
 // ---- align_patches (CPU only) -------------------------------------------------------------------

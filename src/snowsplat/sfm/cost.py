@@ -14,7 +14,8 @@ The work is a sum of steps. Each step has a cost in seconds of one core of a ref
     images    pixels of the copies, from which the lens distortion is removed      up to 4
     report    constant                                                             1
 
-The constants were measured with 100 photos of 12 megapixels and with 50 photos of 0.9 megapixels.
+The constants were measured with 100 photos of 12 megapixels and with 50 photos of 0.9 megapixels,
+those of the features later, beside the ones before.
 `measure_speed` compares this machine, under its present load, with the reference machine. The
 number of matches differs between scenes, so the time of a step may differ by 40% from its
 prediction; the error of the sum is smaller.
@@ -32,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.options import EFFORTS, EffortName, photos_with_adjustment
-from snowsplat.sfm.colmap.sift import new_detector
+from snowsplat.sfm.colmap.sift import detect_in_grey
 from snowsplat.sfm.survey import Photos
 
 # Seconds of one core of the reference machine: a virtual x86-64 server with two cores and AVX-512.
@@ -40,8 +41,8 @@ _PHOTO = 0.02
 _DECODED_MEGAPIXEL = 0.016  # of an original photo
 _WRITTEN_MEGAPIXEL = 0.1  # of a resized photo: resizing and saving
 _FRAME_MEGAPIXEL = 0.02  # of each frame of a video, also of those that are not used
-_SIFT_MEGAPIXEL = 0.33
-_SIFT_THOUSAND = 0.06  # for each thousand features
+_SIFT_MEGAPIXEL = 0.09
+_SIFT_THOUSAND = 0.03  # for each thousand features
 _MATCHED_PAIR = 0.001  # a pair of photos with 1000 features each
 _VERIFIED_PAIR = 0.006  # a pair of photos with 1000 features each
 # The costs of a photo in the step "poses".
@@ -59,8 +60,9 @@ _MOST_READERS = 4  # threads that read and write photos
 
 # The sample with which the speed is measured.
 _SAMPLE_SIDE = 320
-_SAMPLE_SECONDS = 0.1  # of one core of the reference machine
-_SAMPLE_REPEATS = 3
+_SAMPLE_FEATURES = 5000  # more than it has
+_SAMPLE_SECONDS = 0.036  # of one core of the reference machine
+_SAMPLE_REPEATS = 8
 _MOST_THREADS = 16
 
 
@@ -145,11 +147,10 @@ def expected_pairs(count: int, effort: EffortName) -> float:
 def measure_speed(threads: int) -> Speed:
     """Measure the speed of this machine with ``threads`` threads; takes about a second."""
     threads = max(1, min(threads, _MOST_THREADS))
-    cv2.setNumThreads(1)
     sample = _sample()
 
     def run(_: int = 0) -> None:
-        new_detector().detectAndCompute(sample, None)
+        detect_in_grey(sample, None, _SAMPLE_FEATURES)
 
     run()  # the first run also loads code
     start = time.monotonic()

@@ -18,6 +18,19 @@ from snowsplat.util.native_library import ArrayPointer
 
 
 @dataclass(slots=True, kw_only=True)
+class DetectSiftParams(Params):
+    """The struct of the same name in `native/params.h`."""
+
+    width: int
+    height: int
+    grey: ArrayPointer
+    allowed: ArrayPointer | None
+    count: int
+    keypoints: ArrayPointer
+    descriptors: ArrayPointer
+
+
+@dataclass(slots=True, kw_only=True)
 class MatchDescriptorsParams(Params):
     """The struct of the same name in `native/params.h`."""
 
@@ -25,6 +38,9 @@ class MatchDescriptorsParams(Params):
     m: int
     first: ArrayPointer
     second: ArrayPointer
+    common: int
+    begin: ArrayPointer
+    end: ArrayPointer
     row_index: ArrayPointer
     row_best: ArrayPointer
     row_second: ArrayPointer
@@ -68,13 +84,14 @@ class ResampleParams(Params):
 
 
 ENTRIES: dict[str, type[Params]] = {
+    "detect_sift": DetectSiftParams,
     "match_descriptors": MatchDescriptorsParams,
     "align_patches": AlignPatchesParams,
     "resample": ResampleParams,
 }
 
 
-def call(name: str, params: Params) -> None:
+def call(name: str, params: Params) -> int:
     """Call a function of `ENTRIES`. Its arguments must be valid: C++ does not check them.
 
     Raises UserError if the native library is missing or outdated.
@@ -82,7 +99,7 @@ def call(name: str, params: Params) -> None:
     layout = layout_of(ENTRIES[name])
     buffer = ctypes.create_string_buffer(layout.size)
     layout.pack_into(buffer, params)
-    _function(name)(ctypes.addressof(buffer))
+    return int(_function(name)(ctypes.addressof(buffer)))
 
 
 @functools.cache

@@ -7,7 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.matching import LENGTH, match_descriptors, two_nearest
+from snowsplat.sfm.colmap.matching import (
+    LENGTH,
+    Searched,
+    look_alikes,
+    match_descriptors,
+    two_nearest,
+)
 from snowsplat.util import native_library
 
 
@@ -160,3 +166,45 @@ def test_the_child_process_does_not_import_torch():
     code = "import sys, snowsplat.sfm.colmap.worker; print('torch' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.stdout == "False\n", result.stderr
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize("common", [0, 3, 70, 200])
+def test_only_the_descriptors_in_the_ranges_are_compared(common):
+    random = np.random.default_rng(common)
+    first, second = random_descriptors(random, 150, 3), random_descriptors(random, 260, 3)
+    begin, end = np.sort(random.integers(0, 261, (2, 150)).astype(np.int32), axis=0)
+    begin[:40], end[:40] = np.arange(40), np.arange(40) + 20  # narrower than a tile
+    end[60:66] = begin[60:66]  # nothing but the common ones
+    columns = np.arange(260)
+    searched = (columns < common) | ((columns >= begin[:, None]) & (columns < end[:, None]))
+    products = np.where(searched, first.astype(np.int64) @ second.astype(np.int64).T, -1)
+    found = two_nearest(first, second, Searched(common, begin, end))
+    for nearest, matrix in zip(found, (products, products.T), strict=True):
+        best = matrix.max(1)
+        np.testing.assert_array_equal(nearest.which, np.where(best < 0, -1, matrix.argmax(1)))
+        np.testing.assert_array_equal(nearest.best, best)
+        np.testing.assert_array_equal(nearest.second, np.maximum(np.sort(matrix, 1)[:, -2], 0))
+
+
+@pytest.mark.isa
+def test_look_alikes_are_the_nearest_of_the_same_photo():
+    descriptors = random_descriptors(np.random.default_rng(4), 130)
+    products = descriptors.astype(np.int64) @ descriptors.astype(np.int64).T
+    np.fill_diagonal(products, 0)
+    np.testing.assert_array_equal(look_alikes(descriptors), products.max(1))
+    assert list(look_alikes(descriptors[:1])) == [0]
+    assert len(look_alikes(descriptors[:0])) == 0
+
+
+def test_ranges_beyond_the_descriptors_are_refused():
+    good = np.zeros((2, LENGTH), np.uint8)
+    ends = np.array([0, 2], np.int32)
+    for searched, message in (
+        (Searched(3, ends, ends), "common must be from 0 to 2, got 3"),
+        (Searched(0, ends - 1, ends), "begin must be from 0 to 2"),
+        (Searched(0, ends, ends + 1), "end must be from 0 to 2"),
+        (Searched(0, ends, ends.astype(float)), r"end must be \(2,\) int32"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            two_nearest(good, good, searched)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from snowsplat.sfm.colmap import reconstruct
 from snowsplat.sfm.colmap.features import Folders, WorkerProgress
 from snowsplat.sfm.colmap.lens import Lens
 from snowsplat.sfm.colmap.options import SfmOptions
@@ -77,3 +78,26 @@ def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_p
     assert job._best() is other
     other.misfit = 1.2e-3  # the photos contradict the focal length in EXIF
     assert job._best() is bent
+
+
+@pytest.mark.parametrize(
+    ("doubts", "known", "exif", "tried"),
+    [
+        (["a focal length"], {1: 1035.0}, True, True),
+        ([], {1: 1035.0}, True, False),
+        (["a focal length"], {}, True, False),
+        (["a focal length"], {1: 1035.0}, False, False),  # the matches have contradicted it
+    ],
+)
+def test_the_focal_length_in_exif_is_held_if_the_lens_contradicts_it(
+    tmp_path, monkeypatch, doubts, known, exif, tried
+):
+    """Even if the poses agree with the matches: a bent model of a street may."""
+    monkeypatch.setattr(reconstruct, "exif_focals", lambda photos: known)
+    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
+    job.attempts = [
+        SimpleNamespace(
+            registered=9, agreement=0.95, error=1.0, lens=Lens(), doubts=doubts, misfit=1.0
+        )
+    ]
+    assert job._contradicts_exif(Lens(exif=exif)) == tried

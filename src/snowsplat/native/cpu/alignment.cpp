@@ -6,8 +6,10 @@
 // equations are the same in all iterations. Pairs are independent, so the number of threads does not
 // change the result.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <optional>
 #include <vector>
 
 #include "cpu/entry.h"
@@ -51,7 +53,8 @@ struct Window {
 // The Cholesky factorisation of a symmetric positive definite matrix.
 class Cholesky {
  public:
-  explicit Cholesky(const double (&matrix)[kUnknowns][kUnknowns]) {
+  template <class Matrix>
+  explicit Cholesky(const Matrix& matrix) {
     for (int i = 0; i < kUnknowns; i++)
       for (int j = 0; j <= i; j++) {
         double sum = matrix[i][j];
@@ -75,10 +78,10 @@ class Cholesky {
   double l_[kUnknowns][kUnknowns] = {};
 };
 
-class Alignment {
+// The window of a first patch, which is aligned with several second ones.
+class Template {
  public:
-  Alignment(const Window& window, const uint8_t* first, const uint8_t* second, int side)
-      : window_(window), side_(side), second_(second) {
+  Template(const Window& window, const uint8_t* first, int side) : window_(window), side_(side) {
     const uint8_t* start = first + (side / 2 - kRadius) * (side + 1);
     for (int i = 0; i < kPixels; i++) {
       const uint8_t* at = start + i / kWindow * side + i % kWindow;
@@ -93,17 +96,17 @@ class Alignment {
                                        1.0f};
       for (int k = 0; k < kUnknowns; k++) jacobian_[k][i] = column[k];
     }
+    normal_.emplace(normal_matrix());
   }
 
-  // The transform; returns the weighted correlation of the window and the second patch.
-  float run(Affine& affine) const {
-    const Cholesky normal = factorised();
+  // The transform; returns the weighted correlation of the window and the ``second`` patch.
+  float align(const float* second, Affine& affine) const {
     float values[kPixels];
     for (int i = 0; i < kIterations; i++) {
-      sample(affine, values);
+      sample(second, affine, values);
       double x[kUnknowns];
       for (int k = 0; k < kUnknowns; k++) x[k] = dot(jacobian_[k], values);
-      normal.solve(x);
+      normal_->solve(x);
       const float gain = std::clamp(float(x[kGain]), kLeastGain, kLargestGain);
       float change[6];
       for (int k = 0; k < 6; k++) change[k] = float(x[k]) / gain;
@@ -114,17 +117,19 @@ class Alignment {
                                    kRadius * (std::abs(q[3]) + std::abs(q[4])) + std::abs(q[5]));
       if (!(moved >= kTolerance)) break;
     }
-    sample(affine, values);
+    sample(second, affine, values);
     return correlation(values);
   }
 
  private:
-  Cholesky factorised() const {
-    double matrix[kUnknowns][kUnknowns];
+  using Matrix = std::array<std::array<double, kUnknowns>, kUnknowns>;
+
+  Matrix normal_matrix() const {
+    Matrix matrix;
     for (int i = 0; i < kUnknowns; i++)
       for (int j = 0; j <= i; j++) matrix[i][j] = dot(jacobian_[i], jacobian_[j]);
     for (int i = 0; i < kUnknowns; i++) matrix[i][i] += kDamping * matrix[i][i] + kSmallest;
-    return Cholesky(matrix);
+    return matrix;
   }
 
   float dot(const float* a, const float* b) const {
@@ -140,18 +145,18 @@ class Alignment {
   }
 
   // The grey values of the second patch at the transformed positions, bilinear. Outside of the
-  // patch, those at its border.
-  void sample(const Affine& t, float* values) const {
+  // patch, those at its border. They are float, so that compilers use vectors.
+  void sample(const float* __restrict second, const Affine& t, float* __restrict values) const {
     const float middle = float(side_ / 2), last = float(side_ - 1);
     for (int i = 0; i < kPixels; i++) {
       const float u = window_.u[i], v = window_.v[i];
-      const float x = std::clamp(t.a * u + t.b * v + t.c + middle, 0.0f, last);
-      const float y = std::clamp(t.d * u + t.e * v + t.f + middle, 0.0f, last);
+      const float x = std::min(std::max(t.a * u + t.b * v + t.c + middle, 0.0f), last);
+      const float y = std::min(std::max(t.d * u + t.e * v + t.f + middle, 0.0f), last);
       const int column = std::min(int(x), side_ - 2), row = std::min(int(y), side_ - 2);
       const float p = x - float(column), q = y - float(row);
-      const uint8_t* at = second_ + row * side_ + column;
-      const float upper = float(at[0]) + p * float(at[1] - at[0]);
-      const float lower = float(at[side_]) + p * float(at[side_ + 1] - at[side_]);
+      const int at = row * side_ + column;
+      const float upper = second[at] + p * (second[at + 1] - second[at]);
+      const float lower = second[at + side_] + p * (second[at + side_ + 1] - second[at + side_]);
       values[i] = upper + q * (lower - upper);
     }
   }
@@ -186,8 +191,8 @@ class Alignment {
 
   const Window& window_;
   const int side_;
-  const uint8_t* second_;
   float jacobian_[kUnknowns][kPixels];
+  std::optional<Cholesky> normal_;
 };
 
 }  // namespace
@@ -199,11 +204,14 @@ SNOW_ENTRY(align_patches, AlignPatchesParams) {
   const Window window;
   const int64_t size = p.side * p.side;
   parallel_for((p.n + kBlock - 1) / kBlock, [&](int64_t block) {
+    std::vector<float> second(size);
+    std::optional<Template> first;
     for (int64_t i = block * kBlock; i < std::min(p.n, (block + 1) * kBlock); i++) {
-      const uint8_t* first = p.patches + size * p.pairs[2 * i];
-      const uint8_t* second = p.patches + size * p.pairs[2 * i + 1];
+      if (!first || p.pairs[2 * i] != p.pairs[2 * i - 2])
+        first.emplace(window, p.patches + size * p.pairs[2 * i], int(p.side));
+      std::copy_n(p.patches + size * p.pairs[2 * i + 1], size, second.begin());
       Affine t;
-      p.correlation[i] = Alignment(window, first, second, int(p.side)).run(t);
+      p.correlation[i] = first->align(second.data(), t);
       const float values[6] = {t.a, t.b, t.c, t.d, t.e, t.f};
       std::copy_n(values, 6, p.transform + 6 * i);
     }

@@ -1,5 +1,6 @@
 // match_descriptors: for each descriptor of one image the two descriptors of another image with the
 // largest dot products, and the same in the other direction, in one pass over the product matrix.
+// Each row of the matrix may be restricted to a range of the columns.
 //
 // The matrix is computed in tiles that stay in registers, and is never stored. All numbers are
 // integers, so the result is exact for every instruction set and number of threads.
@@ -167,8 +168,7 @@ class Matcher {
     Lanes words[kWords][kColumns];
   };
 
-  // Columns beyond the last are 0, and so are their products. They are never found, because an
-  // earlier column has at least the same product.
+  // Columns beyond the last are 0. They are in no range, so they are never found.
   void pack_columns(int64_t block) {
     Columns& packed = columns_[size_t(block)];
     for (int column = 0; column < kWidth; column++) {
@@ -202,13 +202,35 @@ class Matcher {
     TopTwo tops[kRows];
     Lanes lane;
     for (int l = 0; l < kLanes; l++) lane[l] = l;
-    for (int64_t block = 0; block < blocks_; block++) {
+    // Columns in the ranges of some of these rows, and in the ranges of all of them.
+    int64_t some_begin = p_.m, some_end = 0, every_begin = 0, every_end = p_.m;
+    for (int64_t at = row; at < row + rows; at++) {
+      const int64_t begin = p_.begin[at], end = p_.end[at];
+      if (begin < end) some_begin = std::min(some_begin, begin), some_end = std::max(some_end, end);
+      every_begin = std::max(every_begin, begin), every_end = std::min(every_end, end);
+    }
+    const int64_t common_blocks = (p_.common + kWidth - 1) / kWidth;
+    const int64_t last_block = (some_end + kWidth - 1) / kWidth;
+    for (int64_t block = common_blocks > 0 ? 0 : some_begin / kWidth;
+         block < std::max(common_blocks, last_block); block++) {
+      if (block == common_blocks) block = std::max(block, some_begin / kWidth);
+      const int64_t begin = block * kWidth, end = begin + kWidth;
       Lanes tile[kRows * kColumns];
       multiply(words, block, tile, std::make_index_sequence<kRows * kColumns>());
+      if (end > p_.common && !(every_begin <= begin && end <= every_end))
+        for (int r = 0; r < rows; r++)
+          for (int c = 0; c < kColumns; c++) {
+            const Lanes column = lane + int32_t(begin + c * kLanes);
+            const Lanes searched =
+                (column < all(int32_t(p_.common))) |
+                ((column >= all(p_.begin[row + r])) & (column < all(p_.end[row + r])));
+            Lanes& values = tile[r * kColumns + c];
+            values = searched ? values : all(-1);
+          }
       for (int r = 0; r < rows; r++) {
         TopTwo top = tops[r];
         for (int c = 0; c < kColumns; c++)
-          top.add(tile[r * kColumns + c], lane + int32_t(block * kWidth + c * kLanes));
+          top.add(tile[r * kColumns + c], lane + int32_t(begin + c * kLanes));
         tops[r] = top;
       }
       for (int c = 0; c < kColumns; c++) {

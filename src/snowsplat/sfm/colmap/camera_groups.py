@@ -155,21 +155,32 @@ def _clusters(values: np.ndarray) -> list[int]:
 
 def _with_separate_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """A copy with a camera for each photo, of the points that are in the most photos."""
+    counts = dict.fromkeys(model.reg_image_ids(), 0)
+    chosen = []
+    features: dict[int, list[int]] = {i: [] for i in counts}  # of each photo, of the chosen points
+    for point in sorted(model.points3D.values(), key=lambda point: -point.track.length()):
+        elements = [(e.image_id, e.point2D_idx) for e in point.track.elements]
+        photos = {image_id for image_id, _ in elements}
+        if len(photos) < _MIN_PHOTOS_OF_POINT or min(counts[i] for i in photos) >= _POINTS:
+            continue
+        track = pycolmap.Track()
+        for image_id, feature in elements:
+            track.add_element(image_id, len(features[image_id]))
+            features[image_id].append(feature)
+        chosen.append((point, track))
+        for i in photos:
+            counts[i] += 1
     made = pycolmap.Reconstruction()
-    for image_id in model.reg_image_ids():
+    for image_id, rows in features.items():
         image = model.image(image_id)
         camera = pycolmap.Camera(model.cameras[image.camera_id].todict() | {"camera_id": image_id})
         made.add_camera_with_trivial_rig(camera)
         copied = pycolmap.Image(name=image.name, camera_id=image_id, image_id=image_id)
-        copied.points2D = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
+        points = image.points2D
+        copied.points2D = pycolmap.Point2DList([pycolmap.Point2D(points[row].xy) for row in rows])
         made.add_image_with_trivial_frame(copied, image.cam_from_world())
-    counts = dict.fromkeys(model.reg_image_ids(), 0)
-    for point in sorted(model.points3D.values(), key=lambda point: -point.track.length()):
-        photos = {element.image_id for element in point.track.elements}
-        if len(photos) >= _MIN_PHOTOS_OF_POINT and min(counts[i] for i in photos) < _POINTS:
-            made.add_point3D(point.xyz, point.track, point.color)
-            for i in photos:
-                counts[i] += 1
+    for point, track in chosen:
+        made.add_point3D(point.xyz, track, point.color)
     return made
 
 

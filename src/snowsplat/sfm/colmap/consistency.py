@@ -149,8 +149,14 @@ def agreement_of(pairs: Sequence[CheckedPair], possible: Callable[[CheckedPair],
     return sum(share * pair.matches for share, pair in worst) / total if total else 0.0
 
 
-def agreement_of_model(model: pycolmap.Reconstruction, database: Path, max_error: float) -> float:
-    """`agreement_of` the pairs of ``model``; ``max_error`` as in `check_pairs`."""
+def agreement_of_model(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    max_error: float,
+    pairs: Sequence[CheckedPair] | None = None,
+) -> float:
+    """`agreement_of` the ``pairs`` of ``model``: the result of `check_pairs`, with the same
+    ``max_error``. None: they are checked here."""
     options = pycolmap.RANSACOptions()
     options.max_error, options.max_num_trials = max_error, _MAX_TRIALS
     options.random_seed = SEED
@@ -173,7 +179,8 @@ def agreement_of_model(model: pycolmap.Reconstruction, database: Path, max_error
             rays = _rays(one, first), _rays(two, second)
             return agreement(found["cam2_from_cam1"], *rays, error)
 
-        return agreement_of(check_pairs(model, database, max_error), possible)
+        checked = check_pairs(model, database, max_error) if pairs is None else pairs
+        return agreement_of(checked, possible)
 
 
 def check_pairs(

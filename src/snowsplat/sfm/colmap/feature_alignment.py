@@ -66,8 +66,12 @@ def align_features(
         sizes = {i: detection_size(image_size, lens.is_spherical()) for i, lens in lenses.items()}
         patches = _Patches.cut(block, names, keypoints, images, sizes, threads)
         positions, good = patches.aligned(block)
-        for i in np.flatnonzero(good):
-            model.image(int(block.image[i])).points2D[int(block.row[i])].xy = positions[i]
+        points = {i: model.image(i).points2D for i in names}
+        (moved,) = np.nonzero(good)
+        for i, row, position in zip(
+            block.image[moved].tolist(), block.row[moved].tolist(), positions[moved], strict=True
+        ):
+            points[i][row].xy = position
 
 
 def _features_of(model: pycolmap.Reconstruction) -> _Features:

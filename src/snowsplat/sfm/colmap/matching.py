@@ -30,6 +30,17 @@ class Nearest(NamedTuple):
     second: NDArray[np.int32]  # dot product with the second nearest; 0 if there is none
 
 
+class Searched(NamedTuple):
+    """Descriptors of the second photo with which each of the N of the first one is compared.
+
+    These are the first ``common`` ones, and those from ``begin`` to ``end`` - 1; both (N,) int32.
+    """
+
+    common: int
+    begin: NDArray[np.int32]
+    end: NDArray[np.int32]
+
+
 def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """Matches (K, 2) between descriptors ``first`` (N, 128) and ``second`` (M, 128).
 
@@ -42,23 +53,37 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
         ValueError: a wrong shape or dtype.
         UserError: the native library is missing or outdated.
     """
-    rows, columns = two_nearest(first, second)
+    return mutual(*two_nearest(first, second))
+
+
+def mutual(rows: Nearest, columns: Nearest) -> NDArray[np.uint32]:
+    """The matches (K, 2), as in `match_descriptors`, of the results of `two_nearest`."""
     forth, back = _accepted(rows), _accepted(columns)
-    if len(forth) == 0 or len(back) == 0:
-        return np.zeros((0, 2), np.uint32)
     (found,) = np.nonzero(forth >= 0)
     found = found[back[forth[found]] == found]
     return np.stack([found, forth[found]], 1).astype(np.uint32)
 
 
-def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Nearest, Nearest]:
+def look_alikes(descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(N,) dot product of each of ``descriptors`` (N, 128) with the nearest of the others; 0 if
+    there is none. Raises as `two_nearest`."""
+    count = len(descriptors)
+    later = Searched(0, np.arange(1, count + 1, dtype=np.int32), np.full(count, count, np.int32))
+    rows, columns = two_nearest(descriptors, descriptors, later)
+    return np.maximum(np.maximum(rows.best, columns.best), 0)
+
+
+def two_nearest(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], searched: Searched | None = None
+) -> tuple[Nearest, Nearest]:
     """The nearest of ``second`` (M, 128) for each of ``first`` (N, 128), and vice versa.
 
     The nearest descriptor is the one with the largest dot product. If there are no descriptors in
-    which to search, indices and dot products are -1. The results are exact.
+    which to search, indices and dot products are -1. The results are exact. ``searched``: which
+    descriptors are compared, in both directions; None: all.
 
     Raises:
-        ValueError: a wrong shape or dtype.
+        ValueError: a wrong shape or dtype, or ranges beyond ``second``.
         UserError: the native library is missing or outdated.
     """
     for name, descriptors in (("first", first), ("second", second)):
@@ -69,12 +94,24 @@ def two_nearest(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Ne
         if descriptors.dtype != np.uint8:
             raise ValueError(f"two_nearest: {name} must be uint8, got {descriptors.dtype}")
     n, m = len(first), len(second)
+    if searched is None:
+        searched = Searched(0, np.zeros(n, np.int32), np.full(n, m, np.int32))
+    for name, ends in (("begin", searched.begin), ("end", searched.end)):
+        if ends.shape != (n,) or ends.dtype != np.int32:
+            raise ValueError(f"two_nearest: {name} must be ({n},) int32")
+        if n and not (ends.min() >= 0 and ends.max() <= m):
+            raise ValueError(f"two_nearest: {name} must be from 0 to {m}")
+    if not 0 <= searched.common <= m:
+        raise ValueError(f"two_nearest: common must be from 0 to {m}, got {searched.common}")
     rows, columns = (Nearest(*(np.empty(k, np.int32) for _ in range(3))) for k in (n, m))
     params = array_kernels.MatchDescriptorsParams(
         n=n,
         m=m,
         first=ArrayPointer(np.ascontiguousarray(first)),
         second=ArrayPointer(np.ascontiguousarray(second)),
+        common=searched.common,
+        begin=ArrayPointer(np.ascontiguousarray(searched.begin)),
+        end=ArrayPointer(np.ascontiguousarray(searched.end)),
         row_index=ArrayPointer(rows.which),
         row_best=ArrayPointer(rows.best),
         row_second=ArrayPointer(rows.second),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +27,6 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
 
     Arguments and errors are those of `sift.detect_sift`; ``image_size`` is the width.
     """
-    cv2.setNumThreads(1)  # other photos are processed in parallel
     grey, (width, height) = read_grey(photo, image_size)
     allowed = None if mask is None else read_mask(mask, grey)
     rows, columns = grey.shape

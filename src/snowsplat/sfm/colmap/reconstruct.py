@@ -26,8 +26,9 @@ are verified again without it.
 
 The attempts end when one of them finds poses for 90% of the usable photos (`Evidence.usable`), or
 when the matches show that no further attempt can succeed. If these poses do not agree with the
-matches, the second and third attempts are made, too. The result is the possible model (see `lens`)
-with the most registered photos, weighted by its agreement with the matches.
+matches, the second and third attempts are made, too; the third one also if their lens contradicts
+EXIF. The result is the possible model (see `lens`) with the most registered photos, weighted by its
+agreement with the matches.
 """
 
 from __future__ import annotations
@@ -239,7 +240,7 @@ class PoseEstimation:
         other: Mapper = "incremental" if mapper == "global" else "global"
         if not (self._good(evidence) or evidence.flat):
             self._try("as configured", matched, other, lens)
-        if not self._good(evidence):
+        if not self._good(evidence) or self._contradicts_exif(lens):
             self._try("as configured", matched, "incremental", lens.fixed)
         if not self._enough(evidence):
             self._try("as configured", matched, "plain", lens)
@@ -347,14 +348,15 @@ class PoseEstimation:
             for photo in self.photos
         ]
         scale = max(1.0, float(np.median(scales)))
-        match_pairs(database, choice.pairs, self.threads, self.progress)
+        match_pairs(database, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress)
         return Matched(database, effort, choice, scale)
 
     def _with_pairs(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
         """Match and verify those pairs of ``choice`` that are not matched yet."""
         if choice.pairs == matched.choice.pairs:
             return matched
-        match_pairs(matched.database, choice.pairs, self.threads, self.progress)
+        error = _MAX_ERROR * matched.scale
+        match_pairs(matched.database, choice.pairs, error, self.threads, self.progress)
         more = dataclasses.replace(matched, choice=choice)
         self._verify(more, lens)
         return more
@@ -405,7 +407,8 @@ class PoseEstimation:
         agreement = 0.0
         if models:
             error = _MAX_ERROR * matched.scale
-            agreement = agreement_of_model(models[0], matched.database, error)
+            pairs = repaired.pairs if models[0] is repaired.model else None
+            agreement = agreement_of_model(models[0], matched.database, error, pairs)
         attempt = Attempt(matched, lens, mapping, models, agreement, left_out, doubts)
         self.attempts.append(attempt)
         effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
@@ -464,6 +467,15 @@ class PoseEstimation:
         return lambda model, cameras, held: dataclasses.replace(mapping, held=held).with_cameras(
             model, cameras
         )
+
+    def _contradicts_exif(self, lens: Lens) -> bool:
+        """Whether the best lens is in doubt, and EXIF knows another focal length, which is tried.
+
+        If the photos do not determine the focal length, the model that was made with a wrong one is
+        bent, so `settled`, which starts from this model, may not find that EXIF is right.
+        """
+        doubtful = lens.exif and bool(self._best().doubts) and not self._late()
+        return doubtful and bool(exif_focals(self.photos))
 
     def _good(self, evidence: Evidence) -> bool:
         """Whether enough photos are registered, in a model that agrees with its matches."""

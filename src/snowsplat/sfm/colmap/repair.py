@@ -29,6 +29,7 @@ class Repaired:
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
     left_out: dict[str, str]  # name -> reason, for those of these photos that have no pose now
+    pairs: list[CheckedPair] | None  # `check_pairs` of the model; None: it has changed since
 
     @property
     def description(self) -> str:
@@ -65,13 +66,14 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     # The image ids of the pairs with false matches, of all rounds.
     false_pairs: set[tuple[int, int]] = set()
     wrong: dict[int, str] = {}  # image id -> reason, for all photos that had a wrong pose
-    found: list[tuple[pycolmap.Reconstruction, set[int]]] = []  # models and their wrong photos
+    # Models, their wrong photos, and their pairs.
+    found: list[tuple[pycolmap.Reconstruction, set[int], list[CheckedPair] | None]] = []
     while True:
         names |= {i: image.name for i, image in model.images.items()}
         pairs = check_pairs(model, mapping.database, max_error)
         parts = _parts(pairs, false_pairs)
         doubtful = unconfirmed_photos(pairs).difference(*parts[1:])
-        found.append((model, doubtful.union(*parts[1:])))
+        found.append((model, doubtful.union(*parts[1:]), pairs))
         wrong |= _doubts(model, pairs, doubtful) | _reasons(model, pairs, parts)
         if len(parts) < 2:
             break
@@ -82,12 +84,12 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if not models:
             break
         model = models[0]
-    model, left_out = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
+    model, left_out, checked = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
     if left_out:
-        model = mapping.without(model, left_out)
+        model, checked = mapping.without(model, left_out), None
     registered = set(model.reg_image_ids())
     reasons = {names[i]: reason for i, reason in wrong.items() if i not in registered}
-    return Repaired(model, len(wrong), reasons)
+    return Repaired(model, len(wrong), reasons, checked)
 
 
 def _parts(pairs: Sequence[CheckedPair], false_pairs: set[tuple[int, int]]) -> list[set[int]]:
@@ -118,9 +120,10 @@ def _registered_again(
     again = mapping.extend([rest], relaxed=False)[0]
     if again.num_reg_images() < model.num_reg_images():
         return []
-    if len(find_parts(check_pairs(again, mapping.database, max_error))) > 1:
+    pairs = check_pairs(again, mapping.database, max_error)
+    if len(find_parts(pairs)) > 1:
         return []
-    agreement = agreement_of_model(again, mapping.database, max_error)
+    agreement = agreement_of_model(again, mapping.database, max_error, pairs)
     return [again] if agreement >= CONSISTENT else []
 
 

@@ -1,14 +1,12 @@
-"""Detects SIFT features in a photo (Lowe 2004), with OpenCV.
+"""Detects SIFT features in a photo (Lowe 2004), with a native function.
 
-OpenCV is three to five times as fast as COLMAP's own detection on the CPU: it uses the vector
-instructions of the processor, and computes descriptors only of features that are kept.
+The parameters of the detection are the defaults of COLMAP.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,23 +15,14 @@ from PIL import Image
 
 from snowsplat.data.image_file import scaled_size
 from snowsplat.sfm.ingest.photo_files import open_image
+from snowsplat.util import array_kernels
 from snowsplat.util.machine import memory_bytes
+from snowsplat.util.native_library import ArrayPointer
 
-# Parameters of the detection; their values are the defaults of COLMAP.
-_CONTRAST_THRESHOLD = 0.02  # for pixels in [0, 1]; divided by the number of layers in an octave
-_EDGE_THRESHOLD = 10
-_LAYERS = 3  # in an octave. The scale doubles from one octave to the next
-_NORM = 512  # Euclidean norm of a uint8 descriptor, except for rounding
-
-# Up to this number of pixels for each feature that is wanted, descriptors are computed of all
-# features that are found: usually these are not many more. Otherwise, the largest features are
-# chosen first, and OpenCV makes the pyramid of the photo twice, which takes 0.06 s for 800x533.
-_PIXELS_PER_FEATURE = 100
-
-# Memory for each pixel of the resized photo: all octaves of its pyramid, float32. The first octave
-# has 4 pixels for each pixel of the photo, with 6 levels of blur and 5 differences between them.
-# The other octaves together have a third of the pixels of the first one.
-_BYTES_PER_PIXEL = 4 * 4 * (_LAYERS + 3 + _LAYERS + 2) * 4 // 3
+# Memory for each pixel of the resized photo. The first octave has 4 pixels for each pixel of the
+# photo; three levels of blur are kept, float32. The other octaves together have a third of its
+# pixels.
+_BYTES_PER_PIXEL = 4 * 3 * 4 * 4 // 3
 # The part of the machine's memory that all these pyramids may use.
 _MEMORY_PART = 0.25
 
@@ -68,9 +57,9 @@ def detect_sift(photo: Path, mask: Path | None, image_size: int, count: int) -> 
     Raises:
         OSError: a file is missing.
         Exception: any other that Pillow raises for a damaged file.
-        cv2.error: not enough memory.
+        MemoryError: not enough memory.
+        UserError: the native library is missing or outdated.
     """
-    cv2.setNumThreads(1)  # other photos are processed in parallel
     grey, size = read_grey(photo, image_size)
     found = detect_in_grey(grey, None if mask is None else read_mask(mask, grey), count)
     stretch = np.array(size, np.float32) / grey.shape[::-1]
@@ -85,33 +74,38 @@ def detect_in_grey(
     """The ``count`` largest features of a grey image (H, W), in pixels of this image.
 
     ``allowed`` (H, W) is 0 where no feature is wanted.
+
+    Raises:
+        ValueError: a wrong shape or dtype.
+        MemoryError: not enough memory.
+        UserError: the native library is missing or outdated.
     """
-    sift = new_detector()
-    if grey.size <= _PIXELS_PER_FEATURE * count:
-        found, histograms = sift.detectAndCompute(grey, allowed)
-        order = sorted(range(len(found)), key=lambda i: -found[i].size)[:count]
-        found = [found[i] for i in order]
-        histograms = None if histograms is None else histograms[order]
-    else:
-        found = sorted(sift.detect(grey, allowed), key=lambda keypoint: -keypoint.size)[:count]
-        found, histograms = sift.compute(grey, found)
-    if not found:
-        return Features(np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8))
-    return Features(_as_rows(found), _root_sift(np.asarray(histograms)))
-
-
-def new_detector() -> cv2.SIFT:
-    """The detector that `detect_sift` uses. Each thread needs its own."""
-    return cv2.SIFT.create(
-        nOctaveLayers=_LAYERS,
-        contrastThreshold=_CONTRAST_THRESHOLD,
-        edgeThreshold=_EDGE_THRESHOLD,
-        enable_precise_upscale=True,  # without it, all positions have an error of 1/4 pixel
+    for name, array in (("grey", grey), ("allowed", grey if allowed is None else allowed)):
+        if array.ndim != 2 or array.shape != grey.shape or array.dtype != np.uint8:
+            raise ValueError(
+                f"detect_in_grey: {name} must be an image (H, W) uint8 of the same size, "
+                f"got {array.shape} {array.dtype}"
+            )
+    height, width = grey.shape
+    keypoints, descriptors = np.empty((count, 6), np.float32), np.empty((count, 128), np.uint8)
+    params = array_kernels.DetectSiftParams(
+        width=width,
+        height=height,
+        grey=ArrayPointer(np.ascontiguousarray(grey)),
+        allowed=None if allowed is None else ArrayPointer(np.ascontiguousarray(allowed)),
+        count=count,
+        keypoints=ArrayPointer(keypoints),
+        descriptors=ArrayPointer(descriptors),
     )
+    found = array_kernels.call("detect_sift", params)
+    if found < 0:
+        raise MemoryError("not enough memory to detect features in a photo")
+    return Features(keypoints[:found], descriptors[:found])
 
 
 def read_grey(photo: Path, image_size: int) -> tuple[NDArray[np.uint8], tuple[int, int]]:
     """The grey photo (H, W), resized, and its original width and height."""
+    cv2.setNumThreads(1)  # other photos are processed in parallel
     with open_image(photo) as image:
         width, height = image.size
         size = scaled_size(width, height, image_size)
@@ -128,18 +122,3 @@ def read_mask(mask: Path, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = grey.shape
     with open_image(mask) as image:
         return np.asarray(image.convert("L").resize((width, height), Image.Resampling.NEAREST))
-
-
-def _as_rows(keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
-    """Keypoints (N, 6), as in `Features`. OpenCV measures positions from the centre of the first
-    pixel."""
-    position = np.array([k.pt for k in keypoints]) + 0.5
-    scale = np.array([k.size for k in keypoints]) / 2  # OpenCV has the diameter
-    angle = np.radians([k.angle for k in keypoints])
-    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
-    return np.column_stack([position, cos, -sin, sin, cos]).astype(np.float32)
-
-
-def _root_sift(histograms: NDArray[Any]) -> NDArray[np.uint8]:
-    total = np.maximum(histograms.sum(1, keepdims=True), 1)
-    return np.rint(_NORM * np.sqrt(histograms / total)).clip(0, 255).astype(np.uint8)
