@@ -54,9 +54,9 @@ class Watcher(Observer):
     def page_opened(self, page) -> None:
         self.seen = [status_of(page.url), status_of(page.url[: page.url[:-1].rindex("/")])]
         with Visitor(page.url) as visitor:
-            visitor.send_camera()
+            visitor.view()
             visitor.pictures(20.0, most=1)
-            visitor.press("Pause")
+            visitor.send("training", do="pause")
             before = -1
             while before != self.steps[-1]:
                 before = self.steps[-1]

@@ -5,6 +5,7 @@ import io
 import random
 import time
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 from PIL import Image
@@ -151,7 +152,12 @@ def test_folders_of_the_machine(studio, tmp_path):
         assert "\n" not in answer["error"]
     scene = studio.library.find(new(studio, title="", path=str(tmp_path / "tour")))
     assert (scene.job.title, scene.inputs()) == ("tour", [tmp_path / "tour"])
-    assert studio.ask("scenes", "POST", {"path": "tour"})[0] == 400
+    for wrong in ("tour", "~nobody-of-this-name/x", "/\ud800", "/a\0b", "/" + 5000 * "x"):
+        status, answer = studio.ask("scenes", "POST", {"path": wrong})
+        assert status == 400, wrong[:40]
+        assert "\n" not in answer["error"]
+    for title in ("\ud800", "\0\n", "..", "x" * 10_000, "<b>", {"a": 1}, None):
+        assert studio.ask(f"scenes/{quote(new(studio, title=title))}")[0] == 200, title
     assert studio.ask("scenes", "POST", {"path": str(tmp_path / "absent")})[0] == 400
 
 

@@ -19,7 +19,7 @@ def test_a_new_scene_is_found_again(library, tmp_path):
     assert again.name != scene.name
     os.utime(again.folder)
     assert {each.name for each in Library(library.folder).scenes()} == {scene.name, again.name}
-    with pytest.raises(UserError, match="no such file or folder"):
+    with pytest.raises(UserError, match="No such file or directory"):
         library.new("x", [tmp_path / "absent"])
 
 

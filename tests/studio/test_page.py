@@ -2,6 +2,7 @@
 
 import zipfile
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 
@@ -14,11 +15,11 @@ from ..sfm.colmap import scenes
 pytestmark = [pytest.mark.browser, pytest.mark.sfm]
 
 
-def choose(page: Page, selector: str, files: list[Path]) -> None:
-    """Choose files in an input element."""
-    root = page.call("DOM.getDocument")["root"]["nodeId"]
-    node = page.call("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
-    page.call("DOM.setFileInputFiles", nodeId=node, files=[str(file) for file in files])
+def drop(page: Page, path: Path) -> None:
+    """Drop a file or folder on the page."""
+    data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        page.call("Input.dispatchDragEvent", type=kind, x=400, y=200, data=data)
 
 
 def click(page: Page, text: str, within: str = "main") -> None:
@@ -35,14 +36,15 @@ def status(page: Page) -> str:
 
 def test_from_photos_to_a_file(studio, tmp_path):
     """The browser is closed and the job is killed on the way; nothing is lost."""
-    photos = sorted(scenes.write_photos(tmp_path / "tour", 9).iterdir())
+    photos = scenes.write_photos(tmp_path / "Häuser am See", 9)
     asked: set[str] = set()
     with Browser(1280, 800, frames=2.0) as browser:
         page = browser.open(studio.server.url)
         page.wait_for("!!document.querySelector('.drop')")
-        choose(page, ".drop input[type=file]", photos)
+        drop(page, photos)
         page.wait_for("!!document.querySelector('form.card:not([hidden]) .main')", 120)
         assert page.evaluate("document.querySelector('.facts dd').textContent") == "9"
+        assert page.evaluate("document.querySelector('h1').textContent") == "Häuser am See"
         page.evaluate(
             "(() => { const form = document.querySelector('form.card');"
             "form.querySelector('input[type=text]').value = 'My tour';"
@@ -81,4 +83,4 @@ def test_from_photos_to_a_file(studio, tmp_path):
         page.wait_for("document.querySelector('.tile b')?.textContent === 'My tour'", 30)
         assert not page.errors
     assert all(name.startswith(studio.server.url) for name in asked)
-    assert studio.ask(f"scenes/{scene.name}")[1]["state"]["result"]["psnr"] > 15
+    assert studio.ask(f"scenes/{quote(scene.name)}")[1]["state"]["result"]["psnr"] > 15

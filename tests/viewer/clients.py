@@ -264,7 +264,12 @@ def wrong_messages() -> list[str]:
         found += [json.dumps({**known, name: value}) for name in known for value in WRONG]
         found += [json.dumps({k: v for k, v in known.items() if k != name}) for name in known]
         found.append(json.dumps({**known, "more": 1}))
-    for kind, name in (("shown", "number"), ("training", "do"), ("share", "share")):
+    for kind, name in (
+        ("shown", "number"),
+        ("thumbnails", "count"),
+        ("training", "do"),
+        ("share", "share"),
+    ):
         found += [json.dumps({"type": kind, name: value}) for value in WRONG]
     found += [json.dumps({"type": "view", **POSE, "number": 1, "photo": n}) for n in (-1, 10**9)]
     return found

@@ -20,7 +20,7 @@ class Studio:
     """Make a scene from photos or a video, in the browser.
 
     Examples:
-      snowsplat studio                         scenes are kept in ~/snowsplat
+      snowsplat studio                         scenes are kept in ~/snowsplat_scenes
       snowsplat studio /data/scenes            scenes are kept in this folder
       snowsplat studio --host 0.0.0.0          also for phones in the same network
 
@@ -31,9 +31,9 @@ class Studio:
       resumes after an interruption. Ctrl-C ends the studio only.
     """
 
-    folder: Annotated[Path | None, tyro.conf.Positional, flag("FOLDER", default="~/snowsplat")] = (
-        None
-    )
+    folder: Annotated[
+        Path | None, tyro.conf.Positional, flag("FOLDER", default="~/snowsplat_scenes")
+    ] = None
     """The folder of the scenes. It is created if it does not exist."""
     host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
     """Address to listen on. 0.0.0.0 accepts connections from the network."""
@@ -46,10 +46,10 @@ class Studio:
     def run(self) -> int:
         """Returns the exit code: 0, also after Ctrl-C, the usual end."""
         from snowsplat.studio.app import POLICY, own_address, studio_app
-        from snowsplat.studio.library import Library
+        from snowsplat.studio.library import Library, default_folder
         from snowsplat.viewer.http.server import WebServer
 
-        library = Library(self.folder or Path.home() / "snowsplat")
+        library = Library(self.folder or default_folder())
         servers: list[WebServer] = []
 
         def addresses() -> list[str]:

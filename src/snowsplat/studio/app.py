@@ -22,6 +22,7 @@ from __future__ import annotations
 import asyncio
 import io
 import math
+import os
 import socket
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
@@ -99,7 +100,7 @@ class _File:
 class _Studio:
     def __init__(self, library: Library, addresses: Callable[[], list[str]]) -> None:
         self._library, self._addresses = library, addresses
-        # By scene and kind of work: a second request waits for the first one.
+        # By scene ("": all) and kind of work: a second request waits for the first one.
         self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
 
     def routes(self) -> list[BaseRoute]:
@@ -152,7 +153,8 @@ class _Studio:
         }
 
     async def _browse(self, request: Request) -> Any:
-        return _listing(Path(request.query_params.get("path") or Path.home()))
+        path = request.query_params.get("path") or str(self._library.folder.parent)
+        return _listing(Path(os.path.expanduser(path)))
 
     async def _scenes(self, request: Request) -> Any:
         return [_summary(scene) for scene in self._library.scenes()]
@@ -160,7 +162,7 @@ class _Studio:
     async def _new(self, request: Request) -> Any:
         wanted = await _object(request)
         path = str(wanted.get("path") or "").strip()
-        inputs = [Path(path).expanduser()] if path else []
+        inputs = [Path(os.path.expanduser(path))] if path else []
         if inputs and not inputs[0].is_absolute():
             raise UserError(f"{printable(path)}: write the whole path, such as /home/me/photos")
         title = str(wanted.get("title") or (inputs[0].stem if inputs else ""))
@@ -197,7 +199,7 @@ class _Studio:
             return {"received": await asyncio.to_thread(write_part, scene, path, size, start, data)}
 
     async def _survey(self, request: Request, scene: Scene) -> Any:
-        async with self._locks[scene.name, "survey"]:
+        async with self._locks["", "survey"]:
             return await asyncio.to_thread(job.work, "survey", scene.folder)
 
     async def _start(self, request: Request, scene: Scene) -> Any:
@@ -238,7 +240,7 @@ class _Studio:
 
     async def _export(self, request: Request, scene: Scene) -> Any:
         kind = _kind(request)
-        async with self._locks[scene.name, kind]:
+        async with self._locks["", "export"]:
             return await asyncio.to_thread(job.work, "export", scene.folder, kind)
 
     async def _exported(self, request: Request, scene: Scene) -> Any:
@@ -278,7 +280,8 @@ def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request
     async def endpoint(request: Request) -> Any:
         try:
             value = await answer(request)
-            return value if callable(value) else JSONResponse(value)
+            fresh = {"Cache-Control": "no-store"}
+            return value if callable(value) else JSONResponse(value, headers=fresh)
         except WrongPart as error:
             return JSONResponse({"error": str(error), "received": error.received}, 409)
         except UserError as error:

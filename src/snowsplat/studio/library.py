@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import re
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
 
 _JOB, _STATE = "job.json", "state.json"
+_DEFAULT = "snowsplat_scenes"
 _LONGEST = 80  # characters of a name
 # Names that Windows reserves.
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
@@ -142,8 +144,11 @@ class Library:
     def new(self, title: str, inputs: list[Path]) -> Scene:
         """A new scene with an own folder. Raises UserError: an input does not exist."""
         for path in inputs:
-            if not path.exists():
-                raise UserError(f"{printable(str(path))}: no such file or folder")
+            try:
+                os.stat(path)
+            except (OSError, ValueError) as error:
+                why = getattr(error, "strerror", None) or "no such file or folder"
+                raise UserError(f"{printable(str(path))[:200]}: {why}") from None
         title = safe_title(title)
         name = safe_name(title)
         number = 1
@@ -160,6 +165,14 @@ class Library:
         job = Job(title, now, [str(path.absolute()) for path in inputs])
         write_json(scene.folder / _JOB, asdict(job))
         return scene
+
+
+def default_folder() -> Path:
+    """Where scenes are kept if no folder is named: below the home folder, if there is one."""
+    try:
+        return Path.home() / _DEFAULT
+    except RuntimeError:  # in containers, a user may have a number only
+        return Path.cwd() / _DEFAULT
 
 
 def safe_title(title: str) -> str:

@@ -13,7 +13,6 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 _Kind = TypeVar("_Kind")
-_hints = functools.cache(get_type_hints)  # it takes longer than the rest of `from_json`
 
 # Upper bounds of the memory of JSON values in CPython: bytes per occurrence of each character.
 _BYTES_OF = {b"{": 240, b"[": 72, b",": 48, b":": 48, b'"': 28}
@@ -147,6 +146,12 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
         return kind(**{name: _as(hints[name], value) for name, value in values.items()})
     except TypeError as error:  # a field is missing
         raise ValueError(str(error)) from None
+
+
+@functools.cache
+def _hints(kind: Any) -> dict[str, Any]:
+    """The types of the fields. To find them takes longer than the rest of `from_json`."""
+    return get_type_hints(kind)
 
 
 def _as(hint: Any, value: Any) -> Any:

@@ -297,6 +297,7 @@ def test_the_view_at_a_photo(page):
 def test_a_click_on_a_camera(page):
     """The cameras are drawn where they are in the image; a click goes to the photo."""
     press(page, "frustums")
+    press(page, "next")
     page.evaluate("document.getElementById('stage').focus()")
     type_key(page, "f", "KeyF", lambda: page.evaluate(NOWHERE))
     drawn = (
@@ -304,6 +305,7 @@ def test_a_click_on_a_camera(page):
         ".filter((v, i) => i % 4 == 3 && v > 99).length"
     )
     wait(lambda: page.evaluate(drawn) > 20)
+    settled(page)
     view = sent(page, "view")
     photos = page.evaluate(
         "new Promise(done => { const s = new WebSocket(location.href.replace('http', 'ws') + 'live');"  # noqa: E501
@@ -474,8 +476,11 @@ def test_both_languages(page):
     assert set(re.findall(r"[A-Za-z]{4,}", chinese)) <= left
     press(page, "language")
     assert page.evaluate("document.body.innerText").split("\n")[0] == english.split("\n")[0]
-    unnamed = "[...document.querySelectorAll('button, input, select')].filter(e => "
-    assert page.evaluate(unnamed + "!e.hasAttribute('aria-label') && !e.textContent.trim() && !e.closest('label')).length") == 0
+    unnamed = (
+        "[...document.querySelectorAll('button, input, select')].filter(e => "
+        "!e.hasAttribute('aria-label') && !e.textContent.trim() && !e.closest('label')).length"
+    )
+    assert page.evaluate(unnamed) == 0
 
 
 def test_it_reconnects_by_itself(page):

@@ -10,10 +10,11 @@ from snowsplat.viewer.live.messages import (
     Key,
     Share,
     Shown,
+    Thumbnails,
     Training,
     View,
     parse,
-    plain,
+    to_json,
 )
 
 from .. import clients
@@ -31,6 +32,7 @@ def test_messages_of_the_page():
     assert parse('{"type": "shown", "number": 3}') == Shown(3)
     assert parse('{"type": "training", "do": "pause"}') == Training("pause")
     assert parse('{"type": "share", "share": 0.3}') == Share(0.3)
+    assert parse('{"type": "thumbnails", "count": 4}') == Thumbnails(4)
     assert parse('{"type": "key"}') == Key()
 
 
@@ -61,7 +63,7 @@ def test_other_messages_are_refused():
 
 def test_numbers_are_what_json_has():
     values = {"loss": math.nan, "curve": [(1.0, math.inf), (math.pi, 2)]}
-    assert json.loads(json.dumps(plain(values), allow_nan=False)) == {
+    assert json.loads(to_json(values)) == {
         "loss": None,
         "curve": [[1.0, None], [3.141593, 2]],
     }

@@ -59,6 +59,7 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
             wait(lambda: 1 in shown)
             visitor.view()
             assert visitor.pictures(20.0, most=1) == 1
+            assert visitor.wait_for("about")["lines"] == ["30"]
             saved.append(Scene(gaussians, 2, ["50"]))
             wait(lambda: shown.count(2) >= 2)
             visitor.view(position=[0.0, 0.5, -3.0])

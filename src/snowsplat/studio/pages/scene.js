@@ -68,8 +68,9 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         if (parts !== shown) {
             shown = parts;
             update = undefined;
-            const build = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart }[parts] ?? stoppedPart;
-            body.replaceChildren(...build(scene));
+            /** @type {Record<string, (scene: any) => HTMLElement[]>} */
+            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart };
+            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene));
         }
         update?.(scene);
     }

@@ -100,7 +100,7 @@ function machinePart() {
         const inside = (/** @type {string} */ name) => `${found.path.replace(/[/\\]$/, "")}/${name}`;
         list.replaceChildren(
             make("button.plain", { type: "button", click: action(() => look(found.parent)) }, `↑ ${say("up")}`),
-            found.photos > 0 && make("button.main", { type: "button", click: action(use) }, say("use_this", found.photos)),
+            ...(found.photos > 0 ? [make("button.main", { type: "button", click: action(use) }, say("use_this", found.photos))] : []),
             ...found.folders.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: action(() => look(inside(name))) }, `${name}/`)),
             ...found.files.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: () => (path.value = inside(name)) }, name)),
         );

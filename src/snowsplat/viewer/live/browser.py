@@ -12,7 +12,7 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from snowsplat.viewer.live.messages import Message, parse, plain
+from snowsplat.viewer.live.messages import Message, parse
 from snowsplat.viewer.live.photos import Photos
 from snowsplat.viewer.live.session import Visitor
 
@@ -39,14 +39,14 @@ class Browser:
         self._socket, self._photos = socket, photos
         self._images: deque[bytes] = deque()
         self._keys: deque[str] = deque()
-        self._thumbnails = 0  # number of thumbnails that were sent
+        self._thumbnails = self._wanted = 0  # numbers of thumbnails that were sent, and asked for
         self._sent = self._arrived = 0  # numbers of images
         self._news = asyncio.Event()
         self._sending = asyncio.Lock()
 
-    def tell(self, message: dict[str, Any]) -> None:
-        """Send a JSON message, in place of an unsent one of the same type."""
-        self._told[message["type"]] = json.dumps(plain(message))
+    def tell(self, kind: str, text: str) -> None:
+        """Send a message of this type, as JSON, in place of an unsent one of the same type."""
+        self._told[kind] = text
         self.wake()
 
     def tell_key(self, entry: dict[str, Any]) -> None:
@@ -64,6 +64,11 @@ class Browser:
     def wake(self) -> None:
         """Send what is new."""
         self._news.set()
+
+    def want_thumbnails(self, count: int) -> None:
+        """Send so many thumbnails. If it were all, images would wait for them on a slow link."""
+        self._wanted = count
+        self.wake()
 
     def arrived(self, number: int) -> int:
         """How many images have arrived if that of this number is the last of them."""
@@ -120,7 +125,7 @@ class Browser:
             return self._keys.popleft()
         if self._images:
             return self._images.popleft()
-        if self._thumbnails < len(self._photos.thumbnails):
+        if self._thumbnails < min(self._wanted, len(self._photos.thumbnails)):
             index, jpeg = self._photos.thumbnails[self._thumbnails]
             self._thumbnails += 1
             return _HEAD.pack(_THUMBNAIL, index, 0) + jpeg

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -96,6 +97,13 @@ class Shown:
 
 
 @dataclass(frozen=True)
+class Thumbnails:
+    """Asks for the first ``count`` thumbnails of photos that are read."""
+
+    count: int
+
+
+@dataclass(frozen=True)
 class Training:
     """A button of the training."""
 
@@ -117,11 +125,12 @@ class Key:
     """Asks for the present camera, as an entry of a camera list."""
 
 
-Message = View | Display | Shown | Training | Share | Key
+Message = View | Display | Shown | Thumbnails | Training | Share | Key
 _KINDS: dict[str, type[Message]] = {
     "view": View,
     "display": Display,
     "shown": Shown,
+    "thumbnails": Thumbnails,
     "training": Training,
     "share": Share,
     "key": Key,
@@ -142,14 +151,18 @@ def parse(text: str) -> Message:
     return from_json(_KINDS[kind], value)
 
 
-def plain(value: Any) -> Any:
-    """``value`` for JSON: numbers of few digits; null for those that JSON does not have."""
+def to_json(message: dict[str, Any]) -> str:
+    """A message to the page: numbers have few digits; those that JSON does not have are null."""
+    return json.dumps(_plain(message))
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.7g}") if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {name: plain(each) for name, each in value.items()}
+        return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
+        return [_plain(each) for each in value]
     return value
 
 

@@ -32,8 +32,10 @@ from snowsplat.viewer.live.messages import (
     Message,
     Share,
     Shown,
+    Thumbnails,
     Training,
     View,
+    to_json,
 )
 from snowsplat.viewer.live.photos import Photos, fitted_photo, jpeg
 from snowsplat.viewer.live.pictures import draw
@@ -109,7 +111,8 @@ class NetworkViewer:
         self._photos = Photos(
             self.session, dataset.train, dataset.test, dataset.extent, self.background
         )
-        self._told: dict[str, dict[str, Any]] = {}  # the newest messages for all browsers, by type
+        self._told: dict[str, str] = {}  # the newest messages for all browsers, by type
+        self._training: dict[str, Any] = {}  # the newest one about the training
         self._browsers: set[Browser] = set()
         self._numbers = itertools.count()  # of browsers
         cameras = [view.camera for view in views]
@@ -163,14 +166,18 @@ class NetworkViewer:
     # message is read only after the previous one is processed.
 
     def _tell(self, message: dict[str, Any]) -> None:
-        self._told[message["type"]] = message
+        kind, text = message["type"], to_json(message)
+        if kind == "training":
+            self._training = message
+        self._told[kind] = text
         for browser in self._browsers:
-            browser.tell(message)
+            browser.tell(kind, text)
 
     def _tell_control(self) -> None:
         """Show at once what a browser has set."""
-        session, told = self.session, self._told.get("training", {"type": "training"})
-        self._tell({**told, "paused": session.paused, "share": session.share})
+        if self._training:
+            session = self.session
+            self._tell({**self._training, "paused": session.paused, "share": session.share})
 
     async def _connected(self, socket: WebSocket) -> None:
         """Serve a browser until it disconnects."""
@@ -179,9 +186,8 @@ class NetworkViewer:
         self._browsers.add(browser)
         try:
             await socket.accept()
-            self._photos.begin(lambda: self.server.call(self._wake))
-            for message in self._told.values():
-                browser.tell(message)
+            for kind, text in self._told.items():
+                browser.tell(kind, text)
             await browser.run(lambda message: self._take(browser, message))
         finally:
             self._browsers.discard(browser)
@@ -198,6 +204,9 @@ class NetworkViewer:
             self._move(browser, message)
         elif isinstance(message, Shown):
             session.arrived(visitor, browser.arrived(message.number))
+        elif isinstance(message, Thumbnails):
+            self._photos.begin(lambda: self.server.call(self._wake))
+            browser.want_thumbnails(message.count)
         elif isinstance(message, Display):
             longest = message.longest_side
             session.change(visitor, display=message.settings(), longest=longest)
@@ -230,7 +239,8 @@ class NetworkViewer:
             try:
                 self.session.show_photo(visitor, await self._photos.read(tried))
             except UserError as error:
-                browser.tell({"type": "photo", "index": tried, "error": str(error)})
+                message = {"type": "photo", "index": tried, "error": str(error)}
+                browser.tell("photo", to_json(message))
 
     def _send(self, request: RenderRequest, image: np.ndarray, drawing: float) -> None:
         started = time.monotonic()

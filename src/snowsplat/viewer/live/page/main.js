@@ -68,9 +68,17 @@ const moved = () => {
 // Receiving
 
 let newest = 0; // number of the newest image that has arrived
+let thumbnails = 0; // number of those that have arrived
+const AHEAD = 4; // thumbnails that may be on the way
+
+const askForThumbnails = () => {
+    if (byId('frustums').checked) connection.send({ type: 'thumbnails', count: thumbnails + AHEAD });
+};
+
 const connection = new Connection({
     opened: () => {
-        newest = 0;
+        newest = thumbnails = 0;
+        askForThumbnails();
         notice = 'waitingForScene';
         changed.view = true;
         change('display');
@@ -104,6 +112,8 @@ const connection = new Connection({
         showNotice();
     },
     thumbnail: async ({ index, blob }) => {
+        thumbnails += 1;
+        askForThumbnails();
         const bitmap = await createImageBitmap(blob).catch(() => undefined);
         if (bitmap) frustums?.thumbnails.set(index, bitmap);
         drawFrustums();
@@ -212,7 +222,10 @@ listen(stage, {
 });
 byId('next').onclick = () => stepPhoto(1);
 byId('previous').onclick = () => stepPhoto(-1);
-byId('frustums').onchange = drawFrustums;
+byId('frustums').onchange = () => {
+    askForThumbnails();
+    drawFrustums();
+};
 byId('theme').onclick = switchTheme;
 byId('language').onclick = () => {
     switchLanguage();
