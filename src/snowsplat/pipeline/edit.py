@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from snowsplat.formats import GaussianArrays
+from snowsplat.formats.ply import write_ply
 from snowsplat.formats.sog import order_in_sog, read_sog
 from snowsplat.pipeline.output.edit_record import (
     EditRecord,
+    PageEdit,
     edited_file,
     read_record,
     record_file,
     write_record,
 )
-from snowsplat.pipeline.output.scene_files import write_gaussians
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
@@ -38,48 +37,6 @@ _ROUNDING = 1e-5
 
 class OtherScene(UserError):
     """The page shows another scene than the file contains."""
-
-
-@dataclass(frozen=True)
-class PageEdit:
-    """What was changed in a page.
-
-    Attributes:
-        count: the number of Gaussians of the page.
-        removed: base64 of one bit per Gaussian, in the order of the page, the lowest bit of a byte
-            first; 1: it is removed.
-        scale: the size of the scene relative to its present one.
-        title: the name of the scene for people.
-        start: the initial view in the frame of the page: position, target, field of view in degrees
-            and aspect, see `InitialView`; None: as it is.
-
-    Raises:
-        ValueError: the number of bits, the scale or the view is not possible.
-    """
-
-    count: int
-    removed: str
-    scale: float = 1.0
-    title: str = ""
-    start: list[float] | None = None
-
-    def __post_init__(self) -> None:
-        EditRecord("", 0, self.scale, self.title, self.start)  # checks these
-        if not 1e-9 < self.scale < 1e9:
-            raise ValueError(f"a scene cannot become {self.scale:g} times as large")
-        if len(self.title) > 200 or self.rows().all():
-            raise ValueError("nothing would be left of the scene")
-
-    def rows(self) -> np.ndarray:
-        """(count,) bool: what is removed. Raises ValueError: there are more or fewer bits."""
-        try:
-            data = base64.b64decode(self.removed, validate=True)
-        except binascii.Error:
-            raise ValueError("the removed Gaussians are not in base64") from None
-        if self.count < 1 or len(data) != -(-self.count // 8):
-            raise ValueError(f"{8 * len(data)} bits are not those of {self.count} Gaussians")
-        bits = np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little")
-        return bits[: self.count].astype(bool)
 
 
 def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
@@ -103,9 +60,12 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     moved = source.gaussians if change is None else transform(source.gaussians, change)
     rows = _rows_of_page(scene, moved, Path(site))
     if len(rows) != changes.count:
-        raise OtherScene(f"the page has {changes.count} Gaussians, {scene.name} has {len(rows)}")
+        raise OtherScene(f"the page has {changes.count} Gaussians, the scene has {len(rows)}")
     removed = np.zeros(len(source.gaussians), bool)
-    removed[rows] = changes.rows()
+    bits = np.unpackbits(np.frombuffer(changes.bits(), np.uint8), bitorder="little")
+    removed[rows] = bits[: len(rows)] == 1
+    if removed.all():
+        raise UserError("nothing would be left of the scene; keep some of it")
     kept = source.gaussians.select(torch.from_numpy(~removed))
     larger = replace(Similarity.identity(), scale=changes.scale)
     if changes.scale != 1:
@@ -125,7 +85,7 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     )
     target = edited_file(scene)
     with atomic_path(target) as temporary:
-        write_gaussians(temporary, kept)
+        write_ply(temporary, GaussianArrays.from_gaussians(kept))
         # Until both are there, there is no edited scene.
         record_file(target).unlink(missing_ok=True)
     write_record(target, record)
@@ -159,7 +119,7 @@ def _rows_of_page(scene: Path, gaussians: Gaussians, site: Path) -> np.ndarray:
         step = np.ptp(expected, axis=0) / 65535
         if (np.abs(shown - expected) <= 0.51 * step + _ROUNDING * np.abs(expected)).all():
             return rows
-    raise OtherScene(f"{site / SCENE}: is not a page of {scene.name}; publish it again")
+    raise OtherScene(f"{site}: the page did not show {scene.name}")
 
 
 def _logs(means: np.ndarray) -> np.ndarray:

@@ -25,10 +25,10 @@ from typing import Any
 
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
-from snowsplat.pipeline.edit import OtherScene, PageEdit, edit, undo_edits
+from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
-from snowsplat.pipeline.output.edit_record import shown_file
+from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
 from snowsplat.pipeline.output.output_folder import DATASET
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
@@ -261,9 +261,10 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
             file = edit(file, scene.site, changes)
         except OtherScene as error:  # an earlier process was killed before it wrote the page
             publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
-            raise UserError(f"{error}; that is done, open it and edit it again") from None
+            raise UserError(f"{error}. Open the page anew, then edit it") from None
         if changes.title:
             scene.change(title=safe_title(changes.title))
+    shutil.rmtree(scene.exports, ignore_errors=True)  # they have other Gaussians
     site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
     state = scene.state()
     state["result"] |= {"gaussians": site.gaussians, "bytes": file.stat().st_size}

@@ -1,10 +1,12 @@
-"""The record of an edited scene: NAME_edited.json beside NAME_edited.ply.
+"""What was changed in a page, and the record of an edited scene: NAME_edited.json beside its file.
 
 It imports no torch.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -45,6 +47,44 @@ class EditRecord:
             len(view) == 8 and view[:3] != view[3:6] and 0 < view[6] < 180 and view[7] > 0
         ):
             raise ValueError("the initial view is none")
+
+
+@dataclass(frozen=True)
+class PageEdit:
+    """What was changed in a page.
+
+    Attributes:
+        count: the number of Gaussians of the page.
+        removed: base64 of one bit per Gaussian, in the order of the page, the lowest bit of a byte
+            first; 1: it is removed.
+        scale: the size of the scene relative to its present one.
+        title: the name of the scene for people; "": as it is.
+        start: the initial view in the frame of the page: position, target, field of view in degrees
+            and aspect, see `InitialView`; None: as it is.
+
+    Raises:
+        ValueError: the number of bits, the scale or the view is not possible.
+    """
+
+    count: int
+    removed: str
+    scale: float = 1.0
+    title: str = ""
+    start: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        EditRecord("", 0, self.scale, self.title, self.start)  # checks these
+        if not 1e-9 < self.scale < 1e9:
+            raise ValueError(f"a scene cannot become {self.scale:g} times as large")
+        if self.count < 1 or len(self.bits()) != -(-self.count // 8):
+            raise ValueError(f"{8 * len(self.bits())} bits are not those of {self.count} Gaussians")
+
+    def bits(self) -> bytes:
+        """Raises ValueError: they are not in base64."""
+        try:
+            return base64.b64decode(self.removed, validate=True)
+        except binascii.Error:
+            raise ValueError("the removed Gaussians are not in base64") from None
 
 
 def edited_file(scene: Path) -> Path:

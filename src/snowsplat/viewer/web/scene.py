@@ -194,9 +194,7 @@ def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
     return [view_of_camera(camera, depth) for camera in path]
 
 
-def _change(
-    direction: np.ndarray, depth: float, most: float = _TOO_LARGE
-) -> Similarity | None:
+def _change(direction: np.ndarray, depth: float, most: float = _TOO_LARGE) -> Similarity | None:
     """Transform to a frame with −y up and usual distances; None if the scene has both."""
     up = torch.from_numpy(direction)
     rotation = _shortest_rotation(up, torch.from_numpy(_UP))
