@@ -217,6 +217,7 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         const found = distance();
         measure_.textContent = found ? say("edit_distance", found.toPrecision(4)) : say("edit_two_points");
         rescale.disabled = !found;
+        draw();
     }
 
     overlay.addEventListener("pointerdown", event => {
