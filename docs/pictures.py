@@ -115,6 +115,7 @@ def main(demo: Path) -> None:
         with training(made / "dataset") as url:
             page = browser.open(url)
             page.evaluate("document.documentElement.dataset.theme = 'dark'")
+            page.evaluate("document.getElementById('language').hidden = true")  # needs a font
             page.evaluate("document.getElementById('frustums').click()")
             page.wait_for("/Step 1,[5-9]/.test(document.getElementById('status').innerText)", 600)
             shoot(page, PICTURES / "live.webp")

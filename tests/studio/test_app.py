@@ -152,6 +152,8 @@ def test_folders_of_the_machine(studio, tmp_path):
         assert "\n" not in answer["error"]
     scene = studio.library.find(new(studio, title="", path=str(tmp_path / "tour")))
     assert (scene.job.title, scene.inputs()) == ("tour", [tmp_path / "tour"])
+    address = f"scenes/{scene.name}/uploads?path=x&size=1&start=0"
+    assert "add the photos there" in studio.ask(address, "PUT", b"x")[1]["error"]
     for wrong in ("tour", "~nobody-of-this-name/x", "/\ud800", "/a\0b", "/" + 5000 * "x"):
         status, answer = studio.ask("scenes", "POST", {"path": wrong})
         assert status == 400, wrong[:40]
@@ -173,7 +175,7 @@ def test_only_files_of_a_scene_are_sent(studio, tmp_path, up):
         (folder / "link").symlink_to(secret)
     for kind in ("site", "made"):
         assert studio.ask(f"scenes/{name}/{kind}/index.html") == (200, b"page")
-        for path in (up * 4 + "secret.txt", "link", up + "job.json", f"{up}{secret}"):
+        for path in (up * 4 + "secret.txt", "link", up + "job.json", f"{up}{secret}", 5000 * "x"):
             status, answer = studio.ask(f"scenes/{name}/{kind}/{path}")
             assert status in (400, 404), path
             assert answer != b"secret"

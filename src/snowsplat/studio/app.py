@@ -49,7 +49,7 @@ from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
-from snowsplat.util.safe_json import from_json, printable
+from snowsplat.util.safe_json import from_json, is_file, printable
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -97,15 +97,8 @@ class _File:
         self._path, self._headers = path, headers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        more = [(name.lower().encode(), value.encode()) for name, value in self._headers.items()]
-
-        async def send_with(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                message = {**message, "headers": [*message["headers"], *more]}
-            await send(message)
-
-        file = FileOnDisk(self._path, content_type(self._path)) if self._path.is_file() else None
-        await send_file(file, scope, receive, send_with)
+        file = FileOnDisk(self._path, content_type(self._path)) if is_file(self._path) else None
+        await send_file(file, scope, receive, send, self._headers)
 
 
 class _Studio:
@@ -178,7 +171,8 @@ class _Studio:
         inputs = [Path(os.path.expanduser(path))] if path else []
         if inputs and not inputs[0].is_absolute():
             raise UserError(f"{printable(path)}: write the whole path, such as /home/me/photos")
-        title = str(wanted.get("title") or (inputs[0].stem if inputs else ""))
+        names = [path.name if _is_folder(path) else path.stem for path in inputs]
+        title = str(wanted.get("title") or "".join(names))
         return {"name": self._library.new(title, inputs).name}
 
     async def _scene(self, request: Request, scene: Scene) -> Any:
@@ -207,6 +201,8 @@ class _Studio:
         size, start = (_whole(query.get(name)) for name in ("size", "start"))
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then add photos")
+        if scene.job.inputs:
+            raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
         data = await request.body()
         path = query.get("path", "")
         async with self._locks[scene.name, "upload"]:

@@ -50,7 +50,7 @@ from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, printable, read_json
 from snowsplat.util.stages import Outcome
 
-_PAUSE = 0.7  # seconds between two files of the state
+_PAUSE = 1.0  # seconds between two files of the state
 _CURVE = 400  # points of the curve of the loss
 #: Shown beside the progress while the scene is trained.
 MAP = "map.svg"

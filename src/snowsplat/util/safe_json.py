@@ -136,7 +136,7 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
     """
     if not isinstance(values, dict):
         raise ValueError(f"not a {kind.__name__}")
-    hints = _hints(kind)
+    hints = _hints(kind)  # type: ignore[arg-type]
     known = {field.name for field in fields(kind) if field.init}  # type: ignore[arg-type]
     if not values.keys() <= known:
         raise ValueError(

@@ -302,9 +302,9 @@ def test_a_click_on_a_camera(page):
     type_key(page, "f", "KeyF", lambda: page.evaluate(NOWHERE))
     drawn = (
         "[...document.getElementById('cameras').getContext('2d').getImageData(0, 0, 400, 400).data]"
-        ".filter((v, i) => i % 4 == 3 && v > 99).length"
+        ".filter((v, i) => i % 4 == 3 && v > 9).length"
     )
-    wait(lambda: page.evaluate(drawn) > 20)
+    wait(lambda: page.evaluate(drawn) > 4)
     settled(page)
     view = sent(page, "view")
     photos = page.evaluate(

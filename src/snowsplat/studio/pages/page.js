@@ -84,7 +84,8 @@ export function command(/** @type {string} */ line) {
         "div.command",
         {},
         make("code", {}, line),
-        make("button.plain", { type: "button", click: () => navigator.clipboard?.writeText(line), }, say("copy")),
+        // Browsers give the clipboard only to pages of this machine, or with https.
+        navigator.clipboard && make("button.plain", { type: "button", click: () => navigator.clipboard.writeText(line) }, say("copy")),
     );
 }
 

@@ -33,6 +33,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     const status = make("p.status", { role: "status" });
     const body = make("div");
     main.replaceChildren(make("p", {}, make("a", { href: "#" }, `← ${say("back")}`)), title, status, body);
+    let uploaded = false; // whether its photos are uploaded, not in a folder of the machine
     let away = false; // whether the server did not answer
     let shown = ""; // which parts `body` has
     /** @type {((scene: any) => void) | undefined} */
@@ -64,6 +65,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const sending = uploads.has(name);
         status.textContent = sending ? "" : say(scene.status);
         status.dataset.status = scene.status;
+        uploaded = scene.inputs.length === 0;
         const parts = sending ? "upload" : scene.status;
         if (parts !== shown) {
             shown = parts;
@@ -112,7 +114,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 const found = arrived ? await ask(`${address}/survey`, "POST") : null;
                 if (closed.aborted || shown !== "new") return;
                 facts.replaceChildren(...(found ? factsOf(found.facts) : [make("p", {}, say("no_files"))]));
-                if (!scene.inputs.length) facts.append(moreFiles());
+                if (uploaded) facts.append(moreFiles());
                 form.hidden = !found;
                 for (const [quality, seconds] of Object.entries(found?.seconds ?? {})) {
                     const time = form.querySelector(`[data-quality=${quality}]`);
@@ -121,9 +123,14 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             } catch (error) {
                 const text = error instanceof Refused ? error.message : say("offline");
                 facts.replaceChildren(make("p.bad", { role: "alert" }, text));
-                if (!scene.inputs.length) facts.append(moreFiles());
+                if (uploaded) facts.append(moreFiles());
             }
         }
+    }
+
+    /** With more photos, or another quality. */
+    function againPart(/** @type {any} */ scene) {
+        return [...(uploaded ? [moreFiles()] : []), startForm(scene, say("again"))];
     }
 
     function moreFiles() {
@@ -225,7 +232,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 stages,
                 make("details", {}, make("summary", {}, say("command")), command(scene.command)),
             ),
-            startForm(scene, say("again")),
+            ...againPart(scene),
         ];
     }
 
@@ -253,7 +260,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, line))),
             make("section.card", {}, make("h2", {}, say("download")), ...Object.entries(scene.exports).map(([kind, line]) => download(kind, String(line)))),
             phone,
-            make("details.card", {}, make("summary", {}, say("again")), startForm(scene, say("again"))),
+            make("details.card", {}, make("summary", {}, say("again")), ...againPart(scene)),
         ].filter(part => part !== false);
     }
 
@@ -279,7 +286,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     const over = (/** @type {Event} */ event) => event.preventDefault();
     const drop = async (/** @type {DragEvent} */ event) => {
         event.preventDefault();
-        if (event.dataTransfer && (shown === "new" || uploads.get(name)?.error)) add(await dropped(event.dataTransfer));
+        if (event.dataTransfer && uploaded && shown !== "running" && (shown !== "upload" || uploads.get(name)?.error)) add(await dropped(event.dataTransfer));
     };
     main.addEventListener("dragover", over, { signal: closed });
     main.addEventListener("drop", drop, { signal: closed });

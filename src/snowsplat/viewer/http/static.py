@@ -32,8 +32,14 @@ def static_app(files: Mapping[str, Served]) -> ASGIApp:
     return answer
 
 
-async def send_file(file: Served | None, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a GET or HEAD request with a file; without one, with 404."""
+async def send_file(
+    file: Served | None,
+    scope: Scope,
+    receive: Receive,
+    send: Send,
+    more: Mapping[str, str] | None = None,
+) -> None:
+    """Answer a GET or HEAD request with a file; without one, with 404. ``more``: headers."""
     if scope["method"] not in ("GET", "HEAD"):
         refusal = Response(status_code=405, headers={"Allow": "GET, HEAD"})
         return await refusal(scope, receive, send)
@@ -41,6 +47,7 @@ async def send_file(file: Served | None, scope: Scope, receive: Receive, send: S
         return await Response(status_code=404)(scope, receive, send)
     headers = Headers(scope=scope)
     common = {"ETag": file.etag, "Cache-Control": "private, no-cache", "Accept-Ranges": "bytes"}
+    common |= more or {}
     if file.etag in headers.get("if-none-match", ""):
         return await Response(status_code=304, headers=common)(scope, receive, send)
     size = file.size

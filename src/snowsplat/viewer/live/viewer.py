@@ -245,10 +245,15 @@ class NetworkViewer:
     def _send(self, request: RenderRequest, image: np.ndarray, drawing: float) -> None:
         started = time.monotonic()
         browser = next((b for b in self._browsers if b.visitor is request.visitor), None)
-        if browser is not None:  # None: the browser has disconnected
-            with self._time_limit.uncounted():
-                browser.show(jpeg(image, _QUALITY[request.kind]), request.pose.number)
-        self.session.record_sending(request, drawing + time.monotonic() - started)
+        try:
+            if browser is not None:  # None: the browser has disconnected
+                with self._time_limit.uncounted():
+                    browser.show(jpeg(image, _QUALITY[request.kind]), request.pose.number)
+        except Exception:
+            self.session.arrived(request.visitor, 1)
+            raise
+        finally:
+            self.session.record_sending(request, drawing + time.monotonic() - started)
 
     # The following methods run in the thread that trains or shows a scene
 

@@ -5,11 +5,11 @@ import { number, text } from './texts.js';
 
 /**
  * @typedef {object} Training the message of the server
- * @property {boolean} paused
+ * @property {boolean} paused whether it pauses after the present step
  * @property {number} share of the time for images
  * @property {number} [step]
  * @property {number} [steps]
- * @property {number | null} [rate] steps per second
+ * @property {number | null} [rate] steps per second; null while it is paused
  * @property {number} [gaussians]
  * @property {number | null} [loss]
  * @property {number | null} [psnr]
@@ -58,9 +58,9 @@ export class TrainingPanel {
     }
 
     /** @param {Training} told */
-    lines({ step, steps, rate, paused, gaussians, loss, psnr }) {
+    lines({ step, steps, rate, gaussians, loss, psnr }) {
         if (step === undefined || steps === undefined || gaussians === undefined) return [text('waiting')];
-        const pace = paused ? text('paused') : text('stepsPerSecond', { rate: number(rate ?? 0, 1) });
+        const pace = rate == null ? text('paused') : text('stepsPerSecond', { rate: number(rate, 1) });
         const figures = { gaussians: number(gaussians), loss: loss == null ? '–' : number(loss, 4), psnr: number(psnr ?? 0, 2) };
         return [
             text('stepOf', { step: number(step), steps: number(steps), pace }),
