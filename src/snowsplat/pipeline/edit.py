@@ -69,8 +69,9 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     kept = source.gaussians.select(torch.from_numpy(~removed))
     larger = replace(Similarity.identity(), scale=changes.scale)
     if changes.scale != 1:
-        origin = tuple(changes.scale * value for value in kept.origin)
-        kept = replace(transform(kept, larger), origin=origin)
+        x, y, z = kept.origin
+        moved_to = changes.scale * x, changes.scale * y, changes.scale * z
+        kept = replace(transform(kept, larger), origin=moved_to)
     start = source.start and source.start.transformed(larger)
     if changes.start is not None:
         back = Similarity.identity() if change is None else change.inverse()
@@ -81,7 +82,7 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         removed=before.removed + int(removed.sum()),
         scale=before.scale * changes.scale,
         title=changes.title or before.title,
-        start=start and [*start.position, *start.target, start.fov, start.aspect],
+        start=None if start is None else [*start.position, *start.target, start.fov, start.aspect],
     )
     target = edited_file(scene)
     with atomic_path(target) as temporary:

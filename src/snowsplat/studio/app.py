@@ -224,6 +224,8 @@ class _Studio:
         ):
             raise UserError(f"minutes: use a number above 0, at most {_LONGEST_MINUTES}")
         scene.inputs()
+        if self._locks[scene.name, "edit"].locked():
+            raise UserError("an edit of the scene is being stored; start again in a moment")
         async with self._locks[scene.name, "start"]:
             if not job.is_running(scene):
                 title = safe_title(str(wanted.get("title") or scene.job.title))

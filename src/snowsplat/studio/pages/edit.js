@@ -358,6 +358,10 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
     open.ariaExpanded = "false";
     panel.querySelector(".snow-buttons").append(open);
     panel.querySelector(".snow-card").after(content);
+    // The page fades its panel when its controls hide.
+    viewer.events.on("controlsHidden:changed", () => {
+        if (!content.hidden) panel.classList.remove("snow-faded");
+    });
     choose("");
     modes.mark(mode);
     show();
