@@ -125,7 +125,7 @@ const TEXTS = {
     edit_distance: ["Distance: {0}", "距离：{0}"],
     edit_truth: ["True distance", "真实距离"],
     edit_rescale: ["Set scale", "设定比例"],
-    edit_size: ["Size × {0}", "尺寸 × {0}"],
+    edit_size: ["Size × {0} (snowsplat convert SCENE FILE --scale {0})", "尺寸 × {0}（snowsplat convert SCENE FILE --scale {0}）"],
     edit_start: ["Start with this view", "以此视角开始"],
     edit_start_set: ["The scene will start with this view", "场景将以此视角开始"],
     edit_save: ["Save", "保存"],
