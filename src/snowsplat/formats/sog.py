@@ -246,6 +246,12 @@ def sog_bytes(path: Path, gaussians: GaussianArrays) -> bytes:
     return file.getvalue()
 
 
+def order_in_sog(path: Path, gaussians: GaussianArrays) -> np.ndarray:
+    """(M,) the rows of ``gaussians`` that `write_sog` stores, in the order of the file."""
+    order = packing.spatial_order(packing.packable(path, gaussians).means)
+    return np.flatnonzero(gaussians.usable_rows())[order]
+
+
 def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
     """The members of a scene of version 2 by name; `meta.json` is the first one.
 

@@ -24,7 +24,7 @@ from snowsplat.pipeline.output.scene_files import (
     write_gaussians,
 )
 from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
-from snowsplat.pipeline.output.scene_source import background_of, cameras_of, seen_by_cameras
+from snowsplat.pipeline.output.scene_source import background_of, cameras_of, viewable
 from snowsplat.pipeline.refine import photos_of, refine
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
@@ -246,6 +246,6 @@ def _decimation(
 
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
     """Write an HTML page, with the cameras and the background of its training if they are known."""
-    folder, about = folder_around(source), Description(target.stem, made=made_on(source))
-    scene = seen_by_cameras(scene, folder)
-    write_html(target, ready(scene, cameras_of(folder), background_of(folder)), about)
+    shown, about = viewable(source, scene), Description(target.stem, made=made_on(source))
+    page = ready(shown.gaussians, shown.cameras, shown.background, shown.start)
+    write_html(target, page, about)

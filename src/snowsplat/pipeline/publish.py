@@ -100,9 +100,9 @@ def publish(
     what = source.gaussians, source.cameras, source.background, about, url
     with observer.waiting("writing"):
         if len(source.gaussians) <= _LARGE:
-            write_site(folder, *what)
+            write_site(folder, *what, start=source.start)
         else:
-            write_site(folder, *what, partial(_write_levels, observer))
+            write_site(folder, *what, partial(_write_levels, observer), source.start)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import look_at
+from snowsplat.scene.geometry import Similarity, look_at
 from snowsplat.scene.near_plane import near_of_overview
 
 # Distance of the camera of `overview` from the middle, relative to the radius that it shows.
@@ -52,6 +52,12 @@ class InitialView:
         across, down = self._tangents()
         longer = max(across, down * aspect) / min(aspect, 1.0)
         return replace(self, fov=_degrees(longer), aspect=aspect)
+
+    def transformed(self, change: Similarity) -> InitialView:
+        """The view of the same in the new world frame of ``change``; up is −y in both."""
+        points = torch.tensor([self.position, self.target], dtype=torch.float64)
+        position, target = change.apply(points)
+        return replace(self, position=_point(position), target=_point(target))
 
     def _tangents(self) -> tuple[float, float]:
         """Half of the width and of the height, at a distance of 1."""

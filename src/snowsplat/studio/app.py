@@ -11,6 +11,7 @@
     GET  /scenes/NAME/photos          names of its photos; /photos/N is a small one
     GET  /scenes/NAME/map             the cameras and points from above
     POST /scenes/NAME/exports/KIND    writes a file; GET sends it
+    POST /scenes/NAME/edit            stores what was changed in the viewer; DELETE takes it back
     GET  /scenes/NAME/site/…, /made/… the scene in the viewer, its reports
     GET  /scenes/NAME/live/…          the page of the running training, with its WebSocket
 
@@ -26,6 +27,7 @@ import os
 import socket
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -34,18 +36,20 @@ import segno
 from PIL import Image, ImageOps
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from snowsplat.pipeline.output.edit_record import PageEdit, read_record
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import is_file, printable
+from snowsplat.util.files import write_json
+from snowsplat.util.safe_json import from_json, is_file, printable
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -67,6 +71,13 @@ _SITE_POLICY = "frame-ancestors 'self'"
 _REPORT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src 'self' data:; frame-ancestors 'self'"
+)
+
+# The page of a scene gets tools for editing, except for levels of detail. They come before the
+# script of the page, which looks for them.
+_EDITOR = (
+    '<link rel="stylesheet" href="../../../edit.css" />'
+    '<script type="module" src="../../../edit.js" data-edited="{edited}"></script>'
 )
 
 _Answer = Callable[[Request, Scene], Awaitable[Any]]
@@ -110,6 +121,8 @@ class _Studio:
             ("/map", "GET", self._map),
             ("/exports/{kind}", "POST", self._export),
             ("/exports/{kind}", "GET", self._exported),
+            ("/edit", "POST", self._edit),
+            ("/edit", "DELETE", self._undo),
             ("/site/{path:path}", "GET", self._site),
             ("/made/{path:path}", "GET", self._made),
             ("/live/{path:path}", "GET", self._live),
@@ -174,6 +187,7 @@ class _Studio:
             "status": _status(scene, state),
             "state": state,
             "has_page": has_page,
+            "edited": _edited(scene),
             "has_map": (scene.folder / "map.svg").is_file(),
             "command": make_command(scene, made),
             "exports": {kind: export_command(scene, kind) for kind in FORMATS},
@@ -210,6 +224,8 @@ class _Studio:
         ):
             raise UserError(f"minutes: use a number above 0, at most {_LONGEST_MINUTES}")
         scene.inputs()
+        if self._locks[scene.name, "edit"].locked():
+            raise UserError("an edit of the scene is being stored; start again in a moment")
         async with self._locks[scene.name, "start"]:
             if not job.is_running(scene):
                 title = safe_title(str(wanted.get("title") or scene.job.title))
@@ -244,9 +260,29 @@ class _Studio:
         name = f"attachment; filename*=UTF-8''{quote(file.name)}"
         return _File(file, **{"Content-Disposition": name})
 
+    async def _edit(self, request: Request, scene: Scene) -> Any:
+        try:
+            changes = from_json(PageEdit, await _object(request))
+        except ValueError as error:
+            raise UserError(f"this cannot be stored: {error}") from None
+        if job.is_running(scene):
+            raise UserError("the scene is being made; stop it, then edit it")
+        async with self._locks[scene.name, "edit"]:
+            write_json(scene.edits, asdict(changes))
+            return await asyncio.to_thread(job.work, "edit", scene.folder)
+
+    async def _undo(self, request: Request, scene: Scene) -> Any:
+        async with self._locks[scene.name, "edit"]:
+            return await asyncio.to_thread(job.work, "undo", scene.folder)
+
     async def _site(self, request: Request, scene: Scene) -> Any:
         path = request.path_params["path"] or "index.html"
         file = _inside(scene.site, path)
+        if path == "index.html" and (scene.site / "scene.sog").is_file():
+            page = await asyncio.to_thread(file.read_text, "utf-8")
+            head = _EDITOR.format(edited=str(bool(_edited(scene))).lower())
+            text = page.replace("</head>", f"{head}</head>", 1)
+            return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
         return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
 
     async def _made(self, request: Request, scene: Scene) -> Any:
@@ -312,6 +348,12 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
     if not state and scene.job.quality is None and scene.job.minutes is None:
         return "new"
     return str(state.get("outcome", "interrupted"))
+
+
+def _edited(scene: Scene) -> float:
+    """When the scene that is shown was edited, in seconds; 0 if it was not."""
+    file = scene.scene_file()
+    return file.stat().st_mtime if file and read_record(file) else 0
 
 
 async def _object(request: Request) -> dict[str, Any]:

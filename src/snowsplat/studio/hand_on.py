@@ -25,9 +25,9 @@ def export_file(scene: Scene, kind: str) -> Path:
 
 def export_command(scene: Scene, kind: str) -> str:
     """The command line that writes it."""
-    if kind == "zip":
-        return shlex.join(["snowsplat", "publish", str(scene.made), "-o", "site"])
     file = scene.scene_file() or scene.made
+    if kind == "zip":
+        return shlex.join(["snowsplat", "publish", str(file), "-o", "site"])
     return shlex.join(["snowsplat", "convert", str(file), export_file(scene, kind).name])
 
 

@@ -7,6 +7,7 @@ A scene NAME has:
     NAME/made/       the output folder of `snowsplat make`
     NAME/site/       the web site of the scene
     NAME/exports/    its files in other formats
+    NAME/edit.json   what was changed in its page last
     NAME/state.json  the progress of the job, and its result
 """
 
@@ -20,6 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from snowsplat.pipeline.output.edit_record import shown_file
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
@@ -63,6 +65,7 @@ class Scene:
         self.made = folder / "made"
         self.site = folder / "site"
         self.exports = folder / "exports"
+        self.edits = folder / "edit.json"
         self.lock = folder / ".job.lock"
         self.log = folder / "log.txt"
 
@@ -113,10 +116,10 @@ class Scene:
         return entries if len(entries) == 1 or zips else [self.photos]
 
     def scene_file(self) -> Path | None:
-        """The finished scene."""
+        """The finished scene, as it was edited."""
         result = self.state().get("result") or {}
         file = self.made / Path(str(result.get("file", ""))).name
-        return file if file.is_file() else None
+        return shown_file(file) if file.is_file() else None
 
 
 class Library:

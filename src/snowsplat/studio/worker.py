@@ -3,6 +3,8 @@
     python -m snowsplat.studio.worker make FOLDER          the job of a scene of the library
     python -m snowsplat.studio.worker survey FOLDER        what its photos are, and the time needed
     python -m snowsplat.studio.worker export FOLDER KIND   a file in another format
+    python -m snowsplat.studio.worker edit FOLDER          what was changed in the page of a scene
+    python -m snowsplat.studio.worker undo FOLDER          the scene as it was made
 
 The first one writes its progress to state.json in the folder. The others print one line of JSON.
 """
@@ -23,8 +25,10 @@ from typing import Any
 
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
+from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
+from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
 from snowsplat.pipeline.output.output_folder import DATASET
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
@@ -37,13 +41,13 @@ from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
 from snowsplat.studio.hand_on import export_file
-from snowsplat.studio.library import Scene
+from snowsplat.studio.library import Scene, safe_title
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.run_lock import InUse, locked
-from snowsplat.util.safe_json import printable
+from snowsplat.util.safe_json import from_json, printable, read_json
 from snowsplat.util.stages import Outcome
 
 _PAUSE = 1.0  # seconds between two files of the state
@@ -168,7 +172,9 @@ def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
                     page=page,
                 )
             recorder.begin("page")
-            site = publish(scene.made, scene.site, PublishOptions(job.title), overwrite=True)
+            site = publish(
+                shown_file(made.scene), scene.site, PublishOptions(job.title), overwrite=True
+            )
             recorder.leave()
         return 0, {"outcome": "done", "result": _result(scene, made, site.gaussians)}
     except KeyboardInterrupt:
@@ -239,9 +245,41 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
     return {"file": target.name}
 
 
+def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
+    """Write the edited scene and its page; or remove it, and write the page of the other one.
+
+    Raises: UserError: the scene is not finished, or the page does not show it.
+    """
+    file = scene.scene_file()
+    if file is None:
+        raise UserError("the scene is not finished")
+    if undo:
+        file = undo_edits(file)
+    else:
+        changes = from_json(PageEdit, read_json(scene.edits))
+        try:
+            file = edit(file, scene.site, changes)
+        except OtherScene as error:  # an earlier process was killed before it wrote the page
+            publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
+            raise UserError(f"{error}. Open the page anew, then edit it") from None
+        if changes.title:
+            scene.change(title=safe_title(changes.title))
+    shutil.rmtree(scene.exports, ignore_errors=True)  # they have other Gaussians
+    site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
+    state = scene.state()
+    state["result"] |= {"gaussians": site.gaussians, "bytes": file.stat().st_size}
+    scene.write_state(state)
+    return {"file": file.name}
+
+
 def _printed(scene: Scene, words: list[str]) -> int:
     try:
-        answer = survey_photos(scene) if words[0] == "survey" else export(scene, words[1])
+        if words[0] == "survey":
+            answer = survey_photos(scene)
+        elif words[0] == "export":
+            answer = export(scene, words[1])
+        else:
+            answer = edit_scene(scene, words[0] == "undo")
     except (UserError, OSError) as error:
         answer = {"error": printable(" ".join(str(error).split()))}
     print("\n" + json.dumps(answer))

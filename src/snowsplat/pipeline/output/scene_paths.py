@@ -11,6 +11,7 @@ from pathlib import Path
 
 from snowsplat.formats.lod import INDEX
 from snowsplat.formats.sog import META, is_sog
+from snowsplat.pipeline.output.edit_record import read_record
 from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import read_json
@@ -112,9 +113,12 @@ def folder_of_make(path: Path) -> Path:
 
 
 def scene_name(scene: Path) -> str:
-    """The name of a scene: the title that `make` has recorded; else the name of the folder, or of
-    the file without suffixes."""
+    """The name of a scene: the title that `make` or the editor has recorded; else the name of the
+    folder, or of the file without suffixes."""
     scene = scene.resolve()
+    record = read_record(scene)
+    if record is not None:
+        return record.title or scene_name(scene.with_name(record.scene))
     title = _recorded(folder_of_make(scene) / RECORD, "title")
     return title or scene.name.split(".")[0] or scene.name
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from snowsplat.data import Dataset
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.output.edit_record import read_record
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.output.scene_paths import (
     existing_folder,
@@ -21,6 +24,8 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 
 Color = tuple[float, float, float]
@@ -123,6 +128,7 @@ class ViewableScene:
     gaussians: Gaussians
     cameras: list[Camera]  # the cameras of its photos; empty if unknown
     background: Color
+    start: InitialView | None = None  # the initial view; None: not chosen
 
 
 def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
@@ -148,6 +154,29 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
         if iteration is not None:
             raise UserError("`iteration` selects a scene of an output folder; leave it out")
         file, gaussians = path, read_gaussians(path)
-        folder = folder_around(path)
+        return viewable(file, gaussians)
     gaussians = seen_by_cameras(gaussians, folder)
     return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
+
+
+def viewable(file: Path, gaussians: Gaussians) -> ViewableScene:
+    """The scene of a file, with the cameras and the background of its training if it is known.
+
+    An edited scene has the cameras of the other scene, at its scale.
+    """
+    record = read_record(file)
+    if record is None:
+        folder = folder_around(file)
+        gaussians = seen_by_cameras(gaussians, folder)
+        return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
+    folder = folder_around(file.with_name(Path(record.scene).name))
+    origin = folder.origin()
+    at_scale = None if origin is None else (np.array(origin) * record.scale).tolist()
+    gaussians = seen_from_dataset(gaussians, at_scale and tuple(at_scale))
+    larger = replace(Similarity.identity(), scale=record.scale)
+    cameras = [camera.transformed(larger) for camera in cameras_of(folder)]
+    start = None
+    if record.start is not None:
+        x, y, z, u, v, w, fov, aspect = record.start
+        start = InitialView((x, y, z), (u, v, w), fov, aspect)
+    return ViewableScene(file, gaussians, cameras, background_of(folder), start)

@@ -247,7 +247,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         showPhone(phone, site);
         return [
             make("iframe.viewer", { src: site, title: say("viewer"), allow: "fullscreen; xr-spatial-tracking" }),
-            make("div.row", {}, make("a.button.plain", { href: site, target: "_blank", rel: "noopener" }, say("full")), ...reports),
+            make("div.row", {}, make("a.button.plain", { href: site, target: "_blank", rel: "noopener" }, say("full")), ...reports, scene.edited > 0 && make("span.soft", {}, say("edited"))),
             make(
                 "dl.figures",
                 {},
@@ -291,6 +291,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     main.addEventListener("dragover", over, { signal: closed });
     main.addEventListener("drop", drop, { signal: closed });
     document.addEventListener("uploaded", () => (uploads.has(name) && shown === "upload" ? update?.({}) : refresh()), { signal: closed });
+    document.addEventListener("edited", () => ((shown = ""), refresh()), { signal: closed });
     closed.addEventListener("abort", () => clearTimeout(timer));
     refresh();
 }

@@ -2,7 +2,7 @@
 
 import { action, ask, make, notice } from "./page.js";
 import { showScene, upload } from "./scene.js";
-import { say, speak } from "./text.js";
+import { chosenLanguage, say, speak } from "./text.js";
 import { chosen, dropped, titleOf } from "./upload.js";
 
 const main = /** @type {HTMLElement} */ (document.getElementById("main"));
@@ -124,7 +124,6 @@ function machinePart() {
 
 const themes = ["auto", "light", "dark"];
 const chosenTheme = () => localStorage.getItem("theme") ?? "auto";
-const chosenLanguage = () => localStorage.getItem("language") ?? (navigator.language.startsWith("zh") ? "zh" : "en");
 
 function dress() {
     document.documentElement.dataset.theme = chosenTheme();

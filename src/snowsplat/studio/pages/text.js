@@ -101,9 +101,44 @@ const TEXTS = {
     copy: ["Copy", "复制"],
     viewer: ["The scene", "场景"],
     live: ["The training, live", "实时训练画面"],
+    edit: ["Edit", "编辑"],
+    edit_rectangle: ["Rectangle", "矩形"],
+    edit_lasso: ["Lasso", "套索"],
+    edit_brush: ["Brush", "画笔"],
+    edit_box: ["Box", "裁剪框"],
+    edit_measure: ["Measure", "测量"],
+    edit_mode: ["How to select", "选择方式"],
+    edit_replace: ["New", "新选择"],
+    edit_add: ["Add", "添加"],
+    edit_remove: ["Remove", "减去"],
+    edit_invert: ["Invert", "反选"],
+    edit_delete: ["Delete", "删除"],
+    edit_undo: ["Undo", "撤销"],
+    edit_redo: ["Redo", "重做"],
+    edit_counts: ["{0} selected, {1} deleted", "已选 {0}，已删 {1}"],
+    edit_radius: ["Radius", "半径"],
+    edit_from: ["{0} from", "{0} 从"],
+    edit_to: ["{0} to", "{0} 到"],
+    edit_outside: ["Select what is outside", "选择框外部分"],
+    edit_two_points: ["Click two points of the scene", "点击场景中的两个点"],
+    edit_no_surface: ["There is no surface; click another place", "这里没有表面；请点击别处"],
+    edit_distance: ["Distance: {0}", "距离：{0}"],
+    edit_truth: ["True distance", "真实距离"],
+    edit_rescale: ["Set scale", "设定比例"],
+    edit_size: ["Size × {0} (snowsplat convert SCENE FILE --scale {0})", "尺寸 × {0}（snowsplat convert SCENE FILE --scale {0}）"],
+    edit_start: ["Start with this view", "以此视角开始"],
+    edit_start_set: ["The scene will start with this view", "场景将以此视角开始"],
+    edit_save: ["Save", "保存"],
+    edit_saving: ["Saving…", "正在保存…"],
+    edit_back: ["Back to the original", "恢复原场景"],
+    edit_back_sure: ["Remove all edits of this scene?", "删除此场景的所有编辑？"],
+    edited: ["edited", "已编辑"],
 };
 
 let column = 0;
+
+/** The language that was chosen in the browser. */
+export const chosenLanguage = () => localStorage.getItem("language") ?? (navigator.language.startsWith("zh") ? "zh" : "en");
 
 /** @param {string} language "en" or "zh" */
 export function speak(language) {

@@ -37,6 +37,10 @@ const element = (name, properties, ...children) => {
  */
 const hidingSliders = (app, [x, y, z], limits) => {
     let gsplat;
+    const use = (code) => {
+        ({ gsplat } = app.root.findByName('gsplat'));
+        gsplat.setWorkBufferModifier(code);
+    };
     const apply = () => {
         const [distance, size] = sliders.map(({ value }, i) => {
             const [all, least] = limits[['distance', 'size'][i]];
@@ -44,8 +48,7 @@ const hidingSliders = (app, [x, y, z], limits) => {
         });
         if (!gsplat) {
             if (Math.min(distance, size) === EVERYTHING) return;
-            ({ gsplat } = app.root.findByName('gsplat'));
-            gsplat.setWorkBufferModifier(HIDING);
+            use(HIDING);
         }
         gsplat.setParameter('snowKept', [x, y, z, distance]);
         gsplat.setParameter('snowLargest', size);
@@ -61,6 +64,12 @@ const hidingSliders = (app, [x, y, z], limits) => {
             element('label', {}, 'Crop', sliders[0]),
             element('label', {}, 'Hide floaters', sliders[1])
         ),
+        code: HIDING,
+        /** Gives the engine code that contains this one. */
+        use: (code) => {
+            use(code);
+            apply();
+        },
         values: () => sliders.map(({ value }) => Number(value)),
         set: (values) => {
             values.forEach((value, i) => { sliders[i].value = value; });

@@ -44,8 +44,9 @@ const firstStop = (size) => {
     const shown = stops.map((view, i) => shownOfSubject(view, size, seen[i]));
     return shown.findIndex((share) => share >= Math.max(...shown) - 0.05);
 };
-const first = Math.max(0, firstStop({ width: innerWidth, height: innerHeight }));
-const start = first ? stops[first] : scene.start;
+// A start that a person has chosen is that of no photo.
+const first = scene.chosen ? -1 : Math.max(0, firstStop({ width: innerWidth, height: innerHeight }));
+const start = first > 0 ? stops[first] : scene.start;
 
 const addView = ([x, y, z, u, v, w, fov]) => ({ position: [x, y, z], target: [u, v, w], fov });
 
@@ -202,4 +203,6 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         panel.classList.toggle('snow-faded', hidden && strip.hidden && hiding.element.hidden)
     );
     document.querySelector('.sse-viewer').append(panel);
+    // The studio adds its tools for editing.
+    window.sse.edit?.({ viewer, scene, camera, canvas, hiding, panel, presentView });
 });

@@ -55,11 +55,14 @@ def panel_settings(
     stops: Stops,
     pictures: str,
     hiding: Hiding,
+    scale: float,
+    chosen: bool,
 ) -> dict[str, Any]:
     """What the script needs.
 
     ``gaussians``: their number. ``start``: the initial view. ``stops``: also have the subject,
     which Frame shows. ``pictures``: the address of the image with the pictures of the stops.
+    ``scale``: of the page relative to the scene file. ``chosen``: a person has chosen the start.
     """
     x, y, z = stops.middle.tolist()
     return {
@@ -72,6 +75,8 @@ def panel_settings(
         "seen": [[round(share, 2) for share in seen] for seen in stops.seen],
         "pictures": pictures,
         "hiding": hiding.settings(),
+        "scale": scale,
+        "chosen": chosen,
     }
 
 

@@ -16,6 +16,7 @@ from snowsplat.formats.lod_writer import remove_lod
 from snowsplat.formats.sog import write_sog
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.viewer.http.served_file import Served, served
@@ -43,6 +44,7 @@ def write_site(
     about: Description,
     url: str = "",
     write_scene: Callable[[Path, Gaussians], str] = write_one_file,
+    start: InitialView | None = None,
 ) -> None:
     """Write the page, its viewer, the scene and a picture into a folder.
 
@@ -53,11 +55,12 @@ def write_site(
         url: the address of the folder on the web, which ends in "/"; "" if it is not known yet.
             Services that show a preview of a link need it to find the picture.
         write_scene: writes the scene into the folder, and returns the name of the file to load.
+        start: the initial view; None: see `scene.ready`.
 
     Raises:
         OSError: a file cannot be written.
     """
-    scene = ready(gaussians, cameras, background)
+    scene = ready(gaussians, cameras, background, start)
     content = write_scene(folder, scene.gaussians)
     if content == INDEX:
         scene = scene.complete()

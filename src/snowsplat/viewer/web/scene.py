@@ -49,17 +49,18 @@ def site(
     background: Sequence[float],
     levels: Callable[[Gaussians], Path] | None = None,
     count: int | None = None,
+    start: InitialView | None = None,
 ) -> tuple[dict[str, Served], dict[str, str]]:
     """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
-    The initial view is the first of ``cameras``; without cameras, an overview of the scene.
+    The initial view is ``start``, or the first of ``cameras``, or an overview of the scene.
 
     ``levels`` returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
     loads instead of the complete scene. ``count``: the number of Gaussians, if ``gaussians`` is
     only a coarse level. Then the levels stay as they are, and the page only scales them.
     """
     in_place = count is not None
-    scene = ready(gaussians, cameras, background, turn=not in_place)
+    scene = ready(gaussians, cameras, background, start, turn=not in_place)
     if levels is not None:
         scene = scene.complete()
     content = _content(scene.gaussians, levels)
@@ -103,6 +104,7 @@ class ReadyScene(NamedTuple):
     background: Sequence[float]  # red, green, blue in 0..1
     hiding: Hiding  # what the page can hide
     scale: float  # of the frame, relative to that of the scene that was given
+    chosen: bool  # whether the initial view was given
 
     def complete(self) -> ReadyScene:
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
@@ -120,7 +122,16 @@ class ReadyScene(NamedTuple):
         return {
             "settings": settings(self.start, self.background, self.film),
             "antialiased": self.gaussians.antialiased,
-            "panel": panel_settings(about, count, self.start, self.stops, pictures, self.hiding),
+            "panel": panel_settings(
+                about,
+                count,
+                self.start,
+                self.stops,
+                pictures,
+                self.hiding,
+                self.scale,
+                self.chosen,
+            ),
         }
 
 
@@ -128,40 +139,49 @@ def ready(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     background: Sequence[float] = (0.0, 0.0, 0.0),
+    start: InitialView | None = None,
     *,
     turn: bool = True,
 ) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
+
+    ``start``: the initial view; None: that of the first camera. ``turn``: see `viewing_frame`.
+    """
+    change, depth = viewing_frame(gaussians, cameras, turn=turn)
+    if change is not None:
+        gaussians = transform(gaussians, change)
+        depth *= change.scale
+        cameras = [camera.transformed(change) for camera in cameras]
+        start = start and start.transformed(change)
+    stops = stops_of(gaussians, cameras, depth if cameras else 1.0, background)
+    hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=not cameras)
+    film = _film(cameras, depth) if cameras else []
+    first = start or (stops.views[0] if cameras else overview(gaussians))
+    scale = change.scale if change else 1.0
+    return ReadyScene(
+        gaussians, first, film, stops, background, hiding, scale, chosen=start is not None
+    )
+
+
+def viewing_frame(
+    gaussians: Gaussians, cameras: Sequence[Camera], *, turn: bool = True
+) -> tuple[Similarity | None, float]:
+    """The transform to a frame that suits the viewer; None if that of the scene does. And the
+    depth of what the first camera shows, in world units.
 
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
     Without cameras, the surfaces may imply another up direction, and the distance is that of
     the `overview`. Without ``turn`` (only without cameras), the scene is only scaled.
     """
-    if not cameras:
-        up = up_of_surfaces(*_surfaces(gaussians)) if turn else None
-        view = overview(gaussians)
-        depth = math.dist(view.position, view.target)
-        change = _viewing_frame(_UP if up is None else up, depth, _TOO_FAR)
-        if change is not None:
-            gaussians = transform(gaussians, change)
-        scale = change.scale if change else 1.0
-        stops = stops_of(gaussians, (), 1.0, background)
-        hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=True)
-        start = overview(gaussians)
-        return ReadyScene(gaussians, start, [], stops, background, hiding, scale)
-    depth = _depth_ahead(gaussians, cameras[0])
-    rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
-    change = _viewing_frame(scene_up(rotations.numpy()), depth)
-    if change is not None:
-        gaussians = transform(gaussians, change)
-        depth *= change.scale
-        cameras = [camera.transformed(change) for camera in cameras]
-    stops = stops_of(gaussians, cameras, depth, background)
-    hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=False)
-    film = _film(cameras, depth)
-    scale = change.scale if change else 1.0
-    return ReadyScene(gaussians, stops.views[0], film, stops, background, hiding, scale)
+    if cameras:
+        depth = _depth_ahead(gaussians, cameras[0])
+        rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
+        return _change(scene_up(rotations.numpy()), depth), depth
+    up = up_of_surfaces(*_surfaces(gaussians)) if turn else None
+    view = overview(gaussians)
+    depth = math.dist(view.position, view.target)
+    return _change(_UP if up is None else up, depth, _TOO_FAR), depth
 
 
 def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
@@ -174,9 +194,7 @@ def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
     return [view_of_camera(camera, depth) for camera in path]
 
 
-def _viewing_frame(
-    direction: np.ndarray, depth: float, most: float = _TOO_LARGE
-) -> Similarity | None:
+def _change(direction: np.ndarray, depth: float, most: float = _TOO_LARGE) -> Similarity | None:
     """Transform to a frame with −y up and usual distances; None if the scene has both."""
     up = torch.from_numpy(direction)
     rotation = _shortest_rotation(up, torch.from_numpy(_UP))

@@ -1,0 +1,135 @@
+"""`edit`: what a person has changed in the page of a scene, as a new scene beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from snowsplat.formats import GaussianArrays
+from snowsplat.formats.ply import write_ply
+from snowsplat.formats.sog import order_in_sog, read_sog
+from snowsplat.pipeline.output.edit_record import (
+    EditRecord,
+    PageEdit,
+    edited_file,
+    read_record,
+    record_file,
+    write_record,
+)
+from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.scene.edit import transform
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.initial_view import InitialView
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+from snowsplat.viewer.web.publication import SCENE
+from snowsplat.viewer.web.scene import viewing_frame
+
+# SOG stores positions in steps. They differ from those of the scene by at most half of one, and
+# float32 numbers by this share.
+_ROUNDING = 1e-5
+
+
+class OtherScene(UserError):
+    """The page shows another scene than the file contains."""
+
+
+def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
+    """Write the edited scene beside ``scene``, which stays as it is; returns its file.
+
+    This is NAME_edited.ply, with its record NAME_edited.json. If ``scene`` is such a file itself,
+    it is replaced.
+
+    Args:
+        scene: a scene file.
+        site: the site that `publish` has written of it, without levels of detail: the page.
+
+    Raises:
+        OtherScene: the page shows another scene.
+        UserError: the scene is missing or damaged.
+        OSError: the file cannot be written.
+    """
+    scene = Path(scene)
+    source = load_viewable(scene)
+    change = viewing_frame(source.gaussians, source.cameras)[0]
+    moved = source.gaussians if change is None else transform(source.gaussians, change)
+    rows = _rows_of_page(scene, moved, Path(site))
+    if len(rows) != changes.count:
+        raise OtherScene(f"the page has {changes.count} Gaussians, the scene has {len(rows)}")
+    removed = np.zeros(len(source.gaussians), bool)
+    bits = np.unpackbits(np.frombuffer(changes.bits(), np.uint8), bitorder="little")
+    removed[rows] = bits[: len(rows)] == 1
+    if removed.all():
+        raise UserError("nothing would be left of the scene; keep some of it")
+    kept = source.gaussians.select(torch.from_numpy(~removed))
+    larger = replace(Similarity.identity(), scale=changes.scale)
+    if changes.scale != 1:
+        x, y, z = kept.origin
+        moved_to = changes.scale * x, changes.scale * y, changes.scale * z
+        kept = replace(transform(kept, larger), origin=moved_to)
+    start = source.start and source.start.transformed(larger)
+    if changes.start is not None:
+        back = Similarity.identity() if change is None else change.inverse()
+        start = _view(changes.start).transformed(back).transformed(larger)
+    before = read_record(scene) or EditRecord(scene.name, 0)
+    record = replace(
+        before,
+        removed=before.removed + int(removed.sum()),
+        scale=before.scale * changes.scale,
+        title=changes.title or before.title,
+        start=None if start is None else [*start.position, *start.target, start.fov, start.aspect],
+    )
+    target = edited_file(scene)
+    with atomic_path(target) as temporary:
+        write_ply(temporary, GaussianArrays.from_gaussians(kept))
+        # Until both are there, there is no edited scene.
+        record_file(target).unlink(missing_ok=True)
+    write_record(target, record)
+    return target
+
+
+def undo_edits(edited: Path | str) -> Path:
+    """Remove an edited scene; returns the file of the scene that was edited.
+
+    Raises: UserError: this is no edited scene.
+    """
+    edited = Path(edited)
+    record = read_record(edited)
+    if record is None:
+        raise UserError(f"{edited}: this scene was not edited; nothing to take back")
+    record_file(edited).unlink()
+    edited.unlink(missing_ok=True)
+    return edited.with_name(Path(record.scene).name)
+
+
+def _rows_of_page(scene: Path, gaussians: Gaussians, site: Path) -> np.ndarray:
+    """(N,) the rows of a scene, in the frame of its page, in the order of the page.
+
+    The file of the page is in the order of a space-filling curve. The order is computed again, and
+    the positions in the file must be those of the rows.
+    """
+    arrays = GaussianArrays.from_gaussians(gaussians)
+    rows = order_in_sog(scene, arrays)
+    shown, expected = (_logs(a) for a in (read_sog(site / SCENE).means, arrays.means[rows]))
+    if shown.shape == expected.shape and len(rows):
+        step = np.ptp(expected, axis=0) / 65535
+        if (np.abs(shown - expected) <= 0.51 * step + _ROUNDING * np.abs(expected)).all():
+            return rows
+    raise OtherScene(f"{site}: the page did not show {scene.name}")
+
+
+def _logs(means: np.ndarray) -> np.ndarray:
+    """The numbers that SOG stores in even steps."""
+    values = means.astype(np.float64)
+    return np.sign(values) * np.log1p(np.abs(values))
+
+
+def _view(numbers: Sequence[float]) -> InitialView:
+    """A view of the page, whose world is rotated by 180° about the z axis; see `view_numbers`."""
+    x, y, z, u, v, w, fov, aspect = numbers
+    return InitialView((-x, -y, z), (-u, -v, w), fov, aspect)

@@ -1,0 +1,121 @@
+"""What was changed in a page, and the record of an edited scene: NAME_edited.json beside its file.
+
+It imports no torch.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from snowsplat.util.files import write_json
+from snowsplat.util.safe_json import from_json, read_json
+
+_ENDING = "_edited"
+
+
+@dataclass(frozen=True)
+class EditRecord:
+    """How an edited scene was made from another one.
+
+    Attributes:
+        scene: the name of the file that was edited, in the same folder.
+        removed: the number of Gaussians that were removed.
+        scale: the size relative to that of the other scene, about the origin of the world.
+        title: the name of the scene for people; "": that of the other scene.
+        start: the initial view in the world of the edited scene: position, target, field of view in
+            degrees, aspect (`InitialView`); None: not chosen.
+
+    Raises:
+        ValueError: the scale is not positive, or the view is none.
+    """
+
+    scene: str
+    removed: int
+    scale: float = 1.0
+    title: str = ""
+    start: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"the scale {self.scale} is not positive")
+        view = self.start
+        if view is not None and not (
+            len(view) == 8 and view[:3] != view[3:6] and 0 < view[6] < 180 and view[7] > 0
+        ):
+            raise ValueError("the initial view is none")
+
+
+@dataclass(frozen=True)
+class PageEdit:
+    """What was changed in a page.
+
+    Attributes:
+        count: the number of Gaussians of the page.
+        removed: base64 of one bit per Gaussian, in the order of the page, the lowest bit of a byte
+            first; 1: it is removed.
+        scale: the size of the scene relative to its present one.
+        title: the name of the scene for people; "": as it is.
+        start: the initial view in the frame of the page: position, target, field of view in degrees
+            and aspect, see `InitialView`; None: as it is.
+
+    Raises:
+        ValueError: the number of bits, the scale or the view is not possible.
+    """
+
+    count: int
+    removed: str
+    scale: float = 1.0
+    title: str = ""
+    start: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        EditRecord("", 0, self.scale, self.title, self.start)  # checks these
+        if not 1e-9 < self.scale < 1e9:
+            raise ValueError(f"a scene cannot become {self.scale:g} times as large")
+        if self.count < 1 or len(self.bits()) != -(-self.count // 8):
+            raise ValueError(f"{8 * len(self.bits())} bits are not those of {self.count} Gaussians")
+
+    def bits(self) -> bytes:
+        """Raises ValueError: they are not in base64."""
+        try:
+            return base64.b64decode(self.removed, validate=True)
+        except binascii.Error:
+            raise ValueError("the removed Gaussians are not in base64") from None
+
+
+def edited_file(scene: Path) -> Path:
+    """The file of the edited scene; ``scene`` itself if it is one."""
+    return scene if read_record(scene) else scene.with_name(f"{scene.stem}{_ENDING}.ply")
+
+
+def record_file(edited: Path) -> Path:
+    """The file of the record."""
+    return edited.with_suffix(".json")
+
+
+def read_record(file: Path) -> EditRecord | None:
+    """The record of a scene file; None if it was not edited here."""
+    if not file.stem.endswith(_ENDING):
+        return None
+    try:
+        return from_json(EditRecord, read_json(record_file(file)))
+    except (OSError, ValueError):
+        return None
+
+
+def write_record(edited: Path, record: EditRecord) -> None:
+    """Raises OSError: the folder is not writable, or the disk is full."""
+    write_json(record_file(edited), asdict(record))
+
+
+def shown_file(scene: Path) -> Path:
+    """The edited scene, unless there is none, or ``scene`` has been made again since then."""
+    edited = edited_file(scene)
+    if read_record(edited) and edited.is_file():
+        newer = edited.stat().st_mtime_ns >= scene.stat().st_mtime_ns
+        return edited if newer else scene
+    return scene

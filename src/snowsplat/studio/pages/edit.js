@@ -1,0 +1,393 @@
+// Tools for editing in the page of a finished scene. The studio adds this module to the page, whose
+// script (panel.js) calls `window.sse.edit`. "Save" sends what was changed to the studio.
+
+import { ask, make, Refused } from "./page.js";
+import { bounds, DELETED, outside, project, SELECTED, Selection, times, within } from "./selection.js";
+import { chosenLanguage, say, speak } from "./text.js";
+
+const BRUSH = 24; // its radius at first, in CSS pixels
+const AXES = ["x", "y", "z"];
+const isEdited = /** @type {HTMLElement} */ (document.querySelector("script[data-edited]")).dataset.edited === "true";
+// The engine copies the Gaussians into a buffer before it draws them; this code changes the copies.
+const STREAM = "snowState";
+const R8U = 33; // PIXELFORMAT_R8U of the engine: a byte per Gaussian
+const OF_INSTANCE = 1; // GSPLAT_STREAM_INSTANCE
+
+/** The code of the sliders of the page under other names, and ours, which calls it. */
+function shader(/** @type {{glsl: string, wgsl: string}} */ sliders) {
+    const renamed = (/** @type {string} */ code) => code.replaceAll("modifySplat", "hideSplat");
+    return {
+        glsl: `${renamed(sliders.glsl)}
+void modifySplatCenter(inout vec3 center) {}
+void modifySplatRotationScale(vec3 center, vec3 modified, inout vec4 rotation, inout vec3 scale) {
+    hideSplatRotationScale(center, modified, rotation, scale);
+    if (loadSnowState().r == ${DELETED}u) scale = vec3(0.0);
+}
+void modifySplatColor(vec3 center, inout vec4 color) {
+    if (loadSnowState().r == ${SELECTED}u) color.xyz = mix(color.xyz, vec3(1.0, 0.4, 0.0), 0.65);
+}`,
+        wgsl: `${renamed(sliders.wgsl)}
+fn modifySplatCenter(center: ptr<function, vec3f>) {}
+fn modifySplatRotationScale(center: vec3f, modified: vec3f, rotation: ptr<function, vec4f>, scale: ptr<function, vec3f>) {
+    hideSplatRotationScale(center, modified, rotation, scale);
+    if (loadSnowState().r == ${DELETED}u) { *scale = vec3f(0.0); }
+}
+fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
+    if (loadSnowState().r == ${SELECTED}u) { *color = vec4f(mix((*color).xyz, vec3f(1.0, 0.4, 0.0), 0.65), (*color).w); }
+}`,
+    };
+}
+
+/** Called by the script of the page, before the scene has loaded. */
+function addTools(/** @type {any} */ page) {
+    const { events, state } = page.viewer;
+    /** @type {any} */
+    let picker;
+    events.once("picker:ready", (/** @type {any} */ ready) => (picker = ready));
+    const begin = async () => edit(page, picker, await centersOf(page.viewer.app));
+    if (state.loaded) begin();
+    else events.once("loaded:changed", begin);
+}
+
+async function centersOf(/** @type {any} */ app) {
+    const { resource } = app.assets.get(app.root.findByName("gsplat").gsplat.asset);
+    if (resource.centers) return resource.centers;
+    await resource.gsplatData.generateCenters();
+    return resource.gsplatData.getCenters();
+}
+
+/**
+ * @param {any} page see panel.js
+ * @param {any} picker of the viewer: finds the surface at a place of the window
+ * @param {Float32Array} centers (N, 3)
+ */
+function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers) {
+    const { app } = viewer;
+    const entity = app.root.findByName("gsplat");
+    const selection = new Selection(centers.length / 3);
+    let tool = "";
+    let mode = "replace";
+    let scale = 1; // of the scene that is saved, relative to the present one
+    /** @type {number[] | null} */
+    let start = null;
+    /** @type {number[][]} */
+    let measured = []; // at most two points of the world of the page
+    /** @type {number[][]} */
+    let stroke = []; // points of the window, CSS pixels
+    let saving = false;
+    const [low, high] = bounds(centers);
+    const box = [[...low], [...high]];
+
+    // The picture
+
+    const { resource } = app.assets.get(entity.gsplat.asset);
+    let shown = selection.state;
+    function show() {
+        const { gsplat } = entity;
+        if (shown !== selection.state) {
+            resource.format.addExtraStreams([{ name: STREAM, format: R8U, storage: OF_INSTANCE }]);
+            const texture = gsplat.getInstanceTexture(STREAM);
+            const bytes = texture.lock();
+            bytes.fill(0);
+            bytes.set((shown = selection.state));
+            texture.unlock();
+            hiding.use(shader(hiding.code)); // also copies the Gaussians again
+        }
+        const [selected, deleted] = [selection.count(SELECTED), selection.count(DELETED)];
+        counts.textContent = say("edit_counts", selected.toLocaleString(), deleted.toLocaleString());
+        remove.disabled = !selected;
+        undo.disabled = !selection.past.length;
+        redo.disabled = !selection.future.length;
+        size.textContent = scale === 1 ? "" : say("edit_size", scale.toPrecision(4));
+        save.disabled = saving || !isChanged();
+        viewer.app.renderNextFrame = true;
+    }
+    const isChanged = () => Boolean(start || scale !== 1 || title.value.trim() !== scene.title || selection.count(DELETED));
+    const change = (/** @type {() => void} */ run) => () => {
+        run();
+        show();
+    };
+
+    // Tools in the window
+
+    const overlay = /** @type {HTMLCanvasElement} */ (make("canvas.snow-overlay", { hidden: true }));
+    const drawing = /** @type {CanvasRenderingContext2D} */ (overlay.getContext("2d"));
+    canvas.after(overlay);
+    const world = () => times(camera.projectionMatrix.data, camera.viewMatrix.data);
+    const model = () => times(world(), entity.getWorldTransform().data);
+
+    /** Draws the stroke as a rectangle, an area or a line. */
+    function trace(/** @type {CanvasRenderingContext2D} */ context) {
+        const [first, last] = [stroke[0], stroke[stroke.length - 1]];
+        context.beginPath();
+        if (tool === "rectangle") context.rect(first[0], first[1], last[0] - first[0], last[1] - first[1]);
+        else stroke.forEach(([x, y]) => context.lineTo(x, y));
+        if (tool !== "brush") return context.fill();
+        context.lineTo(last[0] + 0.01, last[1]); // a point has a round end, too
+        context.lineWidth = 2 * Number(radius.value);
+        context.lineCap = context.lineJoin = "round";
+        context.stroke();
+    }
+
+    function draw() {
+        const { clientWidth: width, clientHeight: height } = canvas;
+        const ratio = devicePixelRatio;
+        if (overlay.width !== Math.round(width * ratio) || overlay.height !== Math.round(height * ratio)) {
+            overlay.width = Math.round(width * ratio);
+            overlay.height = Math.round(height * ratio);
+        }
+        drawing.setTransform(ratio, 0, 0, ratio, 0, 0);
+        drawing.clearRect(0, 0, width, height);
+        if (stroke.length) {
+            drawing.fillStyle = drawing.strokeStyle = "#ffb45466";
+            trace(drawing);
+        }
+        if (tool === "box") lines(model(), edges(), width, height);
+        if (tool === "measure") {
+            lines(world(), measured.length === 2 ? [measured] : [], width, height);
+            for (const point of measured) {
+                const [x, y, depth] = project(world(), point, width, height);
+                if (depth <= 0) continue;
+                drawing.beginPath();
+                drawing.arc(x, y, 5, 0, 7);
+                drawing.fillStyle = "#ffb454";
+                drawing.fill();
+            }
+        }
+    }
+
+    function lines(/** @type {Float64Array} */ m, /** @type {number[][][]} */ pairs, /** @type {number} */ width, /** @type {number} */ height) {
+        drawing.lineWidth = 2;
+        drawing.strokeStyle = "#ffb454";
+        drawing.beginPath();
+        for (const pair of pairs) {
+            const [from, to] = pair.map(point => project(m, point, width, height));
+            if (from[2] <= 0 || to[2] <= 0) continue;
+            drawing.moveTo(from[0], from[1]);
+            drawing.lineTo(to[0], to[1]);
+        }
+        drawing.stroke();
+    }
+
+    /** The twelve edges of the box, in short pieces, since those behind the camera are not drawn. */
+    function edges() {
+        const pairs = [];
+        const pieces = 16;
+        for (let axis = 0; axis < 3; axis++) {
+            for (let side = 0; side < 4; side++) {
+                const point = (/** @type {number} */ share) =>
+                    AXES.map((_, k) => {
+                        if (k === axis) return box[0][k] + share * (box[1][k] - box[0][k]);
+                        return box[(side >> Number((k + 3 - axis) % 3 === 1)) & 1][k];
+                    });
+                for (let i = 0; i < pieces; i++) pairs.push([point(i / pieces), point((i + 1) / pieces)]);
+            }
+        }
+        return pairs;
+    }
+
+    function selectStroke(/** @type {PointerEvent} */ event) {
+        const { clientWidth: width, clientHeight: height } = canvas;
+        const context = /** @type {CanvasRenderingContext2D} */ (Object.assign(document.createElement("canvas"), { width, height }).getContext("2d"));
+        trace(context);
+        const pixels = context.getImageData(0, 0, width, height).data;
+        const shape = new Uint8Array(width * height);
+        for (let i = 0; i < shape.length; i++) shape[i] = pixels[4 * i + 3];
+        selection.select(within(centers, model(), shape, width, height), event.shiftKey ? "add" : event.altKey ? "remove" : mode);
+        stroke = [];
+        show();
+    }
+
+    async function measure(/** @type {number} */ x, /** @type {number} */ y) {
+        const found = await picker?.pickSurface(x / canvas.clientWidth, y / canvas.clientHeight);
+        if (!found) return tell(say("edit_no_surface"));
+        const { position } = found;
+        measured = [...(measured.length === 2 ? [] : measured), [position.x, position.y, position.z]];
+        tellDistance();
+    }
+
+    /** The measured distance in units of the scene that is saved; 0 if there is none. */
+    function distance() {
+        if (measured.length < 2) return 0;
+        const [a, b] = measured;
+        return (scale * Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2])) / scene.scale;
+    }
+
+    function tellDistance() {
+        const found = distance();
+        measure_.textContent = found ? say("edit_distance", found.toPrecision(4)) : say("edit_two_points");
+        rescale.disabled = !found;
+        draw();
+    }
+
+    overlay.addEventListener("pointerdown", event => {
+        if (!event.isPrimary || event.button) return;
+        event.preventDefault();
+        if (tool === "measure") measure(event.offsetX, event.offsetY);
+        else {
+            overlay.setPointerCapture(event.pointerId);
+            stroke = [[event.offsetX, event.offsetY]];
+        }
+    });
+    overlay.addEventListener("pointermove", event => {
+        if (stroke.length && event.isPrimary) stroke.push([event.offsetX, event.offsetY]);
+    });
+    overlay.addEventListener("pointerup", event => {
+        if (stroke.length && event.isPrimary) selectStroke(event);
+    });
+    overlay.addEventListener("pointercancel", () => (stroke = []));
+    // Zoom works with every tool.
+    overlay.addEventListener("wheel", event => {
+        event.preventDefault();
+        canvas.dispatchEvent(new WheelEvent("wheel", event));
+    });
+    app.on("update", () => {
+        if (!overlay.hidden) draw();
+    });
+
+    // The panel
+
+    const button = (/** @type {string} */ key, /** @type {() => void} */ click) =>
+        /** @type {HTMLButtonElement} */ (make("button", { type: "button", click }, say(key)));
+    const choices = (/** @type {string[]} */ names, /** @type {(name: string) => void} */ choose) => {
+        const buttons = names.map(name => button(`edit_${name}`, () => choose(name)));
+        const mark = (/** @type {string} */ chosen) => buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
+        return { buttons, mark };
+    };
+    const tools = choices(["rectangle", "lasso", "brush", "box", "measure"], name => choose(tool === name ? "" : name));
+    const modes = choices(["replace", "add", "remove"], name => modes.mark((mode = name)));
+    function choose(/** @type {string} */ name) {
+        tool = name;
+        tools.mark(name);
+        overlay.hidden = !name;
+        // The box is moved by sliders, and the camera by the window.
+        overlay.style.pointerEvents = name === "box" ? "none" : "auto";
+        forBrush.hidden = name !== "brush";
+        forBox.hidden = name !== "box";
+        forMeasure.hidden = name !== "measure";
+    }
+
+    const radius = /** @type {HTMLInputElement} */ (make("input", { type: "range", min: 4, max: 120, value: BRUSH }));
+    const forBrush = make("label", {}, say("edit_radius"), radius);
+    const sides = AXES.flatMap((axis, k) =>
+        [0, 1].map(side => {
+            const input = (/** @type {any} */ event) => {
+                box[side][k] = Number(event.target.value);
+                box[1 - side][k] = side ? Math.min(box[0][k], box[1][k]) : Math.max(box[0][k], box[1][k]);
+                const other = /** @type {HTMLInputElement} */ (forBox.querySelectorAll("input")[2 * k + 1 - side]);
+                other.value = String(box[1 - side][k]);
+            };
+            const label = say(side ? "edit_to" : "edit_from", axis);
+            return make("label", {}, label, make("input", { type: "range", min: low[k], max: high[k], step: "any", value: box[side][k], input }));
+        }),
+    );
+    const forBox = make("div", {}, ...sides, button("edit_outside", change(() => selection.select(outside(centers, box[0], box[1]), mode))));
+    const measure_ = make("span", { role: "status" }, say("edit_two_points"));
+    const truth = /** @type {HTMLInputElement} */ (make("input", { type: "number", min: 0, step: "any", "aria-label": say("edit_truth"), placeholder: say("edit_truth") }));
+    const rescale = button("edit_rescale", () => {
+        const wanted = Number(truth.value);
+        if (!(wanted > 0)) return truth.focus();
+        scale *= wanted / distance();
+        tellDistance();
+        show();
+    });
+    rescale.disabled = true;
+    const size = make("span");
+    const forMeasure = make("div.snow-buttons", {}, measure_, truth, rescale, size);
+    const remove = button("edit_delete", change(() => selection.delete()));
+    const undo = button("edit_undo", change(() => selection.undo()));
+    const redo = button("edit_redo", change(() => selection.redo()));
+    const counts = make("p", { role: "status" });
+    const title = /** @type {HTMLInputElement} */ (make("input", { type: "text", maxlength: 80, value: scene.title, "aria-label": say("title_label"), input: change(() => {}) }));
+    const view = button("edit_start", change(() => {
+        start = [...presentView(), scene.aspect];
+        tell(say("edit_start_set"));
+    }));
+    const told = make("p", { role: "status" });
+    const tell = (/** @type {string} */ text) => (told.textContent = text);
+
+    /** Sends a change to the studio, and shows the scene as it is then. */
+    async function send(/** @type {string} */ method, /** @type {any} */ body) {
+        saving = true;
+        show();
+        tell(say("edit_saving"));
+        try {
+            await ask("../edit", method, body);
+            removeEventListener("beforeunload", keep);
+            // The page of the studio shows the scene in a frame; it has other figures now, too.
+            if (parent === window) location.reload();
+            else parent.document.dispatchEvent(new Event("edited"));
+        } catch (error) {
+            tell(error instanceof Refused ? error.message : say("offline"));
+            saving = false;
+            show();
+        }
+    }
+    const save = button("edit_save", () => {
+        const changed = title.value.trim();
+        send("POST", { count: selection.state.length, removed: selection.deleted(), scale, title: changed === scene.title ? "" : changed, start });
+    });
+    const back = button("edit_back", () => {
+        if (confirm(say("edit_back_sure"))) send("DELETE", undefined);
+    });
+    const keep = (/** @type {Event} */ event) => {
+        if (isChanged()) event.preventDefault();
+    };
+    addEventListener("beforeunload", keep);
+
+    const row = (/** @type {(Node | false)[]} */ ...parts) => make("div.snow-buttons", {}, ...parts);
+    const content = make(
+        "div.snow-edit.snow-card",
+        { hidden: true },
+        row(...tools.buttons),
+        make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => selection.invert()))),
+        forBrush,
+        forBox,
+        forMeasure,
+        row(remove, undo, redo),
+        counts,
+        row(title, view),
+        row(save, isEdited && back),
+        told,
+    );
+    const open = button("edit", () => {
+        content.hidden = !content.hidden;
+        open.ariaExpanded = String(!content.hidden);
+        if (content.hidden) choose("");
+    });
+    open.ariaExpanded = "false";
+    panel.querySelector(".snow-buttons").append(open);
+    panel.querySelector(".snow-card").after(content);
+    // The page fades its panel when its controls hide.
+    viewer.events.on("controlsHidden:changed", () => {
+        if (!content.hidden) panel.classList.remove("snow-faded");
+    });
+    choose("");
+    modes.mark(mode);
+    show();
+
+    // Keys in fields are not for the camera.
+    for (const kind of ["keydown", "keyup"])
+        content.addEventListener(kind, event => {
+            if (event.target === title || event.target === truth) event.stopPropagation();
+        });
+    addEventListener(
+        "keydown",
+        event => {
+            if (content.hidden || saving || event.target === title || event.target === truth) return;
+            const command = event.ctrlKey || event.metaKey;
+            const key = event.key.toLowerCase();
+            if (command && key === "z") change(() => (event.shiftKey ? selection.redo() : selection.undo()))();
+            else if (command && key === "y") change(() => selection.redo())();
+            else if (key === "delete" || key === "backspace") change(() => selection.delete())();
+            else if (key === "escape" && tool) choose("");
+            else return;
+            event.preventDefault();
+            event.stopPropagation();
+        },
+        true,
+    );
+}
+
+speak(chosenLanguage());
+/** @type {any} */ (window).sse.edit = addTools;

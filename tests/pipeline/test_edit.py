@@ -1,0 +1,139 @@
+"""`edit`: the order of the page, scale, views, titles, and the way back."""
+
+import base64
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.sog import read_sog
+from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
+from snowsplat.pipeline.output.edit_record import PageEdit, read_record, shown_file
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.pipeline.publish import publish
+from snowsplat.pipeline.view import viewed_scene
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import write_cameras
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.scene.geometry import look_at
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import write_json
+
+N = 203  # no multiple of 8
+
+VIEW = [0.0, 1.0, -9.0, 0.0, 0.0, 0.0, 40.0, 1.5]
+
+
+def bits(rows: np.ndarray) -> str:
+    return base64.b64encode(np.packbits(rows, bitorder="little").tobytes()).decode()
+
+
+@pytest.fixture(params=[False, True], ids=["file", "cameras"])
+def scene(request, tmp_path):
+    """A scene file; with cameras, in the folder of `make`, tilted and large: the page turns it."""
+    box = torch.tensor([[-40.0, -40.0, -40.0], [40.0, 40.0, 40.0]])
+    gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
+    gaussians = replace(gaussians, log_scales=gaussians.log_scales + 2.0)
+    file = tmp_path / "made" / "tour.ply"
+    file.parent.mkdir()
+    write_gaussians(file, gaussians)
+    if request.param:
+        trained = OutputFolder(file.parent / "scene")
+        trained.scene_path(1).parent.mkdir(parents=True)
+        write_gaussians(trained.scene_path(1), gaussians)
+        write_json(file.parent / "make.json", {"file": "tour.ply", "title": "The tour"})
+        up = torch.tensor([1.0, -1.0, 0.2], dtype=torch.float64)
+        eyes = torch.tensor([[0.0, 0.0, -200.0], [60.0, 5.0, -190.0]], dtype=torch.float64)
+        poses = [look_at(eye, torch.zeros(3, dtype=torch.float64), up) for eye in eyes]
+        cameras = [Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose) for pose in poses]
+        write_cameras(trained.path / "cameras.json", zip("ab", cameras, strict=True))
+    publish(file, tmp_path / "site")
+    return file
+
+
+def test_what_is_removed_in_the_page_is_removed_in_the_scene(scene, tmp_path):
+    before = scene.read_bytes()
+    gone = np.random.default_rng(1).random(N) < 0.4
+    shown = read_sog(tmp_path / "site" / "scene.sog")
+    target = edit(scene, tmp_path / "site", PageEdit(N, bits(gone)))
+    assert (target.name, scene.read_bytes()) == ("tour_edited.ply", before)
+    publish(target, tmp_path / "after")
+    after = read_sog(tmp_path / "after" / "scene.sog")
+    # The opacities, in the order of a line through the page, tell which ones are left.
+    assert len(after.means) == N - gone.sum()
+    expected = np.sort(shown.opacity_logits[~gone])
+    assert np.allclose(np.sort(after.opacity_logits), expected)
+    # Bits of the file: rows of the other file, in their order.
+    whole, kept = read_gaussians(scene), read_gaussians(target)
+    rows = [int((whole.means == mean).all(1).nonzero()[0]) for mean in kept.means]
+    assert rows == sorted(rows)
+    for name, tensor in kept.parameters().items():
+        assert torch.equal(tensor, whole.parameters()[name][rows])
+
+
+def test_scale_view_and_title(scene, tmp_path):
+    first = PageEdit(N, bits(np.arange(N) < 1), 2.0, "New", VIEW)
+    target = edit(scene, tmp_path / "site", first)
+    record = read_record(target)
+    assert (record.removed, record.scale, record.title) == (1, 2.0, "New")
+    assert torch.allclose(
+        read_gaussians(target).means.norm(dim=1).max(),
+        2 * read_gaussians(scene).means.norm(dim=1).max(),
+    )
+    if load_viewable(scene).cameras:
+        seen, before = load_viewable(target).cameras[1], load_viewable(scene).cameras[1]
+        assert torch.allclose(seen.position, 2 * before.position)
+    # The page of the edited scene begins with the view, at the same place in the scene.
+    publish(target, tmp_path / "again")
+    with viewed_scene(target) as viewed:
+        page = viewed.files[""].content.decode()
+    assert '"title": "New"' in page
+    assert '"chosen": true' in page
+    # Another edit goes on from there: sizes and numbers add up, the view stays.
+    rest = N - 1
+    again = edit(target, tmp_path / "again", PageEdit(rest, bits(np.arange(rest) < 5), 0.5))
+    assert again == target
+    second = read_record(target)
+    assert (second.removed, second.scale, second.title) == (6, 1.0, "New")
+    assert np.allclose(second.start[:6], 0.5 * np.array(record.start[:6]))
+    assert shown_file(scene) == target
+    assert undo_edits(target) == scene
+    assert shown_file(scene) == scene
+    assert [each.name for each in scene.parent.glob("tour*")] == ["tour.ply"]
+
+
+def test_the_page_is_that_of_the_scene(scene, tmp_path):
+    site = tmp_path / "site"
+    moved = read_gaussians(scene)
+    moved.means[7] += 3.0
+    write_gaussians(scene, moved)
+    with pytest.raises(OtherScene):
+        edit(scene, site, PageEdit(N, bits(np.arange(N) < 1)))
+    publish(scene, site, overwrite=True)
+    with pytest.raises(OtherScene, match="page"):
+        edit(scene, site, PageEdit(N - 1, bits(np.arange(N - 1) < 1)))
+    with pytest.raises(UserError, match="nothing would be left"):
+        edit(scene, site, PageEdit(N, bits(np.ones(N, bool))))
+    with pytest.raises(UserError, match="not edited"):
+        undo_edits(scene)
+    assert not list(scene.parent.glob("*_edited*"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({"removed": "AAAA"}, "24 bits are not those of 203"),
+        ({"removed": "?"}, "base64"),
+        ({"count": 0, "removed": ""}, "bits"),
+        ({"scale": 0.0}, "not positive"),
+        ({"scale": 1e300}, "times as large"),
+        ({"start": [0.0] * 8}, "view"),
+        ({"start": [1.0]}, "view"),
+    ],
+)
+def test_impossible_changes(wrong, why):
+    with pytest.raises(ValueError, match=why):
+        PageEdit(**{"count": N, "removed": bits(np.zeros(N, bool)), **wrong})

@@ -1,0 +1,227 @@
+"""Editing in the page of a finished scene: what is selected, and what the studio stores."""
+
+import base64
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats.sog import read_sog
+from snowsplat.pipeline.publish import publish
+from snowsplat.scene.gaussians import Gaussians
+from snowsplat.studio.library import Scene
+
+from ..browser import Browser, Page
+
+N = 301
+
+
+@pytest.fixture
+def finished(library) -> Scene:
+    """A scene of Gaussians in a flat box, as a job leaves it."""
+    scene = library.new("Box", [])
+    box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
+    gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
+    file = scene.made / "box.ply"
+    file.parent.mkdir()
+    write_gaussians(file, gaussians)
+    publish(file, scene.site)
+    scene.change(quality="draft")
+    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": []}
+    result = {"file": file.name, "aligned": False, "reports": {}, **facts}
+    scene.write_state({"outcome": "done", "result": result})
+    return scene
+
+
+def edit_of(removed: np.ndarray, **more) -> dict:
+    bits = np.packbits(removed, bitorder="little").tobytes()
+    return {"count": len(removed), "removed": base64.b64encode(bits).decode(), **more}
+
+
+def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
+    address = f"scenes/{finished.name}"
+    original = (finished.made / "box.ply").read_bytes()
+    changes = edit_of(np.arange(N) < 20, title=" Half\n a box ", scale=2.0)
+    assert studio.ask(f"{address}/edit", "POST", changes) == (200, {"file": "box_edited.ply"})
+    about = studio.ask(address)[1]
+    assert (about["title"], about["edited"] > 0) == ("Half a box", True)
+    assert about["state"]["result"]["gaussians"] == N - 20
+    assert "box_edited.ply" in about["exports"]["spz"]
+    assert "box_edited.ply" in about["exports"]["zip"]
+    assert studio.ask(f"{address}/exports/ply", "POST", {})[0] == 200
+    assert len(read_gaussians(finished.exports / "Half a box.ply")) == N - 20
+    assert (finished.made / "box.ply").read_bytes() == original
+    assert studio.ask(f"{address}/edit", "DELETE") == (200, {"file": "box.ply"})
+    about = studio.ask(address)[1]
+    assert (about["edited"], about["state"]["result"]["gaussians"]) == (0, N)
+    assert len(read_sog(finished.site / "scene.sog").means) == N
+    assert not finished.exports.exists()  # they were those of the edited scene
+    assert studio.ask(f"{address}/edit", "DELETE")[0] == 400
+
+
+def test_hostile_changes(studio, finished):
+    address = f"scenes/{finished.name}/edit"
+    nothing = np.zeros(N, bool)
+    bad = [
+        {},
+        edit_of(nothing[:-8]) | {"count": N},
+        edit_of(nothing) | {"count": 10**18},
+        edit_of(nothing) | {"count": True},
+        edit_of(nothing) | {"removed": "é" * 52},
+        edit_of(nothing) | {"removed": None},
+        edit_of(nothing, scale="2"),
+        edit_of(nothing, scale=-1),
+        edit_of(nothing, start=[1, 2, 3]),
+        edit_of(nothing, title=7),
+        edit_of(nothing, path="../../x"),
+    ]
+    for body in bad:
+        status, answer = studio.ask(address, "POST", body)
+        assert (status, "\n" in answer["error"]) == (400, False), body
+    text = json.dumps(edit_of(nothing, scale=1.0)).replace("1.0", "1e999")
+    assert studio.ask(address, "POST", text)[0] == 400
+    assert studio.ask(address, "POST", b"[" * 100_000)[0] == 400
+    assert studio.ask(address, "POST", b"\xff")[0] == 400
+    # The number of another page, and all of it, are only known where the scene is read.
+    assert studio.ask(address, "POST", edit_of(nothing[:-1]))[0] == 400
+    assert studio.ask(address, "POST", edit_of(~nothing))[0] == 400
+    assert [file.name for file in finished.made.iterdir()] == ["box.ply"]
+
+
+def test_a_site_has_no_tools_but_its_page_in_the_studio_has(studio, finished):
+    page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
+    assert '<script type="module" src="../../../edit.js" data-edited="false">' in page
+    assert "edit.js" not in (finished.site / "index.html").read_text("utf-8")
+    # The tools are for the page that is one file.
+    (finished.site / "scene.sog").unlink()
+    assert b"edit.js" not in studio.ask(f"scenes/{finished.name}/site/index.html")[1]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+def test_undo_returns_the_same_bytes():
+    random = np.random.default_rng(0)
+    count = 77
+    found = [random.integers(0, 2, count).tolist() for _ in range(3)]
+    calls = [
+        ["select", found[0], "replace"],
+        ["select", found[1], "add"],
+        ["delete"],
+        ["select", found[2], "replace"],
+        ["invert"],
+        ["select", found[0], "remove"],
+        *[["undo"]] * 6,
+        *[["redo"]] * 6,
+        ["undo"],
+        ["select", found[0], "remove"],  # the same as before: the future is another one
+        ["redo"],
+    ]
+    centers = random.normal(size=(count, 3))
+    matrix = random.normal(size=(4, 4))
+    shape = random.integers(0, 2, (6, 8))
+    box = [[-0.5, -1.0, -0.2], [1.0, 0.4, 2.0]]
+    asked = {
+        "count": count,
+        "calls": calls,
+        "centers": centers.reshape(-1).tolist(),
+        "matrix": matrix.T.reshape(-1).tolist(),
+        "shape": shape.reshape(-1).tolist(),
+        "width": 8,
+        "height": 6,
+        "box": box,
+    }
+    script = Path(__file__).parents[1] / "node" / "selection.mjs"
+    answer = json.loads(
+        subprocess.run(
+            ["node", script], input=json.dumps(asked), capture_output=True, text=True, check=True
+        ).stdout
+    )
+    states = answer["states"]
+    a, b, c = (np.array(each) for each in found)
+    deleted = a | b
+    assert states[0] == a.tolist()
+    assert states[1] == deleted.tolist()
+    assert states[2] == (2 * deleted).tolist()
+    assert states[3] == np.where(deleted, 2, c).tolist()
+    assert states[4] == np.where(deleted, 2, 1 - c).tolist()
+    assert states[5] == np.where(deleted, 2, (1 - c) & (1 - a)).tolist() == states[4]
+    # The last call changed nothing: it is no step. So the sixth undo has nothing left.
+    assert states[6:12] == [*states[3::-1], [0] * count, [0] * count]
+    assert states[12:18] == [*states[:5], states[4]]
+    assert states[18:] == [states[3], states[3], states[4]]
+    bits = np.frombuffer(base64.b64decode(answer["deleted"]), np.uint8)
+    assert np.unpackbits(bits, bitorder="little")[:count].tolist() == deleted.tolist()
+    clip = np.float32(centers) @ matrix[:, :3].T + matrix[:, 3]
+    column, row = (clip[:, 0] / clip[:, 3] + 1) * 4, (1 - clip[:, 1] / clip[:, 3]) * 3
+    inside = (clip[:, 3] > 0) & (column >= 0) & (column < 8) & (row >= 0) & (row < 6)
+    expected = [
+        int(i and shape[int(r), int(c)]) for i, r, c in zip(inside, row, column, strict=True)
+    ]
+    assert answer["found"] == expected
+    beyond = (np.float32(centers) < box[0]) | (np.float32(centers) > box[1])
+    assert answer["outside"] == beyond.any(1).astype(int).tolist()
+
+
+def press(page: Page, text: str) -> None:
+    page.evaluate(
+        f"[...document.querySelectorAll('.snow-panel button')]"
+        f".find(each => each.textContent === {text!r}).click()"
+    )
+
+
+def counts(page: Page) -> str:
+    return page.evaluate("document.querySelector('.snow-edit > p').textContent")
+
+
+@pytest.mark.browser
+def test_lasso_delete_undo_delete_save(studio, finished):
+    """The saved file has exactly the others."""
+    address = f"{studio.server.url}scenes/{finished.name}/site/index.html"
+    with Browser(900, 600, frames=4.0) as browser:
+        page = browser.open(address, timeout=60)
+        page.wait_for("!!document.querySelector('.snow-edit')", 120)
+        before = page.screenshot()
+        press(page, "Edit")
+        press(page, "Lasso")
+        page._mouse("mousePressed", 500, 100, button="left", clickCount=1)
+        for x, y in ((890, 100), (890, 590), (500, 590)):
+            page._mouse("mouseMoved", x, y, button="left", buttons=1)
+        page._mouse("mouseReleased", 500, 590, button="left", clickCount=1)
+        page.wait_for("!document.querySelector('.snow-edit > p').textContent.startsWith('0 ')")
+        selected = int(counts(page).split()[0])
+        assert 20 < selected < N - 20
+        press(page, "Delete")
+        assert counts(page) == f"0 selected, {selected} deleted"
+        for kind in ("rawKeyDown", "keyUp"):
+            page.call("Input.dispatchKeyEvent", type=kind, key="z", code="KeyZ", modifiers=2)
+        assert counts(page) == f"{selected} selected, 0 deleted"
+        for kind in ("rawKeyDown", "keyUp"):
+            page.call("Input.dispatchKeyEvent", type=kind, key="Delete", code="Delete")
+        assert counts(page) == f"0 selected, {selected} deleted"
+        press(page, "Start with this view")
+        page.evaluate("window.old = true")
+        press(page, "Save")
+        page.wait_for("!window.old && !!document.querySelector('.snow-edit')", 180)
+        press(page, "Edit")
+        assert "Back to the original" in page.evaluate(
+            "document.querySelector('.snow-edit').textContent"
+        )
+        after = page.screenshot()
+        assert not page.errors
+    # What was in the lasso is gone; from the same place, the rest looks as before.
+    right, left = np.s_[200:450, 580:670], np.s_[370:430, 150:400]
+    assert before[right].mean() > 5 * after[right].mean()
+    difference = np.abs(before[left].astype(float) - after[left])
+    assert difference.mean() < 2 < before[left].mean()
+    whole, kept = read_gaussians(finished.made / "box.ply"), read_gaussians(finished.scene_file())
+    assert len(kept) == N - selected
+    rows = [int((whole.means == mean).all(1).nonzero()[0]) for mean in kept.means]
+    gone = torch.ones(N, dtype=torch.bool)
+    gone[rows] = False
+    # The right side of the page: the centres of those that are gone are all on one side.
+    x = whole.means[:, 0]
+    assert x[gone].min() > x[~gone].max() - 0.05 or x[gone].max() < x[~gone].min() + 0.05
