@@ -28,7 +28,7 @@ from snowsplat.util.stages import Stages
 from ..fork_server import popen
 from ..sfm.colmap import scenes
 
-#: With few passes, there are up to twice as many steps.
+#: With few passes, there are up to 75% more steps.
 QUICK = replace(PRESETS["draft"], iterations=120)
 #: The command as a separate process, with the same short training and frequent checkpoints.
 PROGRAM = """
@@ -73,12 +73,12 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     assert result.code == 0, result.err
     out = tmp_path / "Häuser am See_scene"
     scene = out / "Häuser am See.ply"
-    original = out / "scene/point_cloud/iteration_120/point_cloud.ply"
+    original = out / "scene/point_cloud/iteration_105/point_cloud.ply"
     assert scene.read_bytes() == original.read_bytes()
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert metrics["psnr"] > 12
     assert list(metrics["views"]) == [sorted(path.name for path in photos.iterdir())[4]]
-    made = files(out / "scene/test/ours_120")
+    made = files(out / "scene/test/ours_105")
     assert made == {f"{kind}/{i:05d}.png" for kind in ("renders", "gt") for i in range(1)}
     assert (out / "dataset/dataset_report.html").is_file()
     assert not (out / "scene/checkpoints").exists()
@@ -88,7 +88,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
 
     facts = json.loads(run("info", out, "--json").out)
     assert facts["kind"] == "output folder"
-    assert facts["scenes"] == [120]
+    assert facts["scenes"] == [105]
     assert facts["last_scene"]["file"] == str(scene)
 
     # The same command again: all stages are skipped.
@@ -104,7 +104,7 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     again = run(*command)
     assert "pictures: repeated (its files are missing)" in again.out
     assert state(out).keys() == before.keys()
-    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_120/point_cloud.ply"]
+    assert original.stat().st_mtime_ns == before["scene/point_cloud/iteration_105/point_cloud.ply"]
 
     # Another training setting: the cameras are kept.
     monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=20))
@@ -112,8 +112,8 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     assert again.code == 0, again.err
     assert "scene: repeated (changed: iterations)" in again.out
     assert again.out.count("done before") == 4
-    assert (out / "scene/test/ours_40").is_dir()
-    assert not (out / "scene/test/ours_120").exists()
+    assert (out / "scene/test/ours_35").is_dir()
+    assert not (out / "scene/test/ours_105").exists()
 
     # Other photos: the existing output is not replaced.
     fewer = tmp_path / "fewer"
@@ -149,7 +149,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     monkeypatch.setattr(all_photos, "SHARE", 0.01)  # fewer than two steps for each photo
     assert "no last part with the held-out photos: it would use each" in run(*command).out
     before = (out / f"{dataset.name}.ply").read_bytes()
-    evaluated = OutputFolder(out / "scene").scene_path(80)
+    evaluated = OutputFolder(out / "scene").scene_path(70)
     assert before == evaluated.read_bytes()
 
     monkeypatch.setattr(all_photos, "SHARE", 1.0)
@@ -157,7 +157,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     result = run(*command, "--title", "A <title>")
     assert result.code == 0, result.err
     views = len(list((dataset / "images").iterdir()))
-    assert f"80 more steps with all {views} photos" in result.out
+    assert f"70 more steps with all {views} photos" in result.out
     assert f"before the last part, which has used all {views} photos" in result.out
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert f"PSNR {metrics['psnr']:.2f} dB" in result.out

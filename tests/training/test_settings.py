@@ -428,7 +428,7 @@ def test_few_passes_have_more_steps_with_small_images():
     assert config.lengthened(50) == config
     assert config.staged(50) == replace(config, few_passes=0.0)
     many = config.lengthened(300)
-    assert many.iterations == 4000
+    assert many.iterations == 3500
     staged = many.staged(300)
     assert staged.coarse_to_fine == pytest.approx((0.2, 0.5))
     assert staged.staged(1000) == staged  # it is final

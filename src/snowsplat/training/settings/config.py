@@ -24,7 +24,7 @@ _SEED_LIMIT = 2**61
 
 #: What is added to the two moments of `TrainConfig.coarse_to_fine` if each photo is used a few
 #: times only, and the share of further steps.
-_COARSER, _LONGER = (0.05, 0.1), 1.0
+_COARSER, _LONGER = (0.05, 0.1), 0.75
 
 
 @dataclass(frozen=True)
