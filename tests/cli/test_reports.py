@@ -12,7 +12,7 @@ from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand
 from snowsplat.evaluation.metrics import Evaluation
 
 #: They serve pages, or run others of these commands.
-WITHOUT = {"view", "watch", "demo", "blocks"}
+WITHOUT = {"studio", "view", "watch", "demo", "blocks"}
 
 
 @pytest.fixture(scope="module")

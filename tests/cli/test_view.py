@@ -80,7 +80,7 @@ def served(run, monkeypatch):
         opened, sites, done = [], [], threading.Event()
         site = viewing.site
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
-        monkeypatch.setattr(viewing, "site", lambda *a: (sites.append(a), site(*a))[1])
+        monkeypatch.setattr(viewing, "site", lambda *a, **k: (sites.append(a), site(*a, **k))[1])
         monkeypatch.setattr(view, "wait", lambda: done.wait(0.3))
         result = run("view", *arguments)
         assert result.code == 0, result.err
