@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.page_flags import AllowHost, for_other_computers, has_screen
-from snowsplat.cli.view import open_browser, wait
+from snowsplat.cli.page_flags import AllowHost
+from snowsplat.cli.view import serve
 from snowsplat.viewer.hosts import ANY_HOST, is_loopback
 
 
@@ -66,10 +66,5 @@ class Studio:
         ):
             servers.append(server)
             print(f"scenes are kept in {library.folder}")
-            print(f"open this in a browser, Ctrl-C ends it: {server.url}", flush=True)
-            for line in for_other_computers(server.url, server.others):
-                print(line, flush=True)
-            if not self.no_browser and has_screen():
-                open_browser(server.url)
-            wait()
+            serve(server, browser=not self.no_browser)
         return 0

@@ -8,7 +8,7 @@ import webbrowser
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -16,6 +16,9 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import AllowHost, for_other_computers, has_screen
 from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.viewer.http.server import WebServer
 
 
 @dataclass
@@ -69,13 +72,19 @@ class View:
         ):
             site = scene.gaussians is None
             print(f"{scene.file}: {'a web site' if site else f'{scene.gaussians:,} Gaussians'}")
-            print(f"open this in a browser, Ctrl-C ends it: {server.url}", flush=True)
-            for line in for_other_computers(server.url, server.others):
-                print(line, flush=True)
-            if not self.no_browser and has_screen():
-                open_browser(server.url)
-            wait()
+            serve(server, browser=not self.no_browser)
         return 0
+
+
+def serve(server: WebServer, browser: bool) -> None:
+    """Print the addresses of a page, open it if there is a ``browser`` and a screen, and wait for
+    Ctrl-C."""
+    print(f"open this in a browser, Ctrl-C ends it: {server.url}", flush=True)
+    for line in for_other_computers(server.url, server.others):
+        print(line, flush=True)
+    if browser and has_screen():
+        open_browser(server.url)
+    wait()
 
 
 def open_browser(url: str) -> None:

@@ -200,7 +200,21 @@ class _Deadline:
         self._timer = None if seconds is None else loop.call_later(seconds, self._transport.abort)
 
 
-class HttpConnection(H11Protocol):
+class _SendLimit(asyncio.Protocol):
+    """Closes a connection whose client does not receive what is sent to it."""
+
+    _sending: _Deadline
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._sending.set(_SEND_SECONDS)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._sending.set(None)
+
+
+class HttpConnection(_SendLimit, H11Protocol):
     """A connection that hands on a request when its head is complete and valid."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
@@ -226,14 +240,6 @@ class HttpConnection(H11Protocol):
         self._sending.set(None)
         self._guard.disconnected(self.transport)
         super().connection_lost(exc)
-
-    def pause_writing(self) -> None:
-        super().pause_writing()
-        self._sending.set(_SEND_SECONDS)
-
-    def resume_writing(self) -> None:
-        super().resume_writing()
-        self._sending.set(None)
 
     def data_received(self, data: bytes) -> None:
         is_first = not self._received
@@ -319,7 +325,7 @@ class HttpConnection(H11Protocol):
         self.transport.close()
 
 
-class WebSocketConnection(WebSocketsSansIOProtocol):
+class WebSocketConnection(_SendLimit, WebSocketsSansIOProtocol):
     """A WebSocket that is closed if it exceeds the limits."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
@@ -342,14 +348,6 @@ class WebSocketConnection(WebSocketsSansIOProtocol):
         self._sending.set(None)
         self._guard.disconnected(self.transport)
         super().connection_lost(exc)
-
-    def pause_writing(self) -> None:
-        super().pause_writing()
-        self._sending.set(_SEND_SECONDS)
-
-    def resume_writing(self) -> None:
-        super().resume_writing()
-        self._sending.set(None)
 
     def data_received(self, data: bytes) -> None:
         for start in range(0, len(data), _PIECE):  # so that little is processed before a rejection
