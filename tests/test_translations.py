@@ -125,7 +125,7 @@ def test_code_and_formulas_of_every_chinese_page_are_those_of_the_english_page(t
 
 
 def test_chinese_pages_link_to_chinese_pages_where_there_are_some(translations):
-    pages = {english: chinese for english, chinese in translations.pairs(ROOT / "docs")}
+    pages = dict(translations.pairs(ROOT / "docs"))
     own = [ROOT / "docs" / "zh" / name for name in translations.OWN]
     for page in [*pages.values(), *own]:
         text = FENCE.sub("", page.read_text(encoding="utf-8"))

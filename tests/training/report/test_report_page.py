@@ -51,7 +51,7 @@ def trained(tmp_path_factory) -> dict[str, Any]:
 
 
 def words(page: Path) -> str:
-    return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
+    return " ".join("".join(ET.parse(page).getroot().find("body/main").itertext()).split())
 
 
 def test_the_page_is_well_formed_and_self_contained(trained, tmp_path):
