@@ -121,10 +121,7 @@ def test_a_browser_in_chinese_shows_chinese_except_for_names_commands_and_other_
         "photos",
     ]
     with Browser() as browser:
-        page = browser.open("about:blank")
-        agent = page.evaluate("navigator.userAgent")
-        page.call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage="zh-CN")
-        page.navigate(path.as_uri())
+        page = browser.open(path.as_uri(), language="zh-CN")
         assert page.evaluate(shown) == chinese
         assert page.evaluate("document.documentElement.lang") == "zh-CN"
         page.evaluate("document.querySelector('.language').click()")

@@ -204,10 +204,7 @@ def test_what_photos_show_beside_a_photo():
 @pytest.mark.browser
 def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
     with Browser(600, 400, 0.25, frames=5.0) as browser:
-        page = browser.open("about:blank")
-        agent = page.evaluate("navigator.userAgent")
-        page.call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage="zh-CN")
-        page.navigate(f"{file.as_uri()}?webgl")
+        page = browser.open(f"{file.as_uri()}?webgl", language="zh-CN")
         page.wait_for("!!document.querySelector('.snow-panel')", 60)
         click(page, "照片")
         click(page, "清理")
