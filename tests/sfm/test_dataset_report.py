@@ -251,4 +251,5 @@ def test_headings_and_labels_are_chinese_in_a_browser_in_chinese(dataset):
         assert not page.errors
     left = re.sub(r"PSNR|SSIM|RMS|dB|ms", "", " ".join(labels))
     assert len(labels) > 20
+    assert {"镜头", "个镜头"} <= set(labels)  # "Lenses", a heading, and "lens", after a number
     assert not re.findall("[A-Za-z]{3,}", left)

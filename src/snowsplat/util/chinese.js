@@ -277,7 +277,9 @@
         const pattern = english.replace(/\{\}|[#.*+?^$()|[\]\\]/g, (found) => parts[found] ?? '\\' + found);
         return [new RegExp(`^${pattern}$`, 'i'), chinese];
     });
+    // A clause may begin with a capital letter; a text of the table in this spelling has priority.
     const translated = (text) => {
+        if (Object.hasOwn(TEXTS, text)) return TEXTS[text];
         for (const [rule, chinese] of rules) {
             const found = rule.exec(text);
             if (found) return chinese.replace(/\{(\d)\}/g, (_, part) => translated(found[1 + Number(part)]));
