@@ -39,7 +39,7 @@ const CHINESE = {
     'Scene': '场景',
     'Gaussians': '个高斯',
 };
-const say = (english) => (navigator.language.toLowerCase().startsWith('zh') ? CHINESE[english] : english);
+const say = (english) => (navigator.language.toLowerCase().startsWith('zh') ? CHINESE[english] ?? english : english);
 
 const element = (name, properties, ...children) => {
     const made = Object.assign(document.createElement(name), properties);
