@@ -94,17 +94,15 @@ def test_a_page_without_an_english_page_is_a_problem(translations, docs):
 FENCE = re.compile(r"^```(.*)\n((?:.*\n)*?)```$", re.MULTILINE)
 
 
-def blocks(text: str) -> list[tuple[str, str]]:
-    """Code, includes and figures: their first lines, and their contents except for captions."""
-    found = []
-    for first, content in FENCE.findall(re.sub(r"(\.\./)+", "", text)):
-        found.append((first, "" if first.startswith("{drawing}") else content))
-    return found
+def blocks(text: str) -> tuple[list[tuple[str, str]], list[str]]:
+    """Code with its first line, and the images."""
+    text = re.sub(r"(\.\./)+(learn/)?", "", text)
+    return FENCE.findall(text), re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
 
 
 def formulas(text: str) -> tuple[list[str], set[str]]:
-    """The formulas in their own lines, in order, and those within text and captions."""
-    text = FENCE.sub(lambda block: block[2] if block[1].startswith("{drawing}") else "", text)
+    """The formulas in their own lines, in order, and those within text."""
+    text = FENCE.sub("", text)
     text = re.sub(r"`[^`\n]+`", "", text)
     text = re.sub(r"\\text\{[^}]*\}", "", text)  # words in a formula
     display = re.compile(r"^\$\$\n(.*?)\n\$\$$", re.MULTILINE | re.DOTALL)
