@@ -34,6 +34,7 @@ mathjax_path = "mathjax/tex-svg.js"
 mathjax3_config = {"svg": {"fontCache": "global"}, "options": {"enableMenu": False}}
 smartquotes = False  # would change the hyphens of flags
 myst_heading_anchors = 4
+myst_fence_as_directive = ["math"]
 myst_enable_extensions = ["dollarmath"]
 html_theme = "furo"
 html_title = f"snowsplat {release}"

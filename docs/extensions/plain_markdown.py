@@ -68,7 +68,9 @@ class Names(SphinxTransform):
     def apply(self, **kwargs: Any) -> None:
         for code in list(self.document.findall(nodes.literal)):
             name = code.astext()
-            if not _NAME.fullmatch(name) or isinstance(code.parent, (pending_xref, nodes.reference)):
+            if not _NAME.fullmatch(name) or isinstance(
+                code.parent, (pending_xref, nodes.reference)
+            ):
                 continue
             reference = pending_xref("", refdomain="py", reftype="obj", reftarget=name)
             reference["refdoc"] = self.env.docname

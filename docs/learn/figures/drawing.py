@@ -1,9 +1,9 @@
 """`Drawing`: a small SVG writer for the figures of the course.
 
-Each colour is an attribute, for light surroundings, and a class, which the style of the file changes
-in dark ones. The background has a colour, too: where only the page around the image is dark, the
-text remains readable. On the site, the figures are elements of the pages
-(`docs/extensions/plain_markdown.py`), and docs/static/site.css changes their colours with the theme.
+Each colour is an attribute, for light surroundings, and a class, which the style of the file
+changes in dark ones. The background has a colour, too: where only the page around the image is
+dark, the text remains readable. On the site, the figures are elements of the pages
+(`docs/extensions/plain_markdown.py`); docs/static/site.css changes their colours with the theme.
 
 Panels are at most 340 units wide. So they are shown at their full size on a phone, too.
 """
