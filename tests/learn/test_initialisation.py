@@ -1,4 +1,4 @@
-"""The formulas of docs/learn/initialisation.md and its study, and the code of experiments/basins."""
+"""The formulas of docs/learn/initialisation.md, its study, and experiments/basins."""
 
 from __future__ import annotations
 
