@@ -98,13 +98,16 @@ def slugs(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_links_of_the_course_lead_to_files_and_headings_of_the_repository():
-    for page in COURSE:
+def test_links_lead_to_files_and_headings_of_the_repository():
+    pages = sorted(DOCS.rglob("*.md"))
+    assert len(pages) > 100
+    for page in pages:
         text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
         for target, anchor in LINK.findall(text):
             file = (page.parent / target).resolve() if target else page
             assert file.exists(), f"{page}: {target}"
-            if anchor:
+            # Headings that a directive makes are on the site only.
+            if anchor and "```{" not in file.read_text(encoding="utf-8"):
                 assert anchor in slugs(file), f"{page}: {target}#{anchor}"
 
 
