@@ -81,7 +81,9 @@ def test_every_figure_is_a_described_image_in_both_languages():
     shown: dict[str, set[Path]] = {"learn": set(), "zh/learn": set()}
     for page in COURSE:
         for words, target in IMAGE.findall(page.read_text(encoding="utf-8")):
-            assert len(words) > 3, f"{page}: {target} has no description"
+            assert len(words) > 1, f"{page}: {target} has no description"
+            chinese = re.search(r"[\u4e00-\u9fff]", words) is not None
+            assert chinese == ("zh" in page.parts), f"{page}: {target}: {words}"
             file = (page.parent / target).resolve()
             assert file.exists(), f"{page}: {target}"
             shown[page.parent.relative_to(DOCS).as_posix()].add(file)
