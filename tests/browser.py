@@ -137,8 +137,11 @@ class Browser:
         os.close(self._commands)
         shutil.rmtree(self._profile, ignore_errors=True)
 
-    def open(self, url: str, timeout: float = 30.0) -> Page:
-        """Open a new tab that shows ``url``; waits until its document is loaded."""
+    def open(self, url: str, timeout: float = 30.0, language: str = "en-US") -> Page:
+        """Open a new tab that shows ``url``; waits until its document is loaded.
+
+        ``language``: what the page takes for the language of the browser.
+        """
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         page = self._pages[session] = Page(self, session, target)
@@ -154,6 +157,8 @@ class Browser:
         page.call(
             "Page.addScriptToEvaluateOnNewDocument", source=_SLOW_FRAMES % (1e3 / self.frames)
         )
+        agent = page.evaluate("navigator.userAgent")
+        page.call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage=language)
         page.navigate(url, timeout)
         return page
 

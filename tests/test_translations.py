@@ -121,3 +121,15 @@ def test_code_and_formulas_of_every_chinese_page_are_those_of_the_english_page(t
         translated = chinese.read_text(encoding="utf-8")
         assert blocks(translated) == blocks(original), chinese
         assert formulas(translated) == formulas(original), chinese
+
+
+def test_chinese_pages_link_to_chinese_pages_where_there_are_some(translations):
+    pages = dict(translations.pairs(ROOT / "docs"))
+    own = [ROOT / "docs" / "zh" / name for name in translations.OWN]
+    for page in [*pages.values(), *own]:
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        for link in re.findall(r"\]\(([^)#:]+\.md)", text):
+            target = (page.parent / link).resolve()
+            assert target.exists(), f"{page}: {link}"
+            if page.name != "README.zh-CN.md" or target.name != "README.md":
+                assert target not in pages, f"{page}: {link}: there is a Chinese page"

@@ -22,7 +22,22 @@ from sphinx.util import logging
 
 _DOCS = Path(__file__).resolve().parents[1]
 #: Pages of `docs/` that are translated, as patterns.
-TRANSLATED = ("installation.md", "quick-start.md", "guides/what-you-can-bring.md", "learn/*.md")
+TRANSLATED = (
+    "installation.md",
+    "quick-start.md",
+    "guides/gpu.md",
+    "guides/images-and-videos.md",
+    "guides/memory.md",
+    "guides/photos.md",
+    "guides/scene-files.md",
+    "guides/studio.md",
+    "guides/training.md",
+    "guides/troubleshooting.md",
+    "guides/video.md",
+    "guides/viewers.md",
+    "guides/what-you-can-bring.md",
+    "learn/*.md",
+)
 #: Pages of `docs/zh/` that are not translations.
 OWN = ("index.md", "glossary.md")
 _FIRST_LINE = re.compile(r"<!-- translation of (\S+) ([0-9a-f]{16}) -->\n")

@@ -73,7 +73,7 @@ def test_learnt_exposures_are_written(dataset, tmp_path):
     names = [view.name for view in load.load_dataset(dataset, hold_out=8).train]
     assert list(written["photos"]) == names
     assert abs(sum(red for red, _, _ in written["photos"].values())) < 1e-4
-    assert "Exposures of the photos" in (out / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Exposures of the photos" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_from_a_dataset_to_metrics_and_images_without_printing(dataset, tmp_path, capfd):

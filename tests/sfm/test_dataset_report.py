@@ -20,6 +20,8 @@ from snowsplat.sfm import dataset_report
 from snowsplat.sfm.dataset_report import write_report
 from snowsplat.sfm.photo_problems import DARK
 
+from ..browser import Browser
+
 NAMES = [
     "one.jpg",
     "sub/zwei ñandú 雪.jpg",
@@ -87,7 +89,7 @@ def facts(**sfm: Any) -> dict[str, Any]:
 
 
 def visible_text(page: Path) -> str:
-    return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
+    return " ".join("".join(ET.parse(page).getroot().find("body/main").itertext()).split())
 
 
 def test_page_is_well_formed_and_self_contained(dataset):
@@ -213,7 +215,7 @@ def test_long_lists_are_shortened_and_any_name_is_accepted(dataset):
 def test_level_north_and_scale_are_told(dataset):
     """In metres, the scale bars name the unit too."""
     before = write_report(dataset, facts()).read_text()
-    assert "Level, north" not in before
+    assert "<h2>Level, north" not in before
     assert " units</text>" in before
     placement = {
         "up_from": ["the <gimbal> angles of 18 photos"],
@@ -232,3 +234,22 @@ def test_level_north_and_scale_are_told(dataset):
     assert "GPS &amp; gimbal disagree" in after
     assert " units</text>" not in after
     assert re.search(r"[0-9] m</text>", after)
+
+
+@pytest.mark.browser
+def test_headings_and_labels_are_chinese_in_a_browser_in_chinese(dataset):
+    known = facts() | {"problems": {NAMES[0]: DARK}}
+    known["undistorted"]["placement"] = {
+        "up_from": ["the ground", "the accelerometers of 18 photos"],
+        "level_error": 0.7,
+    }
+    path = write_report(dataset, known)
+    shown = "[...document.querySelectorAll('h2, th, .card, summary')]"
+    with Browser() as browser:
+        page = browser.open(path.as_uri(), language="zh-CN")
+        labels = page.evaluate(f"{shown}.map(e => e.lastChild?.data ?? '')")
+        assert not page.errors
+    left = re.sub(r"PSNR|SSIM|RMS|dB|ms", "", " ".join(labels))
+    assert len(labels) > 20
+    assert {"镜头", "个镜头"} <= set(labels)  # "Lenses", a heading, and "lens", after a number
+    assert not re.findall("[A-Za-z]{3,}", left)

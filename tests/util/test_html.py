@@ -1,10 +1,14 @@
 """The parts of report pages: well-formed, escaped, self-contained."""
 
+import ast
+import re
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import pytest
 from PIL import Image
 
+import snowsplat
 from snowsplat.util import html
 from snowsplat.util.duration import duration
 
@@ -77,8 +81,8 @@ def test_pictures_open_large_by_click_and_key(tmp_path):
         assert not page.errors
 
 
-def test_a_page_without_pictures_has_no_script():
-    assert "<script" not in html.page("a page", ["<p>words</p>"])
+def test_a_page_without_pictures_has_no_script_for_them():
+    assert "showModal" not in html.page("a page", ["<p>words</p>"])
 
 
 @pytest.mark.parametrize(
@@ -87,3 +91,66 @@ def test_a_page_without_pictures_has_no_script():
 )
 def test_duration(seconds, words):
     assert duration(seconds) == words
+
+
+@pytest.mark.browser
+def test_a_browser_in_chinese_shows_chinese_except_for_names_commands_and_other_text(tmp_path):
+    parts = [
+        "<h1>photos</h1>",
+        "<p>No photo is blurred, too dark or too bright.</p>",
+        "<p>A sentence. Evaluated on 5 photos of 800x600 that were not used for training.</p>",
+        "<ul><li>Also: 3 of 40 photos could not be placed</li><li>something else</li></ul>",
+        html.table(["photo", "reason"], [["good.jpg", "it matches no other photo"]]),
+        html.table(
+            [], [["level", "from the ground and the compasses of 1,234 photos, to about 2°"]]
+        ),
+        "<pre>photos</pre>",
+    ]
+    path = tmp_path / "page.html"
+    path.write_text(html.page("a page", parts), encoding="utf-8")
+    shown = "document.querySelector('main').innerText.split(/\\s*[\\n\\t]\\s*/)"
+    chinese = [
+        "photos",
+        "没有模糊、太暗或太亮的照片。",
+        "A sentence. 在没有参加训练的 5 张照片（800x600）上评估。",
+        "另外：40 张照片中有 3 张无法求出位姿",
+        "something else",
+        *("照片", "原因"),
+        *("good.jpg", "它与其他照片都不匹配"),
+        *("水平", "由地面和 1,234 张照片的罗盘求出，误差约 2°"),
+        "photos",
+    ]
+    with Browser() as browser:
+        page = browser.open(path.as_uri(), language="zh-CN")
+        assert page.evaluate(shown) == chinese
+        assert page.evaluate("document.documentElement.lang") == "zh-CN"
+        page.evaluate("document.querySelector('.language').click()")
+        assert page.evaluate(shown)[2].endswith(
+            "Evaluated on 5 photos of 800x600 that were not used for training."
+        )
+        assert page.evaluate("document.documentElement.lang") == "en"
+        assert not page.errors
+
+
+def strings(file: Path) -> list[str]:
+    """All strings of a module; what an f-string inserts is a line break."""
+
+    def value(node: ast.AST) -> str:
+        if isinstance(node, ast.JoinedStr):
+            return "".join(map(value, node.values))
+        return node.value if isinstance(node, ast.Constant) else "\n"
+
+    nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+    return [text for node in nodes if isinstance(text := value(node), str)]
+
+
+def test_every_text_with_a_translation_exists():
+    """A changed text would be shown in English. Single words are not looked for."""
+    source = Path(snowsplat.__file__).parent
+    known = "\n".join(text for file in source.rglob("*.py") for text in strings(file)).lower()
+    script = (source / "util" / "chinese.js").read_text(encoding="utf-8")
+    translated = re.findall(r"^ {8}'(.*?)':", script, re.MULTILINE)
+    assert len(translated) > 100
+    for text in translated:
+        for words in re.split(r"[#{}%°(),.;:/]", text.lower()):
+            assert " " not in words.strip() or words.strip() in known, text

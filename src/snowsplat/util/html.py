@@ -10,6 +10,7 @@ import base64
 import io
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 
 from PIL import Image
 
@@ -43,6 +44,8 @@ pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px
 .bar { display: inline-block; width: calc(var(--share) * min(35vw, 400px)); height: .7em;
   border-radius: 2px; background: var(--accent); }
 summary { cursor: pointer; color: var(--soft); } ol { margin: 6px 0; padding-left: 1.4em; }
+.language { position: absolute; top: 8px; right: 12px; font: inherit; font-size: .85rem;
+  color: var(--soft); background: none; border: 0; cursor: pointer; }
 .wide { overflow-x: auto; } [role="button"] { cursor: zoom-in; }
 dialog { max-width: none; max-height: none; border: 0; padding: 0; background: none; color: #fff;
   text-align: center; cursor: zoom-out; } dialog::backdrop { background: #000d; }
@@ -55,7 +58,7 @@ dialog img { display: block; width: 96vw; height: calc(96vh - 3em); object-fit: 
 # Each picture is a button that opens it as large as it is stored; Escape or a click closes it, and
 # the arrow keys show the next one. Without scripts, the pictures remain small. The script is part
 # of a well-formed document, so it contains neither "<" nor "&".
-_LARGE = """<script>
+_LARGE = """
 const pictures = [...document.querySelectorAll('main img')];
 const dialog = document.body.appendChild(document.createElement('dialog'));
 const large = dialog.appendChild(new Image());
@@ -82,7 +85,6 @@ dialog.onkeydown = (event) => {
   const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
   if (by) show(shown + by);
 };
-</script>
 """
 
 
@@ -95,12 +97,13 @@ def page(title: str, html: Iterable[str], style: str = "") -> str:
         style: additional CSS.
     """
     body = "\n".join(filter(None, html))
-    script = _LARGE if "<img " in body else ""
+    chinese = Path(__file__).with_name("chinese.js").read_text(encoding="utf-8")
+    script = (_LARGE if "<img " in body else "") + chinese
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
         f"<title>{text(title)}</title><style>{_STYLE}{style}</style></head>\n"
-        f"<body><main>\n{body}\n</main>{script}</body></html>\n"
+        f"<body><main>\n{body}\n</main><script>{script}</script></body></html>\n"
     )
 
 

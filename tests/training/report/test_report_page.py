@@ -15,6 +15,8 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.settings.config import TrainConfig
 
+from ...browser import Browser
+
 pytestmark = pytest.mark.slow  # trains
 
 NAME = "mon <château>"
@@ -51,7 +53,7 @@ def trained(tmp_path_factory) -> dict[str, Any]:
 
 
 def words(page: Path) -> str:
-    return " ".join("".join(ET.parse(page).getroot().find("body").itertext()).split())
+    return " ".join("".join(ET.parse(page).getroot().find("body/main").itertext()).split())
 
 
 def test_the_page_is_well_formed_and_self_contained(trained, tmp_path):
@@ -169,3 +171,17 @@ def test_the_next_run_removes_temporary_files_of_a_kill(tmp_path):
         (out / f".{name}.ab12cd_9.tmp").write_text("half")
     assert main(["train", "-o", str(out), "--resume", "-q", "--iterations", "20"]) == 0
     assert not list(out.rglob("*.tmp"))
+
+
+@pytest.mark.browser
+def test_headings_and_labels_are_chinese_in_a_browser_in_chinese(trained, tmp_path):
+    path = tmp_path / "report.html"
+    write_training_report(path, Trained(**trained, exposures=(0.5, -1.0, 0.5)))
+    shown = "[...document.querySelectorAll('h2, th, .card, summary')]"
+    with Browser() as browser:
+        page = browser.open(path.as_uri(), language="zh-CN")
+        labels = page.evaluate(f"{shown}.map(e => e.lastChild?.data ?? '')")
+        assert not page.errors
+    left = re.sub(r"PSNR|SSIM|RMS|dB|ms", "", " ".join(labels))
+    assert len(labels) > 20
+    assert not re.findall("[A-Za-z]{3,}", left)

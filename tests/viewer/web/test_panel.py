@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -201,6 +202,20 @@ def test_what_photos_show_beside_a_photo():
 
 
 @pytest.mark.browser
+def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
+    with Browser(600, 400, 0.25, frames=5.0) as browser:
+        page = browser.open(f"{file.as_uri()}?webgl", language="zh-CN")
+        page.wait_for("!!document.querySelector('.snow-panel')", 60)
+        click(page, "照片")
+        click(page, "清理")
+        text = page.evaluate("document.querySelector('.snow-panel').innerText")
+        assert text.startswith("Balls <&>")
+        assert re.search(r"[0-9] 个高斯 · 2026-11-24 · CC0", text)
+        assert not re.search(r"[A-Za-z]", text.replace("Balls <&>", "").replace("CC0", ""))
+        assert not page.errors
+
+
+@pytest.mark.browser
 def test_a_click_on_every_control(file):
     """Leaves no error in the console. The film is the last one; dragging ends it in orbit."""
     with opened(file, 600, 400) as page:
@@ -214,7 +229,7 @@ def test_a_click_on_every_control(file):
                 break
             clicked.add(new[-1])
             page.evaluate(f"{shown}[{names.index(new[-1])}].click()")
-        assert {"Photos", "Clean up", "Copy link", "Photo 12 of 12"} <= clicked
+        assert {"Photos", "Clean up", "Copy link", "Photo 12 / 12"} <= clicked
         named = ("flyCamera", "settings", "frame", "reset", "controlsButton", "info", "infoClose")
         assert {f"sse-{name}" for name in named} <= clicked
         for key in "12ghfr":

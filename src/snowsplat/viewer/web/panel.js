@@ -152,24 +152,24 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         return button;
     };
 
-    const clean = toggle('Clean up', hiding.element);
+    const clean = toggle(say('Clean up'), hiding.element);
 
     const copied = element('span', { className: 'snow-copied', role: 'status' });
-    const link = element('button', { type: 'button', textContent: 'Copy link', title: 'A link to the present view' });
+    const link = element('button', { type: 'button', textContent: say('Copy link'), title: say('A link to the present view') });
     link.onclick = async () => {
         const view = presentView().map((number) => Number(number.toPrecision(6)));
         const values = String(hiding.values());
         const hidden = values === String(scene.hiding.start) ? '' : `&hide=${values}`;
         history.replaceState(null, '', `#view=${view}${hidden}`);
         const done = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
-        copied.textContent = done ? 'Copied' : 'It is in the address bar';
+        copied.textContent = say(done ? 'Copied' : 'It is in the address bar');
         setTimeout(() => { copied.textContent = ''; }, 3000);
     };
 
     const strip = element('div', { className: 'snow-stops' });
-    const photos = toggle('Photos', strip);
+    const photos = toggle(say('Photos'), strip);
     stops.forEach((view, i) => {
-        const stop = element('button', { type: 'button', ariaLabel: `Photo ${i + 1} of ${stops.length}` });
+        const stop = element('button', { type: 'button', ariaLabel: `${say('Photo')} ${i + 1} / ${stops.length}` });
         stop.style.backgroundImage = `url("${scene.pictures}")`;
         stop.style.backgroundPositionX = `${stops.length > 1 ? (100 * i) / (stops.length - 1) : 0}%`;
         stop.style.backgroundSize = `${100 * stops.length}% 100%`;
@@ -184,12 +184,12 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
 
     const panel = element(
         'section',
-        { className: 'snow-panel', ariaLabel: 'Scene' },
+        { className: 'snow-panel', ariaLabel: say('Scene') },
         element(
             'div',
             { className: 'snow-card' },
             element('h1', { textContent: scene.title }),
-            element('p', { textContent: scene.facts }),
+            element('p', { textContent: scene.facts.replace('Gaussians', say('Gaussians')) }),
             element('div', { className: 'snow-buttons' }, ...(stops.length ? [photos] : []), clean, link, copied)
         ),
         hiding.element,
