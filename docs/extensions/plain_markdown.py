@@ -4,7 +4,8 @@
   the images are its panels, and the quote is its caption. The files become elements of the page, so
   that the style sheet of the site changes their colours with the theme. The alternative text of an
   image becomes the title of its panel.
-- A comment `<!-- toctree` with names of pages becomes a hidden table of contents.
+- A comment `<!-- toctree` or `<!-- toctree: CAPTION`, with names of pages, becomes a part of the
+  table of contents.
 - Code such as `snowsplat.Camera` becomes a link to its description.
 """
 
@@ -19,7 +20,7 @@ from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 
 FIGURES = Path(__file__).resolve().parents[1] / "learn" / "figures"
-_TOCTREE = re.compile(r"<!-- toctree\n((?:[\w/-]+\n)+)-->")
+_TOCTREE = re.compile(r"<!-- toctree(?:: (.+))?\n((?:.+\n)+?)-->")
 _NAME = re.compile(r"snowsplat(?:\.\w+)+")
 
 
@@ -79,7 +80,11 @@ class Names(SphinxTransform):
 
 
 def _toctree(app: Sphinx, name: str, content: list[str]) -> None:
-    content[0] = _TOCTREE.sub(r"```{toctree}\n:hidden:\n\n\1```", content[0])
+    def fence(match: re.Match[str]) -> str:
+        caption = f":caption: {match[1]}\n" if match[1] else ""
+        return f"```{{toctree}}\n:hidden:\n{caption}\n{match[2]}```"
+
+    content[0] = _TOCTREE.sub(fence, content[0])
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
