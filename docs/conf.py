@@ -22,8 +22,8 @@ extensions = [
     "sphinx_copybutton",
     "api_names",
     "docstrings",
-    "drawings",
     "local_mathjax",
+    "plain_markdown",
     "reference_flags_table",
     "repository_links",
     "settings_table",
@@ -37,11 +37,13 @@ mathjax_path = "mathjax/tex-svg.js"
 mathjax3_config = {"svg": {"fontCache": "global"}, "options": {"enableMenu": False}}
 smartquotes = False  # would change the hyphens of flags
 myst_heading_anchors = 4
+myst_fence_as_directive = ["math"]
 myst_enable_extensions = ["dollarmath"]
 html_theme = "furo"
 html_title = f"snowsplat {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = [("basin.js", {"defer": "defer"})]
 html_show_copyright = False
 html_show_sphinx = False
 html_copy_source = False

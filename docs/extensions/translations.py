@@ -42,11 +42,15 @@ TRANSLATED = (
 OWN = ("index.md", "glossary.md")
 _FIRST_LINE = re.compile(r"<!-- translation of (\S+) ([0-9a-f]{16}) -->\n")
 
+# Excerpts of source files (docs/excerpts.py): a translation has the same, and nothing to translate.
+_EXCERPT = re.compile(r"(<!-- code: .* -->)\n```.*\n(?:.*\n)*?```")
+
 logger = logging.getLogger(__name__)
 
 
 def digest(text: str) -> str:
-    """16 hexadecimal digits that change with the text, but not with its line breaks."""
+    """16 hexadecimal digits that change with the text, but not with its line breaks or excerpts."""
+    text = _EXCERPT.sub(r"\1", text)
     return hashlib.sha256(" ".join(text.split()).encode()).hexdigest()[:16]
 
 

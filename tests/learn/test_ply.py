@@ -56,7 +56,7 @@ def test_the_table_of_the_page(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_the_reader_of_the_page(tmp_path, degree):
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    (code,) = re.findall(r"(?<!-->\n)```python\n(.*?)```", PAGE, re.DOTALL)
     names: dict = {}
     exec(code, names)
     arrays = scene(degree)

@@ -75,7 +75,9 @@ def test_the_table_is_that_of_the_code():
         numerator, denominator = root.split("/")
         factor = math.sqrt(float(numerator) / (float(denominator.replace("\\pi", "")) * math.pi))
         assert factor == pytest.approx(float(number), abs=6e-6)
-        code = re.sub(r"(\d)(?=[xyz(])", r"\1*", function.replace("\\,", " ").replace("^", "**"))
+        code = re.sub(
+            r"(\d)(?=[xyz(])", r"\1*", function.replace("\\thinspace", " ").replace("^", "**")
+        )
         code = re.sub(r"(?<=[xyz)])\s*(?=[xyz(])|(?<=\*\*2)(?=[xyz(])", "*", code)
         x, y, z = v.unbind(dim=1)
         values = eval(code, {"x": x, "y": y, "z": z}) + 0 * x

@@ -1,9 +1,9 @@
 """`Drawing`: a small SVG writer for the figures of the course.
 
-The figures are elements of the pages (`docs/extensions/drawings.py`), and docs/static/site.css
-changes their colours with the theme. A drawing library would write fixed colours, so this module
-writes the SVG itself: each colour is a class, and an attribute for programs that show only the
-file.
+Each colour is an attribute, for light surroundings, and a class, which the style of the file
+changes in dark ones. The background has a colour, too: where only the page around the image is
+dark, the text remains readable. On the site, the figures are elements of the pages
+(`docs/extensions/plain_markdown.py`); docs/static/site.css changes their colours with the theme.
 
 Panels are at most 340 units wide. So they are shown at their full size on a phone, too.
 """
@@ -23,17 +23,21 @@ from PIL import Image
 from snowsplat.util.charts import tick_labels, ticks
 
 FOLDER = Path(__file__).parent
+# For light and for dark surroundings, as in docs/static/site.css.
 COLOURS = {
-    "ink": "#1f2933",
-    "soft": "#667080",
-    "line": "#d3d8df",
-    "blue": "#2563b8",
-    "orange": "#d4600c",
-    "green": "#15824f",
-    "violet": "#7a4cc2",
-    "red": "#c02a48",
-    "page": "#ffffff",
+    "ink": ("#1f2933", "#e3e6ea"),
+    "soft": ("#667080", "#98a2af"),
+    "line": ("#d3d8df", "#3b424c"),
+    "blue": ("#2563b8", "#6fb0f7"),
+    "orange": ("#d4600c", "#ffa355"),
+    "green": ("#15824f", "#52cf9a"),
+    "violet": ("#7a4cc2", "#bb9df6"),
+    "red": ("#c02a48", "#ff7d92"),
+    "page": ("#ffffff", "#15181c"),
 }
+STYLE = "".join(
+    f".f-{name}{{fill:{dark}}}.s-{name}{{stroke:{dark}}}" for name, (_, dark) in COLOURS.items()
+)
 Point = Sequence[float]
 
 
@@ -226,7 +230,9 @@ class Drawing:
         for value, word in x_ticks if x_ticks is not None else _ticks(self.x, counts[0]):
             x, _ = self.at((value, self.y[0]))
             self._path(f"M{x:.1f} {self.bottom:.1f}v4", "soft", 1, "", 1, "", 0)
-            self.text((value, self.y[0]), word, "soft", size=12, dy=17)
+            # A digit is about 7 units wide.
+            over = max(0.0, x + 3.6 * len(word.replace(" ", "")) - self.width)
+            self.text((value, self.y[0]), word, "soft", size=12, dx=-over, dy=17)
         self._path(f"M{self.left:.1f} {self.bottom:.1f}H{self.right:.1f}", "soft", 1, "", 1, "", 0)
         if x_label:
             self.text((self.x[1], self.y[0]), x_label, "soft", anchor="end", size=12, dy=33)
@@ -247,6 +253,8 @@ class Drawing:
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{self.width:g}"'
             f' height="{self.height:g}" viewBox="0 0 {self.width:g} {self.height:g}" role="img"'
             f' font-family="sans-serif"><title>{escape(description)}</title>'
+            f"<style>@media (prefers-color-scheme:dark){{{STYLE}}}</style>"
+            f'<rect width="100%" height="100%" rx="6" {_style(fill="page")}/>'
         )
         text = svg + "\n".join(["", *self.parts, "</svg>"]) + "\n"
         (FOLDER / f"{name}.svg").write_text(text, encoding="utf-8")
@@ -274,11 +282,11 @@ class Drawing:
 def _style(*, fill: str = "", stroke: str = "", fill_opacity: float = 1.0) -> str:
     """The attributes of a fill and a stroke in named colours."""
     classes = [f"{kind}-{colour}" for kind, colour in (("f", fill), ("s", stroke)) if colour]
-    style = f'fill="{COLOURS[fill] if fill else "none"}"'
+    style = f'fill="{COLOURS[fill][0] if fill else "none"}"'
     if fill and fill_opacity < 1:
         style += f' fill-opacity="{fill_opacity:g}"'
     if stroke:
-        style += f' stroke="{COLOURS[stroke]}"'
+        style += f' stroke="{COLOURS[stroke][0]}"'
     return f'{style} class="{" ".join(classes)}"'
 
 

@@ -13,11 +13,13 @@ import projection
 import rasterizer
 import reference_walk
 import spherical_harmonics
+import structure_from_motion
 
 for module in (
     gaussian,
     covariance,
     camera,
+    structure_from_motion,
     projection,
     spherical_harmonics,
     blending,

@@ -23,9 +23,15 @@ VIEW = "IMG_0013.jpg"  # the photo that the figures show
 
 
 @functools.cache
+def dataset_folder() -> Path:
+    """The dataset of the demo, with the database of structure from motion."""
+    return demo(BUILD / "demo").made.dataset_report.parent
+
+
+@functools.cache
 def dataset() -> Dataset:
     """The photos with the poses that structure from motion has found; every 8th is held out."""
-    return load_dataset(demo(BUILD / "demo").made.dataset_report.parent)
+    return load_dataset(dataset_folder())
 
 
 @functools.cache

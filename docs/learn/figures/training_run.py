@@ -14,7 +14,6 @@ import torch
 import scene
 from snowsplat import Gaussians
 from snowsplat.data.load import load_dataset
-from snowsplat.pipeline.demo import demo
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.densification import Densification
@@ -25,7 +24,6 @@ SNAPSHOTS = (0, 200, 500, 600, 1000, 1010, 1500, 2500, 4000)
 
 
 def _trainer() -> Trainer:
-    folder = demo(scene.BUILD / "demo").made.dataset_report.parent
     config = recipe(
         "paper",
         iterations=STEPS,
@@ -37,7 +35,7 @@ def _trainer() -> Trainer:
     )
     # The limit of the size in the world is for scenes that are larger than the camera path.
     config = replace(config, density=replace(config.density, prune_world_size=0.0))
-    return Trainer(load_dataset(folder, resolution=2), config)
+    return Trainer(load_dataset(scene.dataset_folder(), resolution=2), config)
 
 
 @functools.cache
