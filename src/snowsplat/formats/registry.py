@@ -47,7 +47,8 @@ class Format:
         loses: a description, for users, of the data that a scene loses in this format.
         marks_antialiased: whether a file can say that its scene is antialiased, see `Gaussians`.
         version: the version of a file that ``recognises`` accepts, if the format has several.
-        stores_origin: whether a file has the `scene.origin`; if not, it is in a file beside it.
+        stores_origin: whether a file has the `scene.origin` and the true scale; if not, they are in
+            a file beside it.
         bytes: the size of a scene; None: the scene is a single file, whose size is taken.
         instead: for users, what to do with a file of a format that cannot be read.
     """
