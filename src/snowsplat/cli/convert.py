@@ -40,6 +40,7 @@ class Convert(Reports):
                         (older viewers need --spz-version 2)
       .sog              1/10 of the size; for the web viewers of PlayCanvas
       .glb              glTF; lossless except for rounding
+      .usdz, .usd       OpenUSD; lossless except for rounding; needs snowsplat[usd]
       .splat            1/8 of the size; no view-dependent colour
       .html             a web page that contains the scene and a viewer
       lod-meta.json     a folder with levels of detail, for large scenes on the

@@ -54,8 +54,8 @@ _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colo
 _MOST_COPIES = 8  # maximum number of copies of the splats, by nodes that share a mesh
 _MOST_PRIMITIVES = 1 << 20  # maximum number of primitives of all nodes
 _MOST_PARTS = 1 << 12  # maximum number of primitives with splats
-_OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
-_LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
+OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
+LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
 _GLB_LIMIT = (1 << 32) - 1
 _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
 
@@ -96,7 +96,7 @@ def read_gltf(path: Path | str) -> GaussianArrays:
             )
         else:
             parts = [(_with_logarithms(part), matrix) for part, matrix in parts]
-        placed = [_transform(part, matrix) for part, matrix in parts]
+        placed = [transformed(part, matrix) for part, matrix in parts]
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
@@ -202,7 +202,7 @@ def _with_logarithms(part: GaussianArrays) -> GaussianArrays:
     return replace(part, log_scales=packing.log_scales(part.log_scales))
 
 
-def _transform(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
+def transformed(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
     """The splats in the frame of the scene; ``world_from_mesh`` is (4, 4).
 
     Positions are relative to an origin: float32 may not be able to store the translation.
@@ -247,7 +247,7 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     quats = read(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]]
     quats[(quats == 0).all(1)] = 1, 0, 0, 0
     opacity = read(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0].astype(np.float64)
-    opacity = np.clip(opacity, *_OPACITY_RANGE)
+    opacity = np.clip(opacity, *OPACITY_RANGE)
     names = _coefficients(3)
     present = [name for name in names if name in attributes]
     if not present and "COLOR_0" in attributes:
@@ -303,12 +303,12 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     means, quats, sh_rest = packing.flip_axes(means, quats, sh_rest, packing.UP_BACK)
     opacity = (1 / (1 + np.exp(-opacity_logits))).astype("<f4")
     cut = packing.Cut(path, "glTF", len(means))
-    packing.cut_scales(cut, log_scales, *_LOG_SCALES, step=0)
+    packing.cut_scales(cut, log_scales, *LOG_SCALES, step=0)
     attributes: dict[str, np.ndarray] = {
         "POSITION": means,
         "COLOR_0": _point_colors(sh_dc, opacity),
         f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": np.exp(np.clip(log_scales, *_LOG_SCALES)),
+        f"{EXTENSION}:SCALE": np.exp(np.clip(log_scales, *LOG_SCALES)),
         f"{EXTENSION}:OPACITY": opacity[:, None],
     }
     sh = np.concatenate([sh_dc, sh_rest], 1)
