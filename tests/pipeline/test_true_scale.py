@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import shutil
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from snowsplat import Trainer, recipe
+from snowsplat.data import load_dataset
+from snowsplat.data.placement import PLACEMENT, Placement
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.describe import describe
@@ -21,6 +25,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.length import metres_of, stored_metres
 from snowsplat.util.errors import SettingError
+from snowsplat.util.files import write_json
 
 FORMATS = ["ply", "compressed.ply", "spz", "sog", "glb", "splat", "lod-meta.json"]
 A, B = (0.0, 0.5, 2.0), (-1.0, 0.5, 2.0)  # a unit apart
@@ -130,6 +135,21 @@ def test_two_scales_are_one_too_many(plain: Path) -> None:
     known = KnownDistance("1m", (text(A), text(B)))
     with pytest.raises(SettingError, match="leave one of them out"):
         convert(plain, plain.with_name("x.ply"), Edits(scale=2.0), known=known)
+
+
+def test_a_training_keeps_it(dataset: Path, tmp_path: Path) -> None:
+    """From the record of `sfm`; a start that has a scale has priority over it."""
+    shutil.copytree(dataset, tmp_path / "dataset")
+    placement = asdict(Placement(["gimbal"], 1.0, metres_per_unit=1.0))
+    stages = {"images": {"result": {PLACEMENT: placement}}}
+    write_json(tmp_path / "dataset" / "sfm.json", {"stages": stages})
+    metric = load_dataset(tmp_path / "dataset")
+    assert metric.metres_per_unit == 1
+    assert load_dataset(dataset).metres_per_unit is None
+    config = recipe("default", iterations=1)
+    assert Trainer(metric, config).gaussians.metres_per_unit == 1
+    start = replace(scene(), metres_per_unit=2.0)
+    assert Trainer(metric, config, initial=start).gaussians.metres_per_unit == 2
 
 
 def test_lengths_are_read() -> None:
