@@ -50,8 +50,9 @@ class Convert(Reports):
     Notes:
       If there are several scenes, they are merged first. Then the edits are
       applied in this order: --crop, --sh-degree, --decimate, --rotate, --scale
-      or --scale-to, --translate. Coordinates are in the frame of PLY files: x right, y down, z
-      forward. They are those in the world, also for a scene far away from 0.
+      or --scale-to, --translate. Coordinates are in the frame of PLY files: x
+      right, y down, z forward. They are those in the world, also for a scene far
+      away from 0.
       --decimate is better with an output folder than with a scene file: the
       result is then trained to look like the whole scene from its cameras.
     """
