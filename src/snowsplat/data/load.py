@@ -26,6 +26,7 @@ from snowsplat.data.place import moved_to_origin
 from snowsplat.data.placement import read_placement
 from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.natural_order import natural_key
@@ -236,7 +237,7 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
             raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
     if poses:
         placement = read_placement(root) if poses.models[0] == root / "sparse" / "0" else None
-        metres = None if placement is None else placement.metres_per_unit
+        metres = None if placement is None else stored_metres(placement.metres_per_unit)
         return *read_colmap(root, poses.models, images), metres
     if (known := advice(root)) is not None:
         raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
