@@ -104,7 +104,9 @@ class MakeOptions(Settings):
     )
     title: str | None = None
     exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
-    marker: float | None = None
+    marker: float | None = setting(
+        None, "Side of the printed markers in metres.", above=0.0, allowed="a number above 0"
+    )
     compute: Compute = field(default_factory=Compute)
 
 
