@@ -37,6 +37,12 @@ _OF_FOLDERS = {
     "viewer": "slow",
 }
 _QUICK = {"cli/test_main.py"}
+try:
+    from pxr import UsdVol
+
+    _USD = hasattr(UsdVol, "ParticleField3DGaussianSplat")
+except ImportError:
+    _USD = False
 _OF_FIXTURES = {"recorder": "build", "start": "slow"}
 
 
@@ -77,6 +83,10 @@ def pytest_sessionstart() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     from .browser import chromium
+
+    given = item.callspec.params.values() if hasattr(item, "callspec") else ()
+    if any(each == ".usd" or getattr(each, "name", None) == "USD" for each in given) and not _USD:
+        pytest.skip("needs usd-core 26.3 or newer (pip install 'snowsplat[usd]')")
 
     if item.get_closest_marker("browser") and chromium() is None:
         pytest.skip(

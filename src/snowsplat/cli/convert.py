@@ -30,6 +30,7 @@ class Convert(Reports):
       snowsplat convert out/garden small.ply --decimate 50% --refine garden
       snowsplat convert garden.ply table.glb --crop -1 -1 -1 1 0.5 1 --rotate 0 90 0
       snowsplat convert house.ply tree.spz both.ply
+      snowsplat convert out/garden true.glb --scale-to 4.2m --between IMG_1 IMG_9
       snowsplat convert out/town town_levels/lod-meta.json
 
     The suffix of FILE selects the format:
@@ -39,6 +40,7 @@ class Convert(Reports):
                         (older viewers need --spz-version 2)
       .sog              1/10 of the size; for the web viewers of PlayCanvas
       .glb              glTF; lossless except for rounding
+      .usdz, .usd       OpenUSD; lossless except for rounding; needs snowsplat[usd]
       .splat            1/8 of the size; no view-dependent colour
       .html             a web page that contains the scene and a viewer
       lod-meta.json     a folder with levels of detail, for large scenes on the
@@ -47,9 +49,10 @@ class Convert(Reports):
 
     Notes:
       If there are several scenes, they are merged first. Then the edits are
-      applied in this order: --crop, --sh-degree, --decimate, --rotate, --scale,
-      --translate. Coordinates are in the frame of PLY files: x right, y down, z
-      forward. They are those in the world, also for a scene far away from 0.
+      applied in this order: --crop, --sh-degree, --decimate, --rotate, --scale
+      or --scale-to, --translate. Coordinates are in the frame of PLY files: x
+      right, y down, z forward. They are those in the world, also for a scene far
+      away from 0.
       --decimate is better with an output folder than with a scene file: the
       result is then trained to look like the whole scene from its cameras.
     """
@@ -69,6 +72,11 @@ class Convert(Reports):
     """Rotate by these angles in degrees, first about x, then about y, then about z."""
     scale: Annotated[float, flag("F", default="1")] = 1.0
     """Scale by this factor about the origin."""
+    scale_to: Annotated[str | None, flag("LENGTH")] = None
+    """The true distance of the two places of --between, e.g. 0.45m, 45cm, 17.7in: scale the scene
+    so that one unit is one metre."""
+    between: Annotated[tuple[str, str], flag("A B")] = ("", "")
+    """With --scale-to: two points X,Y,Z, or the names of two photos of an output folder."""
     translate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
     """Translate by this offset."""
     spz_version: Annotated[Literal[2, 3, 4] | None, flag("{2,3,4}", default="3")] = None
@@ -86,7 +94,10 @@ class Convert(Reports):
             raise UserError("convert needs a scene and the name of a file to write")
         *sources, target = self.paths
         from snowsplat.pipeline.convert import Edits, convert
+        from snowsplat.pipeline.true_scale import KnownDistance
 
+        if self.scale_to is None and any(self.between):
+            raise UserError("--between: how far is it? add --scale-to LENGTH, such as 0.45m")
         edits = Edits(
             crop=self.crop,
             rotate=self.rotate,
@@ -103,6 +114,7 @@ class Convert(Reports):
                 dataset=self.refine,
                 spz_version=self.spz_version,
                 georeferenced=self.georeferenced,
+                known=KnownDistance(self.scale_to, self.between) if self.scale_to else None,
                 overwrite=self.overwrite,
                 observer=observer,
             )

@@ -5,6 +5,9 @@ from typing import Annotated, Any, TypeAlias
 
 import tyro
 
+from snowsplat.scene.length import metres_of
+from snowsplat.util.errors import SettingError
+
 _SETTING = re.compile(r"`([a-z][a-z0-9_]*)`")
 # Settings whose flag has another name.
 _OTHER_NAMES = {"hold_out": "--eval"}
@@ -32,7 +35,24 @@ def switch(*aliases: str, help: str | None = None) -> Any:
 Threads: TypeAlias = Annotated[
     int | None, flag("N", default="all cores", help="Number of CPU threads.")
 ]
+Marker: TypeAlias = Annotated[
+    str | None,
+    flag(
+        "LENGTH",
+        default="none",
+        help="Side of the black square of ArUco or AprilTag markers that lie in the scene, e.g. "
+        "0.10m, 10cm, 4in: one unit of the scene is then one metre.",
+    ),
+]
 Quiet: TypeAlias = Annotated[bool, switch("-q", help="Print only the result and no progress.")]
+
+
+def marker_side(text: str | None) -> float | None:
+    """The value of `Marker` in metres. Raises: SettingError: it is no length."""
+    try:
+        return None if text is None else metres_of(text)
+    except ValueError as error:
+        raise SettingError("marker", str(error)) from None
 
 
 def with_flags(message: str) -> str:

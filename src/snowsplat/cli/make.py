@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from snowsplat.cli.flags import Threads, flag, switch, with_flags
+from snowsplat.cli.flags import Marker, Threads, flag, marker_side, switch, with_flags
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
 from snowsplat.cli.page_flags import AllowHost, page_at
@@ -33,6 +33,7 @@ _RESUMED_FLAGS = (
     "hold_out",
     "title",
     "exposure",
+    "marker",
     "threads",
     "device",
     "memory",
@@ -87,6 +88,7 @@ class Make(Reports):
     ] = None
     """Whether to learn a gain for each photo and colour channel, for photos with different
     exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
+    marker: Marker = None
     threads: Threads = None
     device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
     """Device to train on."""
@@ -114,6 +116,7 @@ class Make(Reports):
             memory=self.memory,
             title=self.title,
             exposure=self.exposure or "auto",
+            marker=marker_side(self.marker),
             compute=Compute(self.device, self.threads),
             **({} if self.hold_out is None else {"hold_out": _hold_out(self.hold_out)}),
         )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from snowsplat.cli.flags import Quiet, Threads, flag, switch
+from snowsplat.cli.flags import Marker, Quiet, Threads, flag, marker_side, switch
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
@@ -71,6 +71,7 @@ class Sfm(Reports):
     """With -s, do not estimate camera poses; use the COLMAP model in LOCATION/distorted/sparse/0
     and only undistort the photos."""
 
+    marker: Marker = None
     threads: Threads = None
     overwrite: Annotated[bool, switch()] = False
     """Replace the dataset in DATASET even if it was made from other photos."""
@@ -138,4 +139,5 @@ class Sfm(Reports):
             sfm=SfmOptions(mapper=self.mapper, effort=self.quality, threads=self.threads, **lens),
             resize=self.resize,
             skip_matching=self.skip_matching,
+            marker=marker_side(self.marker),
         )

@@ -107,6 +107,7 @@ class Dataset:
     extent: float  # world units; see `scene_extent`
     description: str = ""  # the files it was read from, for messages
     origin: Origin = HERE  # of cameras and points, in the world frame of the files
+    metres_per_unit: float | None = None  # true length of a world unit; None: unknown
 
     def __post_init__(self) -> None:
         prefix = f"{self.description}: " if self.description else ""

@@ -23,8 +23,10 @@ from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.near import near_of
 from snowsplat.data.place import moved_to_origin
+from snowsplat.data.placement import read_placement
 from snowsplat.data.transforms_json import find_transforms, read_transforms
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.natural_order import natural_key
@@ -98,7 +100,7 @@ class DatasetFiles:
         images: each image, the header of its file, and the result of `_file_sizes`.
         circles: the radius of the image circle of each wide lens that has one in the photos.
         test_names: names of the images to hold out.
-        origin: see `Dataset.origin`.
+        origin, metres_per_unit: see `Dataset`.
     """
 
     root: Path
@@ -108,6 +110,7 @@ class DatasetFiles:
     description: str
     test_names: set[str]
     origin: Origin
+    metres_per_unit: float | None
 
     def dataset(self, resolution: int | None) -> Dataset:
         """The dataset at a resolution, see `load_dataset`; reads no file.
@@ -135,6 +138,7 @@ class DatasetFiles:
             extent=scene_extent([view.camera for view in train]),
             description=self.description,
             origin=self.origin,
+            metres_per_unit=self.metres_per_unit,
         )
 
 
@@ -161,7 +165,7 @@ def read_files(
     The other arguments and the errors are those of `load_dataset`.
     """
     root = Path(path)
-    posed, points, description = _read(root, images)
+    posed, points, description, metres = _read(root, images)
     posed, points, origin = moved_to_origin(posed, points)
     folder = root.parent if root.is_file() else root
     posed = with_masks(folder, _with_depth_maps(folder / "depths", posed))
@@ -178,7 +182,7 @@ def read_files(
     _warn_of_cropped(posed)
     found = list(zip(posed, headers, sizes, strict=True))
     names = _test_names(posed, hold_out, first_held_out, test_list)
-    return DatasetFiles(root, found, _circles(found), points, description, names, origin)
+    return DatasetFiles(root, found, _circles(found), points, description, names, origin, metres)
 
 
 @dataclass(frozen=True)
@@ -210,14 +214,15 @@ def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
     return _Poses([], [], export) if export and export.cameras else None
 
 
-def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str]:
+def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str, float | None]:
+    """Posed images, points, a description, and the metres in a unit of them if that is known."""
     if not root.exists():
         raise UserError(f"{root}: no such folder")
     poses = _find_poses(root, images)
     if poses and poses.transforms:
-        return read_transforms(poses.transforms, images)
+        return *read_transforms(poses.transforms, images), None
     if poses and poses.export:
-        return read_export(root, poses.export, images)
+        return *read_export(root, poses.export, images), poses.export.kind.metres_per_unit
     if root.suffix.lower() == ".zip" and root.is_file():
         raise UserError(
             f"{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
@@ -231,7 +236,9 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         if above is not None:
             raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
     if poses:
-        return read_colmap(root, poses.models, images)
+        placement = read_placement(root) if poses.models[0] == root / "sparse" / "0" else None
+        metres = None if placement is None else stored_metres(placement.metres_per_unit)
+        return *read_colmap(root, poses.models, images), metres
     if (known := advice(root)) is not None:
         raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
     raise NoPosesError(

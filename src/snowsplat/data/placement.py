@@ -51,11 +51,13 @@ class Placement:
                 f"north: {aligned if z > 1 - 1e-9 else other}; from {self.north_from}, to about "
                 f"{_short(self.north_error)}°"
             )
-        if self.metres_per_unit and self.scale_from and self.scale_error and self.position_error:
+        if self.metres_per_unit and self.scale_from and self.scale_error:
             unit = "1 unit is 1 m" if self.is_metric else f"1 unit is {self.metres_per_unit:.4g} m"
+            gps = self.position_error
+            typical = f" ({_short(gps)} m typical error)" if gps else ""
             found.append(
-                f"metric: {unit}, scale from {self.scale_from} ({_short(self.position_error)} m "
-                f"typical error), to about {_short(100 * self.scale_error)}%"
+                f"metric: {unit}, scale from {self.scale_from}{typical}, to about "
+                f"{_short(100 * self.scale_error)}%"
             )
         return found + [f"note: {doubt}" for doubt in self.doubts]
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.origin_file import read_origin, write_origin
+from snowsplat.formats.origin_file import Place, read_place, write_place
 from snowsplat.formats.registry import (
     FORMATS,
     Format,
@@ -23,7 +23,7 @@ from snowsplat.formats.registry import (
     format_for_writing,
     register_format,
 )
-from snowsplat.scene.origin import HERE, added
+from snowsplat.scene.origin import added
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -60,7 +60,8 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     _name_coarse_positions(path, scene)
     if format.stores_origin:
         return scene
-    return replace(scene, origin=added(scene.origin, read_origin(path)))
+    origin, metres = read_place(path)
+    return replace(scene, origin=added(scene.origin, origin), metres_per_unit=metres)
 
 
 def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:
@@ -90,8 +91,8 @@ def read_gaussians(path: Path | str) -> Gaussians:
 def write_gaussians(path: Path | str, gaussians: Gaussians, **options: Any) -> None:
     """Write a scene file atomically, in the format that the suffix of its name selects.
 
-    The origin of a scene that has one is in the file or, if the format cannot store it, in
-    NAME.origin.json beside it.
+    The origin and the true scale of a scene that has them are in the file or, if the format cannot
+    store them, in NAME.origin.json beside it.
 
     Args:
         options: of the function that writes the format, such as ``version`` of `write_spz`.
@@ -105,7 +106,8 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, **options: Any) -> N
     assert format.write is not None
     format.write(path, GaussianArrays.from_gaussians(gaussians), **options)
     if not format.stores_origin:
-        write_origin(path, gaussians.origin if format.read else HERE)
+        place = Place(gaussians.origin, gaussians.metres_per_unit)
+        write_place(path, place if format.read else Place())
     if gaussians.antialiased and not format.marks_antialiased:
         logger.warning(
             "%s: the scene is antialiased, but %s files cannot say so: viewers will show fine "

@@ -3,7 +3,7 @@
 A project has `document.json` and `splat_0.ply`, `splat_1.ply`, …; "splats" in the document places
 them: position, rotation (xyzw) and scale, in the frame of a PLY turned by 180° about z.
 
-Other zip files, such as USDZ, are named in the error message.
+What is in other zip files is named in the error message.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 _MOST_INFLATION = 16
 _DOCUMENT = "document.json"
 _SPLAT = re.compile(r"splat_(\d{1,4})\.ply")
-_OTHER_SCENES = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
+_OTHER_SCENES = (".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".usd", ".usda", ".usdc")
 _MOST_SCENES = 1000
 # The settings of a splat that change its colours, and their neutral values.
 _COLORS = {
@@ -103,11 +103,6 @@ def _single(path: Path, members: ZipMembers, names: Sequence[str]) -> GaussianAr
     others = [name for name in names if name.lower().endswith(_OTHER_SCENES)]
     if others:
         raise UserError(f"{path}: a zip file; unzip it, and use {_some(others)}")
-    if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):
-        raise UserError(
-            f"{path}: a USDZ file, which is not supported; export the splats as .ply, .spz or .glb "
-            "in the program that made it"
-        )
     raise UserError(f"{path}: a zip file without a scene; it contains {_some(names) or 'nothing'}")
 
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.ply import is_antialiased, origin_in, scene_comments
+from snowsplat.formats.ply import is_antialiased, placement_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -95,7 +95,8 @@ def read_compressed_ply(path: Path | str, data: bytes | None = None) -> Gaussian
         _read_sh(path, vertices, data),
         antialiased=is_antialiased(vertices.comments),
     )
-    return replace(scene, origin=origin_in(vertices.comments))
+    origin, metres = placement_in(vertices.comments)
+    return replace(scene, origin=origin, metres_per_unit=metres)
 
 
 def _read_sh(path: Path, vertices: PlyTable, data: bytes | None) -> np.ndarray:
@@ -195,7 +196,8 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     if k:
         elements.append(("sh", n, [("uchar", f"f_rest_{i}") for i in range(3 * k)]))
     limits = np.concatenate(bounds, 1).astype("<f4")
-    head = header_of(elements, scene_comments(gaussians.antialiased, gaussians.origin))
+    comments = scene_comments(gaussians.antialiased, gaussians.origin, gaussians.metres_per_unit)
+    head = header_of(elements, comments)
     cut.report(".ply keeps them")
     return [head, limits.tobytes(), words.tobytes(), sh.tobytes()]
 

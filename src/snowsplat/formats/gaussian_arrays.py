@@ -10,7 +10,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 _SAMPLE = 1 << 16  # Gaussians from which the usual size is estimated
 
 
@@ -28,7 +29,8 @@ _SAMPLE = 1 << 16  # Gaussians from which the usual size is estimated
 class GaussianArrays:
     """N Gaussians: the parameters of `snowsplat.Gaussians` as float32 arrays, in its order.
 
-    ``antialiased`` and ``origin``: see `snowsplat.Gaussians`. Iterating yields the six arrays.
+    ``antialiased``, ``origin`` and ``metres_per_unit``: see `snowsplat.Gaussians`. Iterating yields
+    the six arrays.
     """
 
     means: np.ndarray  # (N, 3) world units
@@ -39,6 +41,7 @@ class GaussianArrays:
     sh_rest: np.ndarray  # (N, K, 3), K = 0, 3, 8 or 15
     antialiased: bool = field(default=False, kw_only=True)
     origin: Origin = field(default=HERE, kw_only=True)
+    metres_per_unit: float | None = field(default=None, kw_only=True)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         yield from (self.means, self.log_scales, self.quats)
@@ -49,7 +52,12 @@ class GaussianArrays:
         """The parameters without gradients; shares memory where they are float32 on the CPU."""
         tensors = gaussians.parameters().values()
         arrays = (tensor.detach().cpu().float().numpy() for tensor in tensors)
-        return cls(*arrays, antialiased=gaussians.antialiased, origin=gaussians.origin)
+        return cls(
+            *arrays,
+            antialiased=gaussians.antialiased,
+            origin=gaussians.origin,
+            metres_per_unit=gaussians.metres_per_unit,
+        )
 
     @classmethod
     def empty(cls, rest: int = 0) -> GaussianArrays:
@@ -78,7 +86,12 @@ class GaussianArrays:
         from snowsplat.scene.gaussians import Gaussians
 
         tensors = map(torch.from_numpy, self)
-        return Gaussians(*tensors, antialiased=self.antialiased, origin=self.origin)
+        return Gaussians(
+            *tensors,
+            antialiased=self.antialiased,
+            origin=self.origin,
+            metres_per_unit=self.metres_per_unit,
+        )
 
     def select(self, index: np.ndarray | slice) -> GaussianArrays:
         """The rows ``index``: (M,) integers in any order, an (N,) bool mask, or a slice."""
@@ -111,7 +124,8 @@ class GaussianArrays:
         return rows | {"colours": ~sh}
 
     def _with(self, *arrays: np.ndarray) -> GaussianArrays:
-        return GaussianArrays(*arrays, antialiased=self.antialiased, origin=self.origin)
+        own: dict[str, Any] = dict(zip(_ARRAYS, arrays, strict=True))
+        return replace(self, **own)
 
 
 def decoded(path: Path, *arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:

@@ -11,9 +11,11 @@ are taken as those of the mesh, as by CesiumJS. Such files are read, not written
 
 The frame of glTF is x right, y up, z towards the viewer: our frame, rotated by 180° about x.
 Readers must apply the transforms of the nodes, which place the splats in the scene. Numbers in the
-JSON have float64: the translation of the node is the `scene.origin` of the splats. Specification:
-Khronos, github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. It has no
-mark for antialiased scenes.
+JSON have float64: the translation of the node is the `scene.origin` of the splats. The unit of glTF
+is the metre: the scale of the node is the `metres_per_unit` of the splats. Files of unknown scale
+do not keep to that, so "metres_per_unit" in the "extras" of "asset" is 1 if it is known.
+Specification: Khronos, github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+It has no mark for antialiased scenes.
 """
 
 import logging
@@ -28,6 +30,8 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.glb import Document
 from snowsplat.formats.spz import parse_spz
 from snowsplat.formats.zip_members import Damaged
+from snowsplat.scene.length import stored_metres
+from snowsplat.scene.origin import Origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -50,8 +54,8 @@ _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colo
 _MOST_COPIES = 8  # maximum number of copies of the splats, by nodes that share a mesh
 _MOST_PRIMITIVES = 1 << 20  # maximum number of primitives of all nodes
 _MOST_PARTS = 1 << 12  # maximum number of primitives with splats
-_OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
-_LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
+OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
+LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
 _GLB_LIMIT = (1 << 32) - 1
 _FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
 
@@ -92,7 +96,7 @@ def read_gltf(path: Path | str) -> GaussianArrays:
             )
         else:
             parts = [(_with_logarithms(part), matrix) for part, matrix in parts]
-        placed = [_transform(part, matrix) for part, matrix in parts]
+        placed = [transformed(part, matrix) for part, matrix in parts]
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
@@ -105,7 +109,7 @@ def read_gltf(path: Path | str) -> GaussianArrays:
     )
     if any(any(part.origin) for part in placed):
         means = np.concatenate([part.world_means() for part in placed]) * packing.UP_BACK
-    return decoded(
+    found = decoded(
         path,
         means,
         scene.log_scales,
@@ -115,6 +119,11 @@ def read_gltf(path: Path | str) -> GaussianArrays:
         sh_rest,
         antialiased=scene.antialiased,
     )
+    try:
+        metres = stored_metres(document.json["asset"]["extras"]["metres_per_unit"])
+    except (KeyError, IndexError, TypeError):
+        metres = None
+    return replace(found, metres_per_unit=metres)
 
 
 def _parts(
@@ -193,7 +202,7 @@ def _with_logarithms(part: GaussianArrays) -> GaussianArrays:
     return replace(part, log_scales=packing.log_scales(part.log_scales))
 
 
-def _transform(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
+def transformed(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
     """The splats in the frame of the scene; ``world_from_mesh`` is (4, 4).
 
     Positions are relative to an origin: float32 may not be able to store the translation.
@@ -238,7 +247,7 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     quats = read(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]]
     quats[(quats == 0).all(1)] = 1, 0, 0, 0
     opacity = read(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0].astype(np.float64)
-    opacity = np.clip(opacity, *_OPACITY_RANGE)
+    opacity = np.clip(opacity, *OPACITY_RANGE)
     names = _coefficients(3)
     present = [name for name in names if name in attributes]
     if not present and "COLOR_0" in attributes:
@@ -294,12 +303,12 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     means, quats, sh_rest = packing.flip_axes(means, quats, sh_rest, packing.UP_BACK)
     opacity = (1 / (1 + np.exp(-opacity_logits))).astype("<f4")
     cut = packing.Cut(path, "glTF", len(means))
-    packing.cut_scales(cut, log_scales, *_LOG_SCALES, step=0)
+    packing.cut_scales(cut, log_scales, *LOG_SCALES, step=0)
     attributes: dict[str, np.ndarray] = {
         "POSITION": means,
         "COLOR_0": _point_colors(sh_dc, opacity),
         f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": np.exp(np.clip(log_scales, *_LOG_SCALES)),
+        f"{EXTENSION}:SCALE": np.exp(np.clip(log_scales, *LOG_SCALES)),
         f"{EXTENSION}:OPACITY": opacity[:, None],
     }
     sh = np.concatenate([sh_dc, sh_rest], 1)
@@ -313,17 +322,26 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
         raise UserError(f"{path}: {len(means)} Gaussians are too many for .glb; write .ply or .spz")
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "snowsplat"}}
     document["extensionsUsed"] = [EXTENSION]
+    if gaussians.metres_per_unit:
+        document["asset"]["extras"] = {"metres_per_unit": 1.0}
     if len(means):
-        x, y, z = gaussians.origin
-        document |= _contents(list(attributes), arrays, (x, -y, -z))
+        node = _node(gaussians.origin, gaussians.metres_per_unit or 1.0)
+        document |= _contents(list(attributes), arrays, node)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(glb.pack(document, arrays))
     cut.report(".ply keeps them")
 
 
-def _contents(
-    names: list[str], arrays: list[np.ndarray], translation: tuple[float, float, float]
-) -> dict[str, Any]:
+def _node(origin: Origin, metres: float) -> dict[str, Any]:
+    """The node that places the splats, in metres."""
+    x, y, z = origin
+    node: dict[str, Any] = {"mesh": 0, "name": "splats"}
+    if any(origin):
+        node["translation"] = [metres * x, -metres * y, -metres * z]
+    return node | ({"scale": [metres] * 3} if metres != 1 else {})
+
+
+def _contents(names: list[str], arrays: list[np.ndarray], node: dict[str, Any]) -> dict[str, Any]:
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     offset = 0
@@ -344,9 +362,6 @@ def _contents(
         offset += array.nbytes
     # The specification requires the bounds of POSITION, as exact float32 values.
     accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}
-    node: dict[str, Any] = {"mesh": 0, "name": "splats"}
-    if any(translation):
-        node["translation"] = list(translation)
     primitive = {
         "attributes": {name: index for index, name in enumerate(names)},
         "mode": _POINTS,

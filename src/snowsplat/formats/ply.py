@@ -8,7 +8,8 @@ of `GaussianArrays` is (N, K, 3)). Lower degrees have fewer f_rest properties.
 
 A comment in the header says how an antialiased scene is rendered: "SplatRenderMode: mip", which
 Brush introduced. Postshot writes "antialiased 1" or "postshot.anti_aliasing=1". The comment
-"origin X Y Z" has the `scene.origin` of a scene that is far away from 0.
+"origin X Y Z" has the `scene.origin` of a scene that is far away from 0, "metres_per_unit F" its
+true scale.
 
 Other trainers write the same layout with differences that are understood: SH of degree 4 and higher
 (gsplat, 3DGRUT), two scales (2D Gaussian splatting), filter_3D (Mip-Splatting), and red, green,
@@ -25,6 +26,7 @@ import numpy as np
 
 from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, unusable
 from snowsplat.formats.packing import FLAT
+from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, Origin, added, stored_origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -57,7 +59,7 @@ _MODES = {
     "postshot.anti_aliasing=0": False,
 }
 _REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS]
-_ORIGIN = "origin "
+_ORIGIN, _METRES = "origin ", "metres_per_unit "
 _HIGHEST_DEGREE = 10
 
 
@@ -138,7 +140,8 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
         scene = placed(*arrays, antialiased=is_antialiased(table.comments))
     if problem := unusable(scene):
         logger.warning("%s: %s; they are not shown", path, problem)
-    return replace(scene, origin=added(scene.origin, origin_in(table.comments)))
+    origin, metres = placement_in(table.comments)
+    return replace(scene, origin=added(scene.origin, origin), metres_per_unit=metres)
 
 
 def _rest_count(table: PlyTable) -> int:
@@ -184,18 +187,20 @@ def _filtered(
     return wider, np.where(unchanged, logits, result)
 
 
-def origin_in(comments: Sequence[str]) -> Origin:
-    """The origin that the last such comment has; `HERE` without one."""
-    for line in reversed(comments):
+def placement_in(comments: Sequence[str]) -> tuple[Origin, float | None]:
+    """The origin and the metres per unit that the last such comments have; `HERE` and None without
+    them."""
+    origin, metres = HERE, None
+    for line in comments:
+        try:
+            values = [float(word) for word in line.split()[1:]]
+        except ValueError:
+            continue
         if line.startswith(_ORIGIN):
-            words = line.split()[1:]
-            try:
-                origin = stored_origin([float(word) for word in words])
-            except ValueError:
-                continue
-            if origin is not None:
-                return origin
-    return HERE
+            origin = stored_origin(values) or origin
+        elif line.startswith(_METRES) and len(values) == 1:
+            metres = stored_metres(values[0]) or metres
+    return origin, metres
 
 
 def is_antialiased(comments: Sequence[str]) -> bool:
@@ -204,10 +209,11 @@ def is_antialiased(comments: Sequence[str]) -> bool:
     return bool(marks) and marks[-1]
 
 
-def scene_comments(antialiased: bool, origin: Origin) -> list[str]:
-    """The comments of a header for `is_antialiased` and `origin_in`; most scenes need none."""
-    mode = ["SplatRenderMode: mip"] if antialiased else []
-    return mode + ([_ORIGIN + " ".join(map(repr, origin))] if any(origin) else [])
+def scene_comments(antialiased: bool, origin: Origin, metres: float | None) -> list[str]:
+    """The comments of a header for `is_antialiased` and `placement_in`; most scenes need none."""
+    comments = ["SplatRenderMode: mip"] if antialiased else []
+    comments += [_ORIGIN + " ".join(map(repr, origin))] if any(origin) else []
+    return comments + ([f"{_METRES}{metres!r}"] if metres else [])
 
 
 def write_ply(path: Path | str, gaussians: GaussianArrays, *, georeferenced: bool = False) -> None:
@@ -226,6 +232,7 @@ def write_ply(path: Path | str, gaussians: GaussianArrays, *, georeferenced: boo
         [gaussians],
         antialiased=gaussians.antialiased,
         origin=gaussians.origin,
+        metres_per_unit=gaussians.metres_per_unit,
         georeferenced=georeferenced,
     )
 
@@ -238,6 +245,7 @@ def write_ply_parts(
     *,
     antialiased: bool,
     origin: Origin = HERE,
+    metres_per_unit: float | None = None,
     georeferenced: bool = False,
 ) -> None:
     """`write_ply` for a scene that does not fit into the memory: its parts one after the other.
@@ -246,7 +254,7 @@ def write_ply_parts(
         count: number of Gaussians of all parts.
         rest: K, the number of SH coefficients beyond the constant one; parts may have fewer.
         antialiased: whether the scene is marked as `Gaussians.antialiased`.
-        origin: that of all parts.
+        origin, metres_per_unit: those of all parts.
         georeferenced: see `write_ply`.
 
     Raises:
@@ -258,7 +266,8 @@ def write_ply_parts(
     row = np.dtype([("means", "<f8" if exact else "<f4", 3), ("others", "<f4", len(names) - 3)])
     written = 0
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(header(count, kinds, scene_comments(antialiased, HERE if exact else origin)))
+        comments = scene_comments(antialiased, HERE if exact else origin, metres_per_unit)
+        file.write(header(count, kinds, comments))
         for part in parts:
             for start in range(0, len(part.means), _WRITE_ROWS):
                 chunk = part.select(slice(start, start + _WRITE_ROWS))

@@ -26,6 +26,7 @@ from snowsplat.formats.ply import is_ply, read_ply, write_ply
 from snowsplat.formats.sog import is_sog, read_sog, sog_version, write_sog
 from snowsplat.formats.splat import read_splat, write_splat
 from snowsplat.formats.spz import is_spz, read_spz, spz_version, write_spz
+from snowsplat.formats.usd import is_usd, read_usd, write_usd
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading
 
@@ -47,7 +48,8 @@ class Format:
         loses: a description, for users, of the data that a scene loses in this format.
         marks_antialiased: whether a file can say that its scene is antialiased, see `Gaussians`.
         version: the version of a file that ``recognises`` accepts, if the format has several.
-        stores_origin: whether a file has the `scene.origin`; if not, it is in a file beside it.
+        stores_origin: whether a file has the `scene.origin` and the true scale; if not, they are in
+            a file beside it.
         bytes: the size of a scene; None: the scene is a single file, whose size is taken.
         instead: for users, what to do with a file of a format that cannot be read.
     """
@@ -94,8 +96,18 @@ FORMATS: list[Format] = [
     ),
     Format("gsplat checkpoint", (".pt",), is_checkpoint, read_checkpoint, None, "nothing", False),
     Format(
+        "USD",
+        (".usd", ".usdc", ".usda", ".usdz"),
+        is_usd,
+        read_usd,
+        write_usd,
+        "nothing except for rounding",
+        False,
+        stores_origin=True,
+    ),
+    Format(
         "zip file",
-        (".zip", ".ssproj", ".usdz"),
+        (".zip", ".ssproj"),
         is_archive,
         read_archive,
         None,

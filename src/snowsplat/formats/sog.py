@@ -17,7 +17,8 @@ which has these images:
 
 The entry "model" of `meta.json` is "antialiased" for an antialiased scene; other scenes have none.
 Older versions of the format have the entry "antialias" instead, as the types of Spark show.
-The entry "origin" of "asset", ours, is the `scene.origin` of a scene that is far away from 0.
+Two entries of "asset" are ours: "origin" is the `scene.origin` of a scene that is far away from 0,
+"metres_per_unit" its true scale.
 
 Version 1 has evenly spaced levels between mins and maxs instead of codebooks. A scene of version 1
 is usually a folder; `read_sog` takes the path of its `meta.json`. The coordinate frame is that of
@@ -38,6 +39,7 @@ from snowsplat.formats import packing
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
 from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, without_unusable
 from snowsplat.formats.sog_container import Bundle, Damaged
+from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, added, stored_origin
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -84,8 +86,13 @@ def read_stored(path: Path | str) -> GaussianArrays:
     antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
     scene = placed(*arrays, antialiased=antialiased)
     asset = meta.get("asset")
-    stored = stored_origin(asset.get("origin")) if isinstance(asset, dict) else None
-    return replace(scene, origin=added(scene.origin, stored or HERE))
+    asset = asset if isinstance(asset, dict) else {}
+    stored = stored_origin(asset.get("origin"))
+    return replace(
+        scene,
+        origin=added(scene.origin, stored or HERE),
+        metres_per_unit=stored_metres(asset.get("metres_per_unit")),
+    )
 
 
 def sog_files(path: Path) -> list[Path]:
@@ -277,6 +284,7 @@ def encode_sog(gaussians: GaussianArrays) -> dict[str, bytes]:
         "asset": {
             "generator": "snowsplat",
             **({"origin": list(gaussians.origin)} if any(gaussians.origin) else {}),
+            **({"metres_per_unit": metres} if (metres := gaussians.metres_per_unit) else {}),
         },
         "count": n,
         **({"model": "antialiased"} if gaussians.antialiased else {}),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from snowsplat.pipeline.output.scene_files import (
 from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
 from snowsplat.pipeline.output.scene_source import background_of, cameras_of, viewable
 from snowsplat.pipeline.refine import photos_of, refine
+from snowsplat.pipeline.true_scale import KnownDistance, compared
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
@@ -121,6 +122,7 @@ def convert(
     dataset: Path | str | None = None,
     spz_version: int | None = None,
     georeferenced: bool = False,
+    known: KnownDistance | None = None,
     overwrite: bool = False,
     observer: Observer = SILENT,
 ) -> Format:
@@ -135,6 +137,8 @@ def convert(
         spz_version: the version of an .spz file, 2 to 4; default: 3.
         georeferenced: write positions in the world instead of relative to the origin of a scene
             that is far away from 0, see `scene.origin`.
+        known: scale the scene about the origin, so that a unit is a metre; instead of
+            ``edits.scale``.
         overwrite: replace ``target``.
 
     Returns:
@@ -143,7 +147,7 @@ def convert(
     Raises:
         UserError: a missing or damaged scene, an unknown format, ``target`` exists, or
             ``spz_version`` is no version, or given for another format; ``georeferenced`` and a
-            format without doubles.
+            format without doubles; a distance that cannot be measured.
         OSError: ``target`` cannot be written.
     """
     target, edits = Path(target), edits or Edits()
@@ -165,6 +169,10 @@ def convert(
         raise SettingError("decimate", "a size is that of one file; use a number or a share")
     given = [sources] if isinstance(sources, Path | str) else sources
     files = [scene_file(Path(source)) for source in given]
+    if known is not None and edits.scale != 1:
+        raise SettingError("scale", "is determined by `scale_to`; leave one of them out")
+    metres = known and known.metres_per_unit(files[0])
+    edits = replace(edits, scale=metres) if metres else edits
     decimation = _decimation(edits, files, dataset, observer)
     with observer.waiting("reading"):
         parts = [read_gaussians(file) for file in files]
@@ -178,7 +186,16 @@ def convert(
             "the same frame?",
             target,
         )
+    if len({part.metres_per_unit for part in parts}) > 1:
+        logger.warning(
+            "%s: the scenes have different units or unknown ones; the true scale is that of the "
+            "first one",
+            target,
+        )
     scene = edits.reduced(edit.merge(parts))
+    if metres:
+        observer.note(compared(metres, scene.metres_per_unit))
+        scene = replace(scene, metres_per_unit=metres)
     write: Callable[[Path, Gaussians], None] = write_gaussians
     if spz_version is not None:
         write = partial(write_gaussians, version=spz_version)

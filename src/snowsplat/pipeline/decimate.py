@@ -9,12 +9,12 @@ from pathlib import Path
 
 import torch
 
-from snowsplat.formats.origin_file import read_origin, write_origin
+from snowsplat.formats.origin_file import Place, read_place, write_place
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.origin import HERE, Origin
+from snowsplat.scene.origin import Origin
 from snowsplat.scene.simplify import simplify
 from snowsplat.training.core.distillation import distill
 from snowsplat.training.core.progress import Progress
@@ -112,7 +112,7 @@ def write_within(
             if not count:
                 raise SettingError("decimate", f"no scene fits into {format_bytes(size)}; use more")
             path.replace(temporary)
-            write_origin(target, read_origin(path))
+            write_place(target, read_place(path))
         finally:
             path.unlink(missing_ok=True)
-            write_origin(path, HERE)
+            write_place(path, Place())

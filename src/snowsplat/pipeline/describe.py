@@ -42,7 +42,8 @@ def describe(path: Path | str) -> dict[str, Any]:
       what is impossible or doubtful about the cameras.
 
     Bounds and lengths are in world units, in the frame of the file, relative to the "origin" of a
-    scene or dataset that has one (`scene.origin`). torch is imported only where it is needed.
+    scene or dataset that has one (`scene.origin`). "metres_per_unit" is the true scale, if it is
+    known. torch is imported only where it is needed.
 
     Raises:
         UserError: ``path`` is missing, damaged, or of an unknown kind.
@@ -97,6 +98,8 @@ def _gaussians(gaussians: GaussianArrays) -> dict[str, Any]:
     }
     if any(gaussians.origin):
         facts["origin"] = list(gaussians.origin)
+    if gaussians.metres_per_unit:
+        facts["metres_per_unit"] = gaussians.metres_per_unit
     if usable_count < count:
         facts["not_finite"] = count - usable_count
     if usable_count:
@@ -234,6 +237,7 @@ def _dataset(path: Path) -> dict[str, Any]:
         "points": 0 if dataset.points is None else len(dataset.points),
         "extent": float(f"{dataset.extent:.5g}"),
         **({"origin": list(dataset.origin)} if any(dataset.origin) else {}),
+        **({"metres_per_unit": metres} if (metres := dataset.metres_per_unit) else {}),
         "bounds": [_rounded(corner) for corner in dataset.bounds.tolist()],
         "impossible": [finding.text for finding in findings if finding.impossible],
         "doubtful": [finding.text for finding in findings if not finding.impossible],

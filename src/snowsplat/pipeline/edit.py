@@ -71,7 +71,8 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     if changes.scale != 1:
         x, y, z = kept.origin
         moved_to = changes.scale * x, changes.scale * y, changes.scale * z
-        kept = replace(transform(kept, larger), origin=moved_to)
+        # The page asks for the true distance in metres, so a unit is a metre now.
+        kept = replace(transform(kept, larger), origin=moved_to, metres_per_unit=1.0)
     start = source.start and source.start.transformed(larger)
     if changes.start is not None:
         back = Similarity.identity() if change is None else change.inverse()

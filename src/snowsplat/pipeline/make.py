@@ -52,7 +52,7 @@ from snowsplat.training.settings.config import AutoOnOff, TrainConfig
 from snowsplat.training.settings.declare import Settings, same, setting
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import read_json
@@ -89,6 +89,7 @@ class MakeOptions(Settings):
         hold_out: hold out every N-th photo until the scene is evaluated; None: none.
         title: the name of the scene in reports and on pages; None: the name of its photos.
         exposure: whether to learn a gain for each photo and channel; see ``TrainConfig.exposure``.
+        marker: the side of the printed markers in the photos, in metres; None: there are none.
         compute: device and threads.
 
     Raises:
@@ -103,6 +104,9 @@ class MakeOptions(Settings):
     )
     title: str | None = None
     exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
+    marker: float | None = setting(
+        None, "Side of the printed markers in metres.", above=0.0, allowed="a number above 0"
+    )
     compute: Compute = field(default_factory=Compute)
 
 
@@ -264,7 +268,14 @@ class _Job:
         if posed is None:
             return None
         self.sources = replace(self.sources, notes=[])  # they offer the poses
-        return given_poses(self.sources, self._dataset_settings(posed), self.observer)
+        given = given_poses(self.sources, self._dataset_settings(posed), self.observer)
+        if given is not None and self.options.marker is not None:
+            raise SettingError(
+                "marker",
+                f"is for poses that are estimated, and {posed} has its own; make it of the photos "
+                "alone, or scale the scene afterwards: snowsplat convert --scale-to",
+            )
+        return given
 
     @contextmanager
     def _removed_if_alone(self) -> Iterator[None]:
@@ -305,6 +316,7 @@ class _Job:
                 threads=self.options.compute.threads,
                 seconds=self.options.minutes and POSES_SHARE * 60.0 * self.options.minutes,
             ),
+            marker=self.options.marker,
         )
         observer, later = self.observer, self._later()
         outcomes = make_dataset(

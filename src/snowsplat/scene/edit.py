@@ -39,6 +39,7 @@ def transform(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
         quats=quat_product(turn, quats),
         sh_rest=_rotate_sh(gaussians.sh_rest, similarity.rotation),
         origin=HERE,
+        metres_per_unit=gaussians.metres_per_unit and gaussians.metres_per_unit / similarity.scale,
     )
 
 

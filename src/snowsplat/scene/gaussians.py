@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -44,6 +44,7 @@ class Gaussians:
             with it: see `ops.project`. Scene files call this mode "mip" or "antialiased".
         origin: what is added to the means to get positions in the world, see `scene.origin`.
             Rendering and training do not use it: cameras are relative to the origin, too.
+        metres_per_unit: the true length of a world unit; None: unknown. See `scene.length`.
 
     Raises:
         ValueError: shapes, dtypes or devices do not match.
@@ -57,6 +58,7 @@ class Gaussians:
     sh_rest: Tensor
     antialiased: bool = field(default=False, kw_only=True)
     origin: Origin = field(default=HERE, kw_only=True)
+    metres_per_unit: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -140,8 +142,8 @@ class Gaussians:
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
         """Other Gaussians, by the names of `parameters`, that are rendered as these."""
-        tensors = (parameters[name] for name in self.parameters())
-        return Gaussians(*tensors, antialiased=self.antialiased, origin=self.origin)
+        own: dict[str, Any] = {name: parameters[name] for name in self.parameters()}
+        return replace(self, **own)
 
     def select(self, index: Tensor) -> Gaussians:
         """The rows ``index``: (M,) integers in any order, or an (N,) bool mask."""

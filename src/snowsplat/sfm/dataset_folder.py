@@ -36,6 +36,7 @@ from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.sources import RECORDS, Sources, find_sources
 from snowsplat.sfm.orient import orientation
+from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
 from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
@@ -63,12 +64,14 @@ class DatasetOptions:
         sfm: options of the pose estimation.
         resize: also make images_2, images_4 and images_8.
         skip_matching: use the existing model in distorted/sparse/0 instead of estimating poses.
+        marker: the side of the printed markers in the photos, in metres; None: there are none.
     """
 
     gather: GatherOptions = field(default_factory=GatherOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     resize: bool = False
     skip_matching: bool = False
+    marker: float | None = None
 
 
 class Watcher(Protocol):
@@ -196,7 +199,10 @@ def _run(
     def make_images(report: Report) -> dict[str, Any]:
         return _undistort(folder, photos, options, report)
 
-    stage("images", {"resize": options.resize}, _IMAGE_FOLDERS, make_images)
+    of_images: dict[str, Any] = {"resize": options.resize}
+    if options.marker is not None:  # earlier versions did not have this setting
+        of_images["marker"] = options.marker
+    stage("images", of_images, _IMAGE_FOLDERS, make_images)
 
     def write(report: Report) -> dict[str, Any]:
         sfm, coverage = outcomes["poses"].result, measure_coverage(folder / "sparse" / "0")
@@ -249,7 +255,10 @@ def _undistort(
     for name in _IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
     model = pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0")
-    oriented = orientation(model, photos)
+    marker: tuple[MarkerScale | None, list[str]] = (None, [])
+    if options.marker is not None:
+        marker = scale_of_markers(model, photos, folder / "input", options.marker)
+    oriented = orientation(model, photos, marker)
     scene_from_sfm, threads = oriented.scene_from_sfm, options.sfm.threads
     made = undistort(folder, photos, scene_from_sfm, options.resize, report, threads=threads)
     return asdict(made) | {

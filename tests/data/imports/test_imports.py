@@ -145,6 +145,7 @@ def test_depth_maps_have_a_unit(tmp_path):
     exports.polycam(tmp_path)
     dataset = load_dataset(tmp_path, hold_out=None)
     assert [view.depth_unit for view in dataset.train] == [1e-3] * len(NAMES)
+    assert dataset.metres_per_unit == 1
     assert all(view.depth is not None for view in dataset.train)
     assert all(view.depth_confidence.parent.name == "confidence" for view in dataset.train)
     assert dataset.description == "Polycam corrected_cameras, 4 of 4 photos aligned"

@@ -49,6 +49,7 @@ class Kind:
         is_one: whether a file or folder is one of them.
         read: reads one of them. Errors are `UserError`.
         photos: the folder of photos, if other images of the dataset are not photos.
+        metres_per_unit: of its world; None: it has any unit.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Kind:
     is_one: Callable[[Path], bool]
     read: Callable[[Path, PhotoFolder], Reconstruction]
     photos: Callable[[Path], Path | None] = _nowhere
+    metres_per_unit: float | None = None
 
     def find(self, folder: Path) -> Iterator[Path]:
         """The files that describe the cameras of a dataset, the best first.
@@ -71,8 +73,8 @@ class Kind:
 KINDS = (
     Kind("Metashape", ("*.xml",), metashape.is_metashape, metashape.read),
     Kind("RealityScan", ("*.csv",), realityscan.is_realityscan, realityscan.read),
-    Kind("Polycam", polycam.PATTERNS, polycam.is_polycam, polycam.read, polycam.photos),
-    Kind("Record3D", record3d.PATTERNS, record3d.is_record3d, record3d.read, record3d.photos),
+    Kind("Polycam", polycam.PATTERNS, polycam.is_polycam, polycam.read, polycam.photos, 1.0),
+    Kind("Record3D", record3d.PATTERNS, record3d.is_record3d, record3d.read, record3d.photos, 1.0),
     Kind("OpenMVG", ("sfm_data*.json",), openmvg.is_openmvg, openmvg.read),
     Kind("AliceVision", ("*.sfm", "sfm.json"), alicevision.is_alicevision, alicevision.read),
     Kind("Bundler", bundler.PATTERNS, bundler.is_bundler, bundler.read),

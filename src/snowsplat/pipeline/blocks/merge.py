@@ -83,7 +83,15 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
     scene = OutputFolder(folder).scene_path(max(steps))
     scene.parent.mkdir(parents=True, exist_ok=True)
     own_rows = (part()[1] for part in parts)
-    write_ply_parts(scene, sum(counts), rest, own_rows, antialiased=antialiased, origin=plan.origin)
+    write_ply_parts(
+        scene,
+        sum(counts),
+        rest,
+        own_rows,
+        antialiased=antialiased,
+        origin=plan.origin,
+        metres_per_unit=plan.metres_per_unit,
+    )
     if output is not None:
         with atomic_path(output) as temporary:
             shutil.copyfile(scene, temporary)

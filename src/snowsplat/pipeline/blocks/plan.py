@@ -61,6 +61,7 @@ class Plan:
         axes: the axes of the ground plane.
         margin: the margin by which cells are expanded, as a share of their size.
         origin: that of the whole dataset; cells and the merged scene are relative to it.
+        metres_per_unit: that of the whole dataset.
     """
 
     dataset: DatasetSettings
@@ -70,6 +71,7 @@ class Plan:
     margin: float
     blocks: list[Block]
     origin: Origin = HERE
+    metres_per_unit: float | None = None
 
     @staticmethod
     def read(folder: Path) -> Plan:
@@ -179,7 +181,16 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     if config.sky and not config.sky_distance:  # so that the parts of the sky fit
         distance = sky_distance([view.camera for view in whole.train])
         shared["sky_distance"] = float(f"{distance:.4g}")
-    plan = Plan(settings, options.recipe, shared, axes, options.margin, [], whole.origin)
+    plan = Plan(
+        settings,
+        options.recipe,
+        shared,
+        axes,
+        options.margin,
+        [],
+        whole.origin,
+        whole.metres_per_unit,
+    )
     plan.write(folder)  # without blocks: it is unfinished
     limit, blocks, digits = config.density.max_gaussians, [], max(2, len(str(options.blocks)))
     for number, content in enumerate(contents, 1):

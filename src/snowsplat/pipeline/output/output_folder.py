@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
-from snowsplat.formats.origin_file import origin_file, read_origin, write_origin
+from snowsplat.formats.origin_file import Place, origin_file, read_place, write_place
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import (
@@ -200,7 +200,7 @@ class OutputFolder:
             points = dataset.points
             write_points(self.path / "input.ply", points.xyz.numpy(), points.rgb.numpy())
         self.write_cameras([*dataset.train, *dataset.test])
-        write_origin(self.path / _CAMERAS, dataset.origin)
+        write_place(self.path / _CAMERAS, Place(dataset.origin, dataset.metres_per_unit))
 
     def write_cameras(self, views: Sequence[View]) -> None:
         """Write `cameras.json`."""
@@ -216,7 +216,7 @@ class OutputFolder:
 
     def origin(self) -> Origin | None:
         """That of `cameras.json`; None if the cameras are in the world, or it is not known."""
-        origin = read_origin(self.path / _CAMERAS)
+        origin = read_place(self.path / _CAMERAS).origin
         return origin if any(origin) else None
 
     def write_config(self, settings: DatasetSettings, config: TrainConfig) -> None:

@@ -18,6 +18,7 @@ from snowsplat.sfm.ingest.attitude import UPRIGHT
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.ground import of_ground
+from snowsplat.sfm.orient.marker import MarkerScale
 from snowsplat.sfm.orient.positions import Alignment, align
 from snowsplat.sfm.orient.up import Evidence, combined, of_cameras, of_sensors, robust_mean
 
@@ -64,17 +65,23 @@ class _North:
     error: float  # radians
 
 
-def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) -> Oriented:
+def orientation(
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo] = (),
+    marker: tuple[MarkerScale | None, list[str]] = (None, []),
+) -> Oriented:
     """The frame of the scene, in which y points down.
 
     Up is combined from all evidence; see `up`. If GPS positions or a gimbal tell where north is, z
     points north and x east. Otherwise, z is the mean viewing direction, made horizontal. The origin
     is the point that the cameras look at. If they look outwards or all in the same direction, it is
-    the median of the points. If GPS positions determine the scale, the unit is a metre. Otherwise,
-    the median distance from a camera to the points that it sees is `VIEWING_DISTANCE`.
+    the median of the points. If markers or GPS positions determine the scale, the unit is a metre;
+    markers are more accurate. Otherwise, the median distance from a camera to the points that it
+    sees is `VIEWING_DISTANCE`.
 
     Args:
         photos: with the metadata; photos that are not in the model are ignored.
+        marker: the result of `scale_of_markers`.
 
     Raises:
         ValueError: the model has no cameras.
@@ -85,7 +92,8 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
     cameras = _upright(cameras, known)
     up, doubts = _up(cameras, known)
     gps, more = _gps(cameras, known, up)
-    doubts += more
+    measured, of_markers = marker
+    doubts += more + of_markers
     up_from, direction, level_error = list(up.names), up.up, up.error
     if gps is not None:
         direction = gps.alignment.rotation[2]
@@ -114,6 +122,24 @@ def orientation(model: pycolmap.Reconstruction, photos: Sequence[Photo] = ()) ->
             scale_error=gps.alignment.scale_error,
             position_error=gps.alignment.error,
             origin=location_of(gps.alignment.place(cameras.subject[None])[0], gps.origin),
+        )
+    if measured is not None:
+        if gps is not None:
+            ratio = measured.metres_per_unit / scale
+            if abs(math.log(ratio)) > _CONTRADICTION * math.hypot(
+                gps.alignment.scale_error, measured.error
+            ):
+                doubts.append(
+                    f"by the marker, the scene is {100 * abs(ratio - 1):.0f}% "
+                    f"{'larger' if ratio > 1 else 'smaller'} than by GPS; is its side right?"
+                )
+        scale = measured.metres_per_unit
+        placement = replace(
+            placement,
+            metres_per_unit=1.0,
+            scale_from=measured.name,
+            scale_error=measured.error,
+            position_error=None,
         )
     shift = -scale * rotation @ cameras.subject
     return Oriented(

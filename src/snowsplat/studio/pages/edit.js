@@ -215,7 +215,10 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
 
     function tellDistance() {
         const found = distance();
-        measure_.textContent = found ? say("edit_distance", found.toPrecision(4)) : say("edit_two_points");
+        // Set scale makes a unit of the scene that is saved a metre.
+        const metres = scale === 1 ? scene.metres : 1;
+        const length = metres ? `${(metres * found).toPrecision(4)} m` : found.toPrecision(4);
+        measure_.textContent = found ? say("edit_distance", length) : say("edit_two_points");
         rescale.disabled = !found;
         draw();
     }

@@ -189,7 +189,13 @@ class Run:
         for part in parts:
             part.prepare(self)
         first = self.shards.scattered(self._first())
-        self.gaussians = replace(first, antialiased=config.antialias, origin=self.dataset.origin)
+        initial = None if self.initial is None else self.initial.metres_per_unit
+        self.gaussians = replace(
+            first,
+            antialiased=config.antialias,
+            origin=self.dataset.origin,
+            metres_per_unit=initial or self.dataset.metres_per_unit,
+        )
         # A regulariser acts on all Gaussians, not only on those that a view shows.
         self.optimizer = Adam(
             self.gaussians,

@@ -56,13 +56,15 @@ def panel_settings(
     pictures: str,
     hiding: Hiding,
     scale: float,
+    metres: float | None,
     chosen: bool,
 ) -> dict[str, Any]:
     """What the script needs.
 
     ``gaussians``: their number. ``start``: the initial view. ``stops``: also have the subject,
     which Frame shows. ``pictures``: the address of the image with the pictures of the stops.
-    ``scale``: of the page relative to the scene file. ``chosen``: a person has chosen the start.
+    ``scale``: of the page relative to the scene file. ``metres``: in a unit of the scene file, if
+    that is known. ``chosen``: a person has chosen the start.
     """
     x, y, z = stops.middle.tolist()
     return {
@@ -76,6 +78,7 @@ def panel_settings(
         "pictures": pictures,
         "hiding": hiding.settings(),
         "scale": scale,
+        "metres": metres,
         "chosen": chosen,
     }
 

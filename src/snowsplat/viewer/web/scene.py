@@ -104,6 +104,7 @@ class ReadyScene(NamedTuple):
     background: Sequence[float]  # red, green, blue in 0..1
     hiding: Hiding  # what the page can hide
     scale: float  # of the frame, relative to that of the scene that was given
+    metres: float | None  # in a unit of the scene that was given, if that is known
     chosen: bool  # whether the initial view was given
 
     def complete(self) -> ReadyScene:
@@ -130,6 +131,7 @@ class ReadyScene(NamedTuple):
                 pictures,
                 self.hiding,
                 self.scale,
+                self.metres,
                 self.chosen,
             ),
         }
@@ -148,6 +150,7 @@ def ready(
     ``start``: the initial view; None: that of the first camera. ``turn``: see `viewing_frame`.
     """
     change, depth = viewing_frame(gaussians, cameras, turn=turn)
+    metres = gaussians.metres_per_unit
     if change is not None:
         gaussians = transform(gaussians, change)
         depth *= change.scale
@@ -158,9 +161,8 @@ def ready(
     film = _film(cameras, depth) if cameras else []
     first = start or (stops.views[0] if cameras else overview(gaussians))
     scale = change.scale if change else 1.0
-    return ReadyScene(
-        gaussians, first, film, stops, background, hiding, scale, chosen=start is not None
-    )
+    chosen = start is not None
+    return ReadyScene(gaussians, first, film, stops, background, hiding, scale, metres, chosen)
 
 
 def viewing_frame(

@@ -1,0 +1,222 @@
+"""OpenUSD files with a ParticleField3DGaussianSplat, the schema of OpenUSD 26.03 and newer.
+
+`.usd`, `.usdc`, `.usda` and `.usdz` are written and read by the package usd-core, which is an
+optional extra: `pip install "snowsplat[usd]"`.
+
+The splats are one prim with arrays: positions; orientations; scales, the standard deviations
+themselves; opacities in 0 … 1; and SH coefficients in the basis and order of our renderer, all
+those of a particle together, the constant one first. Values of any of these arrays may have 16 bits
+(`positionsh` …). The stage has y up, and metres are its unit: the frame and the scale of the prim
+are as in glTF (see `gltf`), its translation is the `scene.origin`. A stage states a unit even where
+it is unknown, so "metres_per_unit" in "snowsplat" of its customLayerData is 1 if it is known. The
+schema has no mark for antialiased scenes. Specification: openusd.org, schema domain usdVol.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snowsplat.formats import packing
+from snowsplat.formats.archive import first_member
+from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gltf import LOG_SCALES, OPACITY_RANGE, transformed
+from snowsplat.formats.zip_members import Damaged
+from snowsplat.scene.length import stored_metres
+from snowsplat.scene.sh_constants import SH_REST_COUNTS
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import atomic_path
+
+_SUFFIXES = (".usdc", ".usda", ".usd")
+_PRIM = "/scene/splats"
+_OWN = "snowsplat"
+# The radius of a Gaussian in its extent, in standard deviations.
+_RADIUS = 3.0
+
+
+def is_usd(head: bytes) -> bool:
+    """Whether a file that begins with ``head`` is a USD file or a USDZ package."""
+    name = first_member(head)
+    return head.startswith((b"PXR-USDC", b"#usda ")) or bool(name and name.endswith(_SUFFIXES))
+
+
+@contextmanager
+def _usd(path: Path) -> Iterator[tuple[Any, ...]]:
+    """Usd, UsdGeom, UsdUtils, UsdVol, Sdf and Vt of OpenUSD.
+
+    Raises: UserError: they are not installed, or OpenUSD reports an error.
+    """
+    try:
+        from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
+
+        UsdVol.ParticleField3DGaussianSplat  # noqa: B018 since OpenUSD 26.03
+    except (ImportError, AttributeError):
+        raise UserError(
+            f"{path}: USD files need OpenUSD 26.03 or newer; pip install 'snowsplat[usd]', or use "
+            ".glb"
+        ) from None
+    try:
+        yield Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt
+    except Tf.ErrorException as error:
+        reason = re.sub(r"^.* : '|'$", "", str(error).strip().splitlines()[-1].strip())
+        raise UserError(
+            f"{path}: OpenUSD reports: {reason[:200]}; copy or export it again"
+        ) from None
+
+
+def read_usd(path: Path | str) -> GaussianArrays:
+    """Read all splats of the stage, placed by their prims, as one set of Gaussians.
+
+    Raises:
+        UserError: usd-core is missing; the file cannot be read, is damaged, or has no splats.
+    """
+    path = Path(path)
+    packing.read_file(path)  # a clear error if that is not possible
+    with _usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
+        stage = Usd.Stage.Open(str(path))
+        unit = UsdGeom.GetStageMetersPerUnit(stage)
+        own = stage.GetRootLayer().customLayerData.get(_OWN, {})
+        metres = stored_metres(own.get("metres_per_unit")) if isinstance(own, dict) else None
+        # In a stage with z up, z becomes y, and y becomes -z.
+        upright = np.eye(4)
+        if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
+            upright[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+        places = UsdGeom.XformCache()
+        parts = []
+        try:
+            for prim in stage.Traverse():
+                if prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+                    # USD multiplies rows by matrices from the right.
+                    matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
+                    parts.append(transformed(_splats(prim), matrix))
+        except Damaged as error:
+            raise UserError(f"{path}: {error}; copy or export it again") from None
+    if not parts:
+        raise UserError(
+            f"{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)"
+        )
+    scene = GaussianArrays.cat(parts)
+    means, quats, sh_rest = packing.flip_axes(
+        scene.world_means(), scene.quats, scene.sh_rest, packing.UP_BACK
+    )
+    found = decoded(
+        path, means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest
+    )
+    # A file of ours is in metres; another unit is that of another program that has edited it.
+    return replace(found, metres_per_unit=metres and metres * unit)
+
+
+def _splats(prim: Any) -> GaussianArrays:
+    """The splats of a prim in its frame. Raises: Damaged: lengths that do not match."""
+
+    def read(name: str, width: int) -> np.ndarray | None:
+        for each in (name, f"{name}h"):
+            value = prim.GetAttribute(each).Get()
+            if value is not None and len(value):
+                return np.array(value, np.float32).reshape(-1, width)
+        return None
+
+    means = read("positions", 3)
+    count = 0 if means is None else len(means)
+    if means is None:
+        return GaussianArrays.empty()
+
+    def column(name: str, width: int, default: float) -> np.ndarray:
+        """By the schema, longer arrays are cut and shorter ones are ignored."""
+        values = read(name, width)
+        if values is None or len(values) < count:
+            return np.full((count, width), default, np.float32)
+        return values[:count]
+
+    quats = column("orientations", 4, 0.0)[:, [3, 0, 1, 2]]
+    quats[(quats == 0).all(1)] = 1, 0, 0, 0
+    opacity = np.clip(column("opacities", 1, 1.0)[:, 0].astype(np.float64), *OPACITY_RANGE)
+    stored = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    size = (int(stored if stored is not None else 3) + 1) ** 2
+    sh = read("radiance:sphericalHarmonicsCoefficients", 3)
+    if size < 1 or sh is None or len(sh) < count * size:
+        sh = np.zeros((count, 3), np.float32)  # the constant colour 0.5
+        size = 1
+    sh = sh[: count * size].reshape(count, size, 3)[:, : 1 + SH_REST_COUNTS[-1]]
+    return GaussianArrays(
+        means,
+        packing.log_scales(column("scales", 3, 1.0)),
+        quats,
+        np.log(opacity / (1 - opacity)).astype(np.float32),
+        np.ascontiguousarray(sh[:, :1]),
+        np.ascontiguousarray(sh[:, 1:]),
+    )
+
+
+@np.errstate(over="ignore", under="ignore")
+def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
+    """Write one prim of splats, atomically; the suffix selects the kind of file.
+
+    Raises:
+        UserError: usd-core is missing.
+        OSError: the folder is missing or not writable, or the disk is full.
+    """
+    path = Path(path)
+    scene = packing.packable(path, gaussians)
+    means, quats, sh_rest = packing.flip_axes(
+        scene.means, scene.quats, scene.sh_rest, packing.UP_BACK
+    )
+    cut = packing.Cut(path, "USD", len(means))
+    packing.cut_scales(cut, scene.log_scales, *LOG_SCALES, step=0)
+    scales = np.exp(np.clip(scene.log_scales, *LOG_SCALES))
+    opacities = (1 / (1 + np.exp(-scene.opacity_logits))).astype(np.float32)
+    sh = np.concatenate([scene.sh_dc, sh_rest], 1)
+    metres = gaussians.metres_per_unit or 1.0
+    with _usd(path) as (Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt):
+        kind = path.suffix.lower()
+        layer = Sdf.Layer.CreateAnonymous(".usda" if kind == ".usda" else ".usdc")
+        stage = Usd.Stage.Open(layer)
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, str(Path(_PRIM).parent)).GetPrim())
+        known = {"metres_per_unit": 1.0} if gaussians.metres_per_unit else {}
+        layer.customLayerData = {_OWN: known}
+        splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PRIM)
+        x, y, z = gaussians.origin
+        if any(gaussians.origin):
+            splats.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(
+                (metres * x, -metres * y, -metres * z)
+            )
+        if metres != 1:
+            splats.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set((metres,) * 3)
+        flat = np.ascontiguousarray
+        splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(flat(means)))
+        # Arrays of quaternions have the real part last.
+        splats.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(flat(quats[:, [1, 2, 3, 0]])))
+        splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(flat(scales)))
+        splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
+        splats.CreateRadianceSphericalHarmonicsDegreeAttr(SH_REST_COUNTS.index(sh_rest.shape[1]))
+        splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(
+            Vt.Vec3fArray.FromNumpy(flat(sh.reshape(-1, 3)))
+        )
+        if len(means):
+            reach = _RADIUS * scales.max(1, keepdims=True)
+            corners = np.stack([(means - reach).min(0), (means + reach).max(0)])
+            splats.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
+        with atomic_path(path) as temporary:
+            # OpenUSD selects the kind of a file by its suffix.
+            inner = temporary.with_name(f"{temporary.name}{'.usdc' if kind == '.usdz' else kind}")
+            package = temporary.with_name(f"{temporary.name}.usdz")
+            try:
+                layer.Export(str(inner))
+                if kind == ".usdz":
+                    asset = Sdf.AssetPath(str(inner))
+                    UsdUtils.CreateNewUsdzPackage(asset, str(package), "scene.usdc")
+                    inner.unlink()
+                    inner = package
+                inner.replace(temporary)
+            finally:
+                for file in (inner, package):
+                    file.unlink(missing_ok=True)
+    cut.report(".ply keeps them")

@@ -1,0 +1,115 @@
+"""The true scale of a scene from a known distance, between two points or two photos of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from snowsplat.pipeline.output.edit_record import read_record
+from snowsplat.pipeline.output.scene_paths import folder_around
+from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.length import metres_of
+from snowsplat.util.errors import SettingError
+from snowsplat.util.safe_json import quoted
+
+_EXAMPLE = "0,0.5,2 for a point, or the name of a photo"
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """A distance that a person has measured.
+
+    Attributes:
+        length: as text with a unit, such as "0.45m"; see `metres_of`.
+        between: what it is between: two points "X,Y,Z" in the world of the scene, in the frame of
+            a PLY, or the names of two photos, with or without suffix.
+
+    Raises:
+        SettingError: the length is none, or the two are the same.
+    """
+
+    length: str
+    between: tuple[str, str]
+
+    def __post_init__(self) -> None:
+        try:
+            metres_of(self.length)
+        except ValueError as error:
+            raise SettingError("scale_to", str(error)) from None
+        if not all(self.between):
+            raise SettingError("scale_to", f"between what? add `between` A B, each {_EXAMPLE}")
+        if self.between[0] == self.between[1]:
+            raise SettingError("between", f"{self.between[0]} twice; use two different places")
+
+    def metres_per_unit(self, scene: Path) -> float:
+        """The true length of a unit of the world of ``scene``, a file.
+
+        Raises:
+            SettingError: a photo is not known, or the two places are the same.
+            UserError: the list of the cameras is damaged.
+        """
+        a, b = (_point(text) for text in self.between)
+        if a is None or b is None:
+            photos = _positions(scene)
+            a = _photo(self.between[0], photos) if a is None else a
+            b = _photo(self.between[1], photos) if b is None else b
+        distance = float(np.linalg.norm(a - b))
+        # The digits that a person writes, and poses, do not tell nearer places apart.
+        if distance <= 1e-6 * max(np.abs(a).max(), np.abs(b).max()):
+            raise SettingError(
+                "between", "the two are at the same place; use two that are far apart"
+            )
+        return metres_of(self.length) / distance
+
+
+def _point(text: str) -> np.ndarray | None:
+    """(3,) the point that ``text`` states; None if it is not three numbers."""
+    try:
+        point = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        return None
+    return point if point.shape == (3,) and np.isfinite(point).all() else None
+
+
+def _positions(scene: Path) -> dict[str, np.ndarray]:
+    """The positions (3,) of the photos of the training of ``scene``, at the scale of this file."""
+    record = read_record(scene)
+    original = scene.with_name(Path(record.scene).name) if record else scene
+    file = folder_around(original).path / "cameras.json"
+    if not file.is_file():
+        return {}
+    names, cameras = read_cameras(file)
+    scale = record.scale if record else 1.0
+    positions = (scale * camera.position.numpy() for camera in cameras)
+    return dict(zip(names, positions, strict=True))
+
+
+def _photo(name: str, photos: dict[str, np.ndarray]) -> np.ndarray:
+    if not photos:
+        raise SettingError(
+            "between",
+            f"{quoted(name)} is no point, and the photos of this file are not known; use "
+            f"{_EXAMPLE} of an output folder",
+        )
+    wanted = str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix else name
+    found = photos.get(name, photos.get(wanted))
+    if found is None:
+        first = quoted(next(iter(photos)))
+        raise SettingError(
+            "between",
+            f"{quoted(name)} is neither a point nor one of {len(photos)} photos ({first} …); use "
+            f"{_EXAMPLE}",
+        )
+    return found
+
+
+def compared(metres: float, before: float | None) -> str:
+    """A line about the scale that a scene gets, beside the one that it had."""
+    line = f"true scale: 1 unit was {metres:.6g} m; 1 unit of the written scene is 1 m"
+    if before is None:
+        return line
+    percent = 100 * abs(math.expm1(math.log(metres / before)))
+    return f"{line}; {percent:.2g}% {'more' if metres > before else 'less'} than it said before"
