@@ -5,11 +5,16 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+import torch
 
+from snowsplat.formats import write_gaussians
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.studio import job
 from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library
@@ -33,6 +38,18 @@ try:
 except InUse:
     sys.exit(2)
 """
+
+
+def of_the_command_line(folder: Path, step: int = 5) -> Path:
+    """An output folder of training; returns its scene."""
+    folder.mkdir(exist_ok=True)
+    settings = "eval=True, images='images', resolution=-1, sh_degree=1, source_path='photos'"
+    (folder / "cfg_args").write_text(f"Namespace({settings}, white_background=False)")
+    file = OutputFolder(folder).scene_path(step)
+    file.parent.mkdir(parents=True)
+    box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
+    write_gaussians(file, Gaussians.random_in_bounds(box, 50, torch.Generator().manual_seed(0), 1))
+    return file
 
 
 @dataclass

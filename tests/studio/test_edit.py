@@ -15,8 +15,10 @@ from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.publish import publish
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.studio.library import Scene
+from snowsplat.util.files import write_json
 
 from ..browser import Browser, Page
+from .conftest import of_the_command_line
 
 N = 301
 
@@ -62,6 +64,46 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert len(read_sog(finished.site / "scene.sog").means) == N
     assert not finished.exports.exists()  # they were those of the edited scene
     assert studio.ask(f"{address}/edit", "DELETE")[0] == 400
+
+
+def test_a_scene_is_renamed_and_removed(studio, finished):
+    address = f"scenes/{finished.name}"
+    assert studio.ask("scenes")[1][0]["picture"]
+    assert studio.ask(f"{address}/picture")[1].startswith(b"\xff\xd8")
+    for title in ("", " \n", None, 7):
+        assert studio.ask(f"{address}/rename", "POST", {"title": title})[0] == 400
+    assert studio.ask(f"{address}/rename", "POST", {"title": "My\nbox"}) == (200, {})
+    assert studio.ask(address)[1]["title"] == "My box"
+    assert "<title>My box</title>" in (finished.site / "index.html").read_text("utf-8")
+    assert studio.ask(address, "DELETE") == (200, {"photos": None})
+    assert studio.ask(address)[0] == 404
+    assert studio.ask("scenes") == (200, [])
+
+
+def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
+    file = of_the_command_line(studio.library.folder / "tour")
+    write_json(file.parents[2] / "metrics.json", {"split": "test", "psnr": 27.5})
+    address = "scenes/tour"
+    assert studio.ask(address)[1]["status"] == "found"
+    assert studio.ask(f"{address}/open", "POST", {}) == (200, {"file": "point_cloud.ply"})
+    about = studio.ask(address)[1]
+    assert (about["status"], about["found"]) == ("done", True)
+    assert (about["state"]["result"]["gaussians"], about["state"]["result"]["psnr"]) == (50, 27.5)
+    assert studio.ask(f"{address}/open", "POST", {}) == (200, {})  # it is there
+    changes = edit_of(np.arange(50) < 20)
+    assert studio.ask(f"{address}/edit", "POST", changes) == (
+        200,
+        {"file": f"{file.stem}_edited.ply"},
+    )
+    assert studio.ask(f"{address}/exports/spz", "POST", {})[0] == 200
+    assert len(read_gaussians(file.parents[2] / "studio/exports/tour.spz")) == 30
+    # The training goes on: the page is that of another scene.
+    of_the_command_line(studio.library.folder / "tour", 7)
+    assert studio.ask(address)[1]["status"] == "found"
+    assert studio.ask(f"{address}/start", "POST", {})[0] == 400
+    assert studio.ask(f"{address}/uploads?path=a&size=1&start=0", "PUT", b"x")[0] == 400
+    assert studio.ask(address, "DELETE")[0] == 400
+    assert file.is_file()
 
 
 def test_hostile_changes(studio, finished):

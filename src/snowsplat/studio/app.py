@@ -4,7 +4,9 @@
     GET  /about                       addresses for other devices
     GET  /browse?path=                folders of this machine
     GET  /scenes                      all scenes; POST makes a new one
-    GET  /scenes/NAME                 a scene: its settings, progress and result
+    GET  /scenes/NAME                 a scene: its settings, progress and result; DELETE removes it
+    GET  /scenes/NAME/picture         a small picture of it
+    POST /scenes/NAME/open, /rename   writes the site of a scene of the command line; its title
     GET  /scenes/NAME/uploads         what has arrived; PUT adds a part
     POST /scenes/NAME/survey          what the photos are, and how long it takes
     POST /scenes/NAME/start, /stop    its job
@@ -42,6 +44,8 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from snowsplat.pipeline.output.edit_record import PageEdit, read_record
+from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
@@ -57,7 +61,7 @@ _PAGES = Path(__file__).parent / "pages"
 _QUALITIES = ("draft", "normal", "best")
 _LONGEST_MINUTES = 7 * 24 * 60
 _PHOTOS = 120  # of which small pictures are shown
-_SMALL = 240  # pixels of their longer side
+_SMALL = 320  # pixels of their longer side
 _FOLDERS = 500  # that are listed
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff", ".mp4", ".mov", ".zip")
 #: The content security policy of the page.
@@ -111,6 +115,10 @@ class _Studio:
         page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
         scene = [
             ("", "GET", self._scene),
+            ("", "DELETE", self._remove),
+            ("/picture", "GET", self._picture),
+            ("/open", "POST", self._open),
+            ("/rename", "POST", self._rename),
             ("/uploads", "GET", self._received),
             ("/uploads", "PUT", self._upload),
             ("/survey", "POST", self._survey),
@@ -181,6 +189,8 @@ class _Studio:
         return {
             "name": scene.name,
             "title": made.title,
+            "folder": str(scene.folder),
+            "found": scene.found,
             "inputs": made.inputs,
             "quality": made.quality,
             "minutes": made.minutes,
@@ -188,10 +198,41 @@ class _Studio:
             "state": state,
             "has_page": has_page,
             "edited": _edited(scene),
-            "has_map": (scene.folder / "map.svg").is_file(),
+            "has_map": scene.map.is_file(),
             "command": make_command(scene, made),
             "exports": {kind: export_command(scene, kind) for kind in FORMATS},
         }
+
+    async def _remove(self, request: Request, scene: Scene) -> Any:
+        if job.is_running(scene):
+            raise UserError("the scene is being made; stop it, then remove it")
+        async with self._locks[scene.name, "edit"]:
+            photos = await asyncio.to_thread(scene.remove)
+        return {"photos": None if photos is None else str(photos)}
+
+    async def _picture(self, request: Request, scene: Scene) -> Any:
+        picture = await asyncio.to_thread(_picture_of, scene)
+        if picture is None:
+            raise UnknownScene("there is no picture yet")
+        return Response(await asyncio.to_thread(_small, picture), media_type="image/jpeg")
+
+    async def _open(self, request: Request, scene: Scene) -> Any:
+        async with self._locks[scene.name, "edit"]:
+            if scene.is_shown():
+                return {}
+            return await asyncio.to_thread(job.work, "show", scene.folder)
+
+    async def _rename(self, request: Request, scene: Scene) -> Any:
+        title = (await _object(request)).get("title")
+        if not isinstance(title, str) or not title.strip():
+            raise UserError("the title is empty; write one")
+        if job.is_running(scene):
+            raise UserError("the scene is being made; stop it, then rename it")
+        async with self._locks[scene.name, "edit"]:
+            before = scene.job.title
+            if scene.change(title=safe_title(title)).title != before and scene.scene_file():
+                await asyncio.to_thread(job.work, "show", scene.folder)
+        return {}
 
     async def _received(self, request: Request, scene: Scene) -> Any:
         return await asyncio.to_thread(received, scene)
@@ -201,6 +242,8 @@ class _Studio:
         size, start = (_whole(query.get(name)) for name in ("size", "start"))
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then add photos")
+        if scene.found:
+            scene.inputs()  # says why not
         if scene.job.inputs:
             raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
         data = await request.body()
@@ -248,7 +291,7 @@ class _Studio:
         return Response(await asyncio.to_thread(_small, shown[number]), media_type="image/jpeg")
 
     async def _map(self, request: Request, scene: Scene) -> Any:
-        return _File(scene.folder / "map.svg")
+        return _File(scene.map)
 
     async def _export(self, request: Request, scene: Scene) -> Any:
         kind = _kind(request)
@@ -337,12 +380,16 @@ def _summary(scene: Scene) -> dict[str, Any]:
         about["status"] = _status(scene, scene.state())
     except UserError:
         about = {"title": scene.name, "created": "", "status": "failed"}
-    picture = (scene.site / "poster.jpg").is_file()
-    return {"name": scene.name, "picture": picture, **about}
+    return {"name": scene.name, "picture": _picture_of(scene) is not None, **about}
 
 
 def _status(scene: Scene, state: dict[str, Any]) -> str:
-    """One of new, running, done, stopped, failed or, if the process was killed, interrupted."""
+    """One of new, running, done, stopped, failed or, if the process was killed, interrupted.
+
+    A scene of the command line is "found" until its site was written.
+    """
+    if scene.found:
+        return "done" if scene.is_shown() else "found"
     if job.is_running(scene):
         return "running"
     if not state and scene.job.quality is None and scene.job.minutes is None:
@@ -419,13 +466,23 @@ def _is_folder(path: Path) -> bool:
 
 def _shown_photos(scene: Scene) -> list[Path]:
     """The photos of the dataset: those with a pose as soon as they are known, before that all."""
+    dataset = scene.made / DATASET
     for name in ("images", "input"):
-        folder = scene.made / "dataset" / name
+        folder = dataset / name
         if folder.is_dir():
             found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
             step = max(1, math.ceil(len(found) / _PHOTOS))
             return found[::step]
     return []
+
+
+def _picture_of(scene: Scene) -> Path | None:
+    """Of the site; before that a rendered test view, or a photo."""
+    poster = scene.site / "poster.jpg"
+    if is_file(poster):
+        return poster
+    views = training_folder(scene.made).path.glob("test/ours_*/renders/*.png")
+    return next(iter([*sorted(views)[:1], *_shown_photos(scene)[:1]]), None)
 
 
 def _small(path: Path) -> bytes:

@@ -3,6 +3,7 @@
     python -m snowsplat.studio.worker make FOLDER          the job of a scene of the library
     python -m snowsplat.studio.worker survey FOLDER        what its photos are, and the time needed
     python -m snowsplat.studio.worker export FOLDER KIND   a file in another format
+    python -m snowsplat.studio.worker show FOLDER          the site of a scene, anew
     python -m snowsplat.studio.worker edit FOLDER          what was changed in the page of a scene
     python -m snowsplat.studio.worker undo FOLDER          the scene as it was made
 
@@ -19,6 +20,7 @@ import socket
 import sys
 import time
 import traceback
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -30,13 +32,14 @@ from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
 from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of
-from snowsplat.sfm.dataset_report import draw_from_above
+from snowsplat.sfm.dataset_report import REPORT, draw_from_above
 from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
@@ -52,8 +55,6 @@ from snowsplat.util.stages import Outcome
 
 _PAUSE = 1.0  # seconds between two files of the state
 _CURVE = 400  # points of the curve of the loss
-#: Shown beside the progress while the scene is trained.
-MAP = "map.svg"
 
 
 class _Recorder(Observer):
@@ -135,7 +136,7 @@ class _Recorder(Observer):
     def _draw_map(self) -> None:
         try:
             drawing = draw_from_above(self._scene.made / DATASET)
-            write_text(self._scene.folder / MAP, drawing)
+            write_text(self._scene.map, drawing)
         except (UserError, OSError) as error:  # the job goes on without it
             self.note(f"there is no map of the cameras: {error}")
 
@@ -199,11 +200,7 @@ def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
         "aligned": made.exposures,
         "seconds": made.seconds,
         "verdict": [] if made.verdict is None else made.verdict.lines("The scene"),
-        "reports": {
-            name: path.relative_to(scene.made).as_posix()
-            for name, path in reports.items()
-            if path is not None and path.is_relative_to(scene.made) and path.is_file()
-        },
+        "reports": _reports(scene, reports),
     }
 
 
@@ -264,12 +261,54 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
             raise UserError(f"{error}. Open the page anew, then edit it") from None
         if changes.title:
             scene.change(title=safe_title(changes.title))
-    shutil.rmtree(scene.exports, ignore_errors=True)  # they have other Gaussians
+    return show_scene(scene)
+
+
+def show_scene(scene: Scene) -> dict[str, Any]:
+    """Write the site of a finished scene as it is now, and its figures.
+
+    Raises: UserError: the scene is not finished.
+    """
+    file = scene.scene_file()
+    if file is None:
+        raise UserError("the scene is not finished")
+    shutil.rmtree(scene.exports, ignore_errors=True)  # they have another title, or other Gaussians
+    scene.site.mkdir(parents=True, exist_ok=True)
     site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
     state = scene.state()
+    if scene.found:
+        state = {"outcome": "done", "result": _found(scene)}
     state["result"] |= {"gaussians": site.gaussians, "bytes": file.stat().st_size}
     scene.write_state(state)
     return {"file": file.name}
+
+
+def _found(scene: Scene) -> dict[str, Any]:
+    """What a scene of the command line tells about its training."""
+    folder = training_folder(scene.folder)
+    try:
+        facts = dict(read_json(folder.path / "metrics.json"))
+    except (OSError, ValueError, TypeError):  # it was not evaluated, or not by this program
+        facts = {}
+    aligned = bool(folder.exposures())
+    psnr = facts.get("psnr_aligned" if aligned else "psnr")
+    reports = {"training": folder.report, "photos": scene.made / DATASET / REPORT}
+    return {
+        "psnr": psnr if facts.get("split") == "test" and isinstance(psnr, float) else None,
+        "aligned": aligned,
+        "seconds": None,
+        "verdict": [],
+        "reports": _reports(scene, reports),
+    }
+
+
+def _reports(scene: Scene, reports: Mapping[str, Path | None]) -> dict[str, str]:
+    """The paths of the reports that exist, in the output folder."""
+    return {
+        name: path.relative_to(scene.made).as_posix()
+        for name, path in reports.items()
+        if path is not None and path.is_relative_to(scene.made) and path.is_file()
+    }
 
 
 def _printed(scene: Scene, words: list[str]) -> int:
@@ -278,6 +317,8 @@ def _printed(scene: Scene, words: list[str]) -> int:
             answer = survey_photos(scene)
         elif words[0] == "export":
             answer = export(scene, words[1])
+        elif words[0] == "show":
+            answer = show_scene(scene)
         else:
             answer = edit_scene(scene, words[0] == "undo")
     except (UserError, OSError) as error:
