@@ -2,6 +2,7 @@
 
 import base64
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,14 +34,18 @@ def bits(rows: np.ndarray) -> str:
 
 @pytest.fixture(params=[False, True], ids=["file", "cameras"])
 def scene(request, tmp_path):
+    return write_scene(tmp_path, with_cameras=request.param)
+
+
+def write_scene(folder: Path, with_cameras: bool) -> Path:
     """A scene file; with cameras, in the folder of `make`, tilted and large: the page turns it."""
     box = torch.tensor([[-40.0, -40.0, -40.0], [40.0, 40.0, 40.0]])
     gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
     gaussians = replace(gaussians, log_scales=gaussians.log_scales + 2.0)
-    file = tmp_path / "made" / "tour.ply"
+    file = folder / "made" / "tour.ply"
     file.parent.mkdir()
     write_gaussians(file, gaussians)
-    if request.param:
+    if with_cameras:
         trained = OutputFolder(file.parent / "scene")
         trained.scene_path(1).parent.mkdir(parents=True)
         write_gaussians(trained.scene_path(1), gaussians)
@@ -50,7 +55,7 @@ def scene(request, tmp_path):
         poses = [look_at(eye, torch.zeros(3, dtype=torch.float64), up) for eye in eyes]
         cameras = [Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose) for pose in poses]
         write_cameras(trained.path / "cameras.json", zip("ab", cameras, strict=True))
-    publish(file, tmp_path / "site")
+    publish(file, folder / "site")
     return file
 
 

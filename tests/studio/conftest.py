@@ -20,20 +20,22 @@ from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library
 from snowsplat.viewer.http.server import WebServer
 
+from ..browser import Page
+
 #: A worker that only holds the lock of a job, and saves when it is asked to end.
 HOLDER = """
 import os, signal, socket, sys, time
 from pathlib import Path
 from snowsplat.studio.library import Scene
 from snowsplat.util.run_lock import InUse, locked
-scene = Scene(Path(sys.argv[2]))
+task, scene = sys.argv[1], Scene(Path(sys.argv[2]))
 def end(*_):
-    scene.write_state({"outcome": "stopped"})
+    scene.write_state({"outcome": "stopped"}, task)
     sys.exit(130)
 signal.signal(signal.SIGTERM, end)
 try:
-    with locked(scene.lock, "", wait=0.0):
-        scene.write_state({"process": os.getpid(), "host": socket.gethostname()})
+    with locked(scene.lock(task), "", wait=0.0):
+        scene.write_state({"process": os.getpid(), "host": socket.gethostname()}, task)
         time.sleep(60)
 except InUse:
     sys.exit(2)
@@ -50,6 +52,13 @@ def of_the_command_line(folder: Path, step: int = 5) -> Path:
     box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
     write_gaussians(file, Gaussians.random_in_bounds(box, 50, torch.Generator().manual_seed(0), 1))
     return file
+
+
+def press(page: Page, text: str) -> None:
+    page.evaluate(
+        f"[...document.querySelectorAll('.snow-panel button')]"
+        f".find(each => each.textContent === {text!r}).click()"
+    )
 
 
 @dataclass

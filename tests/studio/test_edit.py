@@ -18,7 +18,7 @@ from snowsplat.studio.library import Scene
 from snowsplat.util.files import write_json
 
 from ..browser import Browser, Page
-from .conftest import of_the_command_line
+from .conftest import of_the_command_line, press
 
 N = 301
 
@@ -137,11 +137,12 @@ def test_hostile_changes(studio, finished):
 
 def test_a_site_has_no_tools_but_its_page_in_the_studio_has(studio, finished):
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
-    assert '<script type="module" src="../../../edit.js" data-edited="false">' in page
-    assert "edit.js" not in (finished.site / "index.html").read_text("utf-8")
-    # The tools are for the page that is one file.
+    assert 'src="../../../tools.js" data-whole="true" data-edited="false">' in page
+    assert "tools.js" not in (finished.site / "index.html").read_text("utf-8")
+    # Editing is for the page that is one file.
     (finished.site / "scene.sog").unlink()
-    assert b"edit.js" not in studio.ask(f"scenes/{finished.name}/site/index.html")[1]
+    page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
+    assert 'data-whole="false"' in page
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
@@ -206,13 +207,6 @@ def test_undo_returns_the_same_bytes():
     assert answer["found"] == expected
     beyond = (np.float32(centers) < box[0]) | (np.float32(centers) > box[1])
     assert answer["outside"] == beyond.any(1).astype(int).tolist()
-
-
-def press(page: Page, text: str) -> None:
-    page.evaluate(
-        f"[...document.querySelectorAll('.snow-panel button')]"
-        f".find(each => each.textContent === {text!r}).click()"
-    )
 
 
 def counts(page: Page) -> str:

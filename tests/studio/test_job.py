@@ -73,7 +73,7 @@ def test_a_job_of_another_computer_is_not_stopped(library, holder):
     scene = library.new("a", [])
     job.start(scene)
     process = begun(scene)
-    started = job._started.pop(scene.folder)
+    started = job._started.pop(scene.lock())
     scene.write_state({"process": os.getpid(), "host": "elsewhere"})
     with pytest.raises(UserError, match="is being made on elsewhere"):
         job.stop(scene)

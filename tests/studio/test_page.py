@@ -55,8 +55,8 @@ def test_from_photos_to_a_file(studio, tmp_path):
         page.wait_for("!!document.querySelector('.stages li[data-state=now]')", 60)
         (scene,) = studio.library.scenes()
         hash_ = page.evaluate("location.hash")
-    job._started[scene.folder].kill()
-    job._started[scene.folder].wait()
+    job._started[scene.lock()].kill()
+    job._started[scene.lock()].wait()
     with Browser(1280, 800, frames=2.0) as browser:
         page = browser.open(studio.server.url + hash_)
         page.wait_for("document.querySelector('.status')?.dataset.status === 'interrupted'", 30)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,9 +23,9 @@ from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
+from snowsplat.viewer.web.panel import view_of_page
 from snowsplat.viewer.web.publication import SCENE
 from snowsplat.viewer.web.scene import viewing_frame
 
@@ -75,7 +74,7 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     start = source.start and source.start.transformed(larger)
     if changes.start is not None:
         back = Similarity.identity() if change is None else change.inverse()
-        start = _view(changes.start).transformed(back).transformed(larger)
+        start = view_of_page(changes.start).transformed(back).transformed(larger)
     before = read_record(scene) or EditRecord(scene.name, 0)
     record = replace(
         before,
@@ -127,9 +126,3 @@ def _logs(means: np.ndarray) -> np.ndarray:
     """The numbers that SOG stores in even steps."""
     values = means.astype(np.float64)
     return np.sign(values) * np.log1p(np.abs(values))
-
-
-def _view(numbers: Sequence[float]) -> InitialView:
-    """A view of the page, whose world is rotated by 180° about the z axis; see `view_numbers`."""
-    x, y, z, u, v, w, fov, aspect = numbers
-    return InitialView((-x, -y, z), (-u, -v, w), fov, aspect)

@@ -13,6 +13,9 @@
     GET  /scenes/NAME/photos          names of its photos; /photos/N is a small one
     GET  /scenes/NAME/map             the cameras and points from above
     POST /scenes/NAME/exports/KIND    writes a file; GET sends it
+    GET  /scenes/NAME/film            its film; POST renders one, DELETE stops that
+    POST /scenes/NAME/film/path       the path of a film
+    GET  /scenes/NAME/film/file       the film
     POST /scenes/NAME/edit            stores what was changed in the viewer; DELETE takes it back
     GET  /scenes/NAME/site/…, /made/… the scene in the viewer, its reports
     GET  /scenes/NAME/live/…          the page of the running training, with its WebSocket
@@ -45,15 +48,22 @@ from starlette.websockets import WebSocket
 
 from snowsplat.pipeline.output.edit_record import PageEdit, read_record
 from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.studio import job
-from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
-from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
+from snowsplat.studio.hand_on import (
+    FORMATS,
+    export_command,
+    export_file,
+    film_command,
+    make_command,
+)
+from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
-from snowsplat.util.safe_json import from_json, is_file, printable
+from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -67,8 +77,8 @@ _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff", ".mp4",
 #: The content security policy of the page.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-    "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'"
+    "media-src 'self'; connect-src 'self'; frame-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
 )
 # The site has the rest of its policy in its page.
 _SITE_POLICY = "frame-ancestors 'self'"
@@ -77,11 +87,12 @@ _REPORT_POLICY = (
     "img-src 'self' data:; frame-ancestors 'self'"
 )
 
-# The page of a scene gets tools for editing, except for levels of detail. They come before the
-# script of the page, which looks for them.
-_EDITOR = (
-    '<link rel="stylesheet" href="../../../edit.css" />'
-    '<script type="module" src="../../../edit.js" data-edited="{edited}"></script>'
+# The page of a scene gets tools: a film and, except for levels of detail, editing. They come before
+# the script of the page, which looks for them.
+_TOOLS = (
+    '<link rel="stylesheet" href="../../../tools.css" />'
+    '<script type="module" src="../../../tools.js" data-whole="{whole}" data-edited="{edited}">'
+    "</script>"
 )
 
 _Answer = Callable[[Request, Scene], Awaitable[Any]]
@@ -129,6 +140,11 @@ class _Studio:
             ("/map", "GET", self._map),
             ("/exports/{kind}", "POST", self._export),
             ("/exports/{kind}", "GET", self._exported),
+            ("/film", "GET", self._film),
+            ("/film", "POST", self._render_film),
+            ("/film", "DELETE", self._stop_film),
+            ("/film/path", "POST", self._film_path),
+            ("/film/file", "GET", self._film_file),
             ("/edit", "POST", self._edit),
             ("/edit", "DELETE", self._undo),
             ("/site/{path:path}", "GET", self._site),
@@ -198,14 +214,15 @@ class _Studio:
             "state": state,
             "has_page": has_page,
             "edited": _edited(scene),
+            "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
             "has_map": scene.map.is_file(),
             "command": make_command(scene, made),
             "exports": {kind: export_command(scene, kind) for kind in FORMATS},
         }
 
     async def _remove(self, request: Request, scene: Scene) -> Any:
-        if job.is_running(scene):
-            raise UserError("the scene is being made; stop it, then remove it")
+        if job.is_running(scene) or job.is_running(scene, "film"):
+            raise UserError("the scene or its film is being made; stop that, then remove it")
         async with self._locks[scene.name, "edit"]:
             photos = await asyncio.to_thread(scene.remove)
         return {"photos": None if photos is None else str(photos)}
@@ -303,6 +320,47 @@ class _Studio:
         name = f"attachment; filename*=UTF-8''{quote(file.name)}"
         return _File(file, **{"Content-Disposition": name})
 
+    async def _film(self, request: Request, scene: Scene) -> Any:
+        state = scene.state("film")
+        try:
+            plan = from_json(PageFilm, read_json(scene.plan))
+        except (OSError, ValueError):  # there is none
+            plan = None
+        return {
+            "running": job.is_running(scene, "film"),
+            "plan": plan and asdict(plan),
+            "now": state.get("now"),
+            "outcome": state.get("outcome"),
+            "error": state.get("error"),
+            "bytes": scene.film.stat().st_size if is_file(scene.film) else 0,
+            "command": plan and film_command(scene, plan),
+        }
+
+    async def _render_film(self, request: Request, scene: Scene) -> Any:
+        plan = await _planned(request)
+        async with self._locks[scene.name, "film"]:
+            if not job.is_running(scene, "film"):
+                write_json(scene.plan, asdict(plan))
+                scene.write_state({}, "film")
+            job.start(scene, "film")
+        return {}
+
+    async def _stop_film(self, request: Request, scene: Scene) -> Any:
+        job.stop(scene, "film")
+        return {}
+
+    async def _film_path(self, request: Request, scene: Scene) -> Any:
+        plan = await _planned(request)
+        async with self._locks[scene.name, "film"]:
+            if job.is_running(scene, "film"):
+                raise UserError("a film is being rendered; wait until it ends, or stop it")
+            write_json(scene.plan, asdict(plan))
+            return await asyncio.to_thread(job.work, "preview", scene.folder)
+
+    async def _film_file(self, request: Request, scene: Scene) -> Any:
+        name = f"inline; filename*=UTF-8''{quote(safe_name(scene.job.title))}.mp4"
+        return _File(scene.film, **{"Content-Disposition": name})
+
     async def _edit(self, request: Request, scene: Scene) -> Any:
         try:
             changes = from_json(PageEdit, await _object(request))
@@ -321,9 +379,11 @@ class _Studio:
     async def _site(self, request: Request, scene: Scene) -> Any:
         path = request.path_params["path"] or "index.html"
         file = _inside(scene.site, path)
-        if path == "index.html" and (scene.site / "scene.sog").is_file():
+        if path == "index.html" and is_file(file):
             page = await asyncio.to_thread(file.read_text, "utf-8")
-            head = _EDITOR.format(edited=str(bool(_edited(scene))).lower())
+            facts = (scene.site / "scene.sog").is_file(), bool(_edited(scene))
+            whole, edited = (str(fact).lower() for fact in facts)
+            head = _TOOLS.format(whole=whole, edited=edited)
             text = page.replace("</head>", f"{head}</head>", 1)
             return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
         return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
@@ -401,6 +461,13 @@ def _edited(scene: Scene) -> float:
     """When the scene that is shown was edited, in seconds; 0 if it was not."""
     file = scene.scene_file()
     return file.stat().st_mtime if file and read_record(file) else 0
+
+
+async def _planned(request: Request) -> PageFilm:
+    try:
+        return from_json(PageFilm, await _object(request))
+    except ValueError as error:
+        raise UserError(f"no such film is possible: {error}") from None
 
 
 async def _object(request: Request) -> dict[str, Any]:

@@ -8,7 +8,8 @@ A scene NAME has:
     NAME/site/       the web site of the scene
     NAME/exports/    its files in other formats
     NAME/edit.json   what was changed in its page last
-    NAME/state.json  the progress of the job, and its result
+    NAME/film.json   the plan of its film; film_cameras.json and film.mp4 are the film
+    NAME/state.json  the progress of the job, and its result; film_state.json: of the film
 
 An output folder of the command line is a scene, too. What the studio adds to it is in its folder
 `studio/`.
@@ -37,7 +38,12 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
 
-_JOB, _STATE = "job.json", "state.json"
+_JOB = "job.json"
+#: What a process of its own does for a scene, and the files of its state, lock and output.
+TASKS = {
+    "make": ("state.json", ".job.lock", "log.txt"),
+    "film": ("film_state.json", ".film.lock", "film_log.txt"),
+}
 _DEFAULT = "snowsplat_scenes"
 _STUDIO = "studio"  # in output folders of the command line
 _LONGEST = 80  # characters of a name
@@ -87,8 +93,9 @@ class Scene:
         self.exports = kept / "exports"
         self.edits = kept / "edit.json"
         self.map = kept / "map.svg"
-        self.lock = kept / ".job.lock"
-        self.log = kept / "log.txt"
+        self.plan = kept / "film.json"
+        self.keys = kept / "film_cameras.json"
+        self.film = kept / "film.mp4"
 
     @property
     def name(self) -> str:
@@ -115,15 +122,21 @@ class Scene:
         write_json(self.kept / _JOB, asdict(job))
         return job
 
-    def state(self) -> dict[str, Any]:
-        """What the last process of the job has told; empty if there was none."""
+    def lock(self, task: str = "make") -> Path:
+        return self.kept / TASKS[task][1]
+
+    def log(self, task: str = "make") -> Path:
+        return self.kept / TASKS[task][2]
+
+    def state(self, task: str = "make") -> dict[str, Any]:
+        """What the last process of a task has told; empty if there was none."""
         try:
-            return dict(json.loads((self.kept / _STATE).read_text("utf-8")))
+            return dict(json.loads((self.kept / TASKS[task][0]).read_text("utf-8")))
         except (OSError, ValueError, TypeError):
             return {}
 
-    def write_state(self, state: dict[str, Any]) -> None:
-        write_json(self.kept / _STATE, state)
+    def write_state(self, state: dict[str, Any], task: str = "make") -> None:
+        write_json(self.kept / TASKS[task][0], state)
 
     def inputs(self) -> list[Path]:
         """What the scene is made of, for `make`.
@@ -182,9 +195,10 @@ class Scene:
                 folder.unlink()
             elif folder.exists():
                 shutil.rmtree(folder)
-        names = (_STATE, self.edits.name, self.map.name, self.log.name, self.lock.name, _JOB)
-        for name in names:
-            (self.folder / name).unlink(missing_ok=True)
+        files = [self.edits, self.map, self.plan, self.keys, self.film]
+        files += [self.folder / name for names in TASKS.values() for name in names]
+        for file in (*files, self.folder / _JOB):
+            file.unlink(missing_ok=True)
         for folder in (self.photos, self.folder):
             with suppress(OSError):  # there are photos, or other files
                 folder.rmdir()

@@ -1,13 +1,15 @@
 """What the studio does in other processes: all that takes long, or needs torch.
 
     python -m snowsplat.studio.worker make FOLDER          the job of a scene of the library
+    python -m snowsplat.studio.worker film FOLDER          its film, as film.json says
+    python -m snowsplat.studio.worker preview FOLDER       the path of this film
     python -m snowsplat.studio.worker survey FOLDER        what its photos are, and the time needed
     python -m snowsplat.studio.worker export FOLDER KIND   a file in another format
     python -m snowsplat.studio.worker show FOLDER          the site of a scene, anew
     python -m snowsplat.studio.worker edit FOLDER          what was changed in the page of a scene
     python -m snowsplat.studio.worker undo FOLDER          the scene as it was made
 
-The first one writes its progress to state.json in the folder. The others print one line of JSON.
+The first two write their progress to a file in the folder. The others print one line of JSON.
 """
 
 from __future__ import annotations
@@ -28,10 +30,12 @@ from typing import Any
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
+from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
 from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
@@ -44,7 +48,7 @@ from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
 from snowsplat.studio.hand_on import export_file
-from snowsplat.studio.library import Scene, safe_title
+from snowsplat.studio.library import TASKS, Scene, safe_title
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_text
@@ -58,10 +62,10 @@ _CURVE = 400  # points of the curve of the loss
 
 
 class _Recorder(Observer):
-    """Writes the progress of a job to the state of its scene."""
+    """Writes the progress of a task to the state of its scene."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+    def __init__(self, scene: Scene, task: str = "make") -> None:
+        self._scene, self._task = scene, task
         self._written = 0.0
         self._every = 1  # steps between two points of the curve
         self.state: dict[str, Any] = {
@@ -78,7 +82,7 @@ class _Recorder(Observer):
         """Write the state; unless ``now``, only if the last time is a moment ago."""
         if now or time.monotonic() - self._written > _PAUSE:
             with suppress(OSError):  # a full disk is for the job to tell
-                self._scene.write_state(self.state)
+                self._scene.write_state(self.state, self._task)
             self._written = time.monotonic()
 
     def note(self, line: str) -> None:
@@ -141,12 +145,12 @@ class _Recorder(Observer):
             self.note(f"there is no map of the cameras: {error}")
 
 
-def run_job(scene: Scene) -> int:
-    """Make the scene and its page, or resume; returns the exit code."""
+def run_job(scene: Scene, task: str) -> int:
+    """Do one of the `TASKS`, or resume it; returns the exit code."""
     try:
-        with locked(scene.lock, f"{scene.folder}: in use by"):
-            recorder = _Recorder(scene)
-            code, outcome = _outcome(scene, recorder)
+        with locked(scene.lock(task), f"{scene.folder}: in use by"):
+            recorder = _Recorder(scene, task)
+            code, outcome = _outcome(scene, task, recorder)
             for name in ("now", "page"):
                 recorder.state.pop(name, None)
             recorder.state |= outcome
@@ -157,27 +161,12 @@ def run_job(scene: Scene) -> int:
         return 2
 
 
-def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
+def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
     """The exit code of the job, and what it adds to the state."""
     try:
         with ended_by_signals():
-            job = scene.job
-            options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
-            with LivePage(port=0) as page:
-                made = make(
-                    scene.inputs(),
-                    scene.made,
-                    options,
-                    overwrite=True,
-                    observer=recorder,
-                    page=page,
-                )
-            recorder.begin("page")
-            site = publish(
-                shown_file(made.scene), scene.site, PublishOptions(job.title), overwrite=True
-            )
-            recorder.leave()
-        return 0, {"outcome": "done", "result": _result(scene, made, site.gaussians)}
+            result = _make(scene, recorder) if task == "make" else _film(scene, recorder)
+        return 0, {"outcome": "done", "result": result}
     except KeyboardInterrupt:
         return 130, {"outcome": "stopped"}
     except (UserError, OSError, MemoryError) as error:
@@ -185,8 +174,39 @@ def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
         return 2, {"outcome": "failed", "error": printable(" ".join(message.split()))}
     except Exception as error:
         traceback.print_exc()
-        about = f"an unexpected fault: {type(error).__name__}: {error}; details are in {scene.log}"
+        what, log = f"{type(error).__name__}: {error}", scene.log(task)
+        about = f"an unexpected fault: {what}; details are in {log}"
         return 1, {"outcome": "failed", "error": printable(about)}
+
+
+def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
+    job = scene.job
+    options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
+    with LivePage(port=0) as page:
+        made = make(
+            scene.inputs(), scene.made, options, overwrite=True, observer=recorder, page=page
+        )
+    recorder.begin("page")
+    site = publish(shown_file(made.scene), scene.site, PublishOptions(job.title), overwrite=True)
+    recorder.leave()
+    return _result(scene, made, site.gaussians)
+
+
+def _film(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
+    file = film(_finished(scene), _plan(scene), scene.keys, scene.film, observer=recorder)
+    return {"bytes": file.stat().st_size}
+
+
+def _plan(scene: Scene) -> PageFilm:
+    return from_json(PageFilm, read_json(scene.plan))
+
+
+def _finished(scene: Scene) -> Path:
+    """The scene file. Raises: UserError: the scene is not finished."""
+    file = scene.scene_file()
+    if file is None:
+        raise UserError("the scene is not finished")
+    return file
 
 
 def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
@@ -227,9 +247,7 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished.
     """
-    file = scene.scene_file()
-    if file is None:
-        raise UserError("the scene is not finished")
+    file = _finished(scene)
     target = export_file(scene, kind)
     if not target.is_file() or target.stat().st_mtime_ns < file.stat().st_mtime_ns:
         target.parent.mkdir(exist_ok=True)
@@ -247,9 +265,7 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished, or the page does not show it.
     """
-    file = scene.scene_file()
-    if file is None:
-        raise UserError("the scene is not finished")
+    file = _finished(scene)
     if undo:
         file = undo_edits(file)
     else:
@@ -269,9 +285,7 @@ def show_scene(scene: Scene) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished.
     """
-    file = scene.scene_file()
-    if file is None:
-        raise UserError("the scene is not finished")
+    file = _finished(scene)
     shutil.rmtree(scene.exports, ignore_errors=True)  # they have another title, or other Gaussians
     scene.site.mkdir(parents=True, exist_ok=True)
     site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
@@ -319,6 +333,8 @@ def _printed(scene: Scene, words: list[str]) -> int:
             answer = export(scene, words[1])
         elif words[0] == "show":
             answer = show_scene(scene)
+        elif words[0] == "preview":
+            answer = {"path": film_preview(_finished(scene), _plan(scene))}
         else:
             answer = edit_scene(scene, words[0] == "undo")
     except (UserError, OSError) as error:
@@ -330,8 +346,8 @@ def _printed(scene: Scene, words: list[str]) -> int:
 def main(words: list[str]) -> int:
     logging.basicConfig(level=logging.WARNING)
     scene = Scene(Path(words[1]))
-    if words[0] == "make":
-        return run_job(scene)
+    if words[0] in TASKS:
+        return run_job(scene, words[0])
     return _printed(scene, [words[0], *words[2:]])
 
 

@@ -42,10 +42,7 @@ class EditRecord:
     def __post_init__(self) -> None:
         if not 0 < self.scale < math.inf:
             raise ValueError(f"the scale {self.scale} is not positive")
-        view = self.start
-        if view is not None and not (
-            len(view) == 8 and view[:3] != view[3:6] and 0 < view[6] < 180 and view[7] > 0
-        ):
+        if self.start is not None and not is_view(self.start):
             raise ValueError("the initial view is none")
 
 
@@ -85,6 +82,14 @@ class PageEdit:
             return base64.b64decode(self.removed, validate=True)
         except binascii.Error:
             raise ValueError("the removed Gaussians are not in base64") from None
+
+
+def is_view(numbers: list[float]) -> bool:
+    """Whether these are position, target, field of view in degrees and aspect of a view."""
+    if len(numbers) != 8:
+        return False
+    *points, fov, aspect = numbers
+    return points[:3] != points[3:] and 0 < fov < 180 and aspect > 0
 
 
 def edited_file(scene: Path) -> Path:

@@ -1,13 +1,12 @@
-// Tools for editing in the page of a finished scene. The studio adds this module to the page, whose
-// script (panel.js) calls `window.sse.edit`. "Save" sends what was changed to the studio.
+// Tools for editing in the page of a finished scene; see tools.js. "Save" sends what was changed to
+// the studio.
 
 import { ask, make, Refused } from "./page.js";
 import { bounds, DELETED, outside, project, SELECTED, Selection, times, within } from "./selection.js";
-import { chosenLanguage, say, speak } from "./text.js";
+import { say } from "./text.js";
 
 const BRUSH = 24; // its radius at first, in CSS pixels
 const AXES = ["x", "y", "z"];
-const isEdited = /** @type {HTMLElement} */ (document.querySelector("script[data-edited]")).dataset.edited === "true";
 // The engine copies the Gaussians into a buffer before it draws them; this code changes the copies.
 const STREAM = "snowState";
 const R8U = 33; // PIXELFORMAT_R8U of the engine: a byte per Gaussian
@@ -38,18 +37,8 @@ fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
     };
 }
 
-/** Called by the script of the page, before the scene has loaded. */
-function addTools(/** @type {any} */ page) {
-    const { events, state } = page.viewer;
-    /** @type {any} */
-    let picker;
-    events.once("picker:ready", (/** @type {any} */ ready) => (picker = ready));
-    const begin = async () => edit(page, picker, await centersOf(page.viewer.app));
-    if (state.loaded) begin();
-    else events.once("loaded:changed", begin);
-}
-
-async function centersOf(/** @type {any} */ app) {
+/** The centres of the Gaussians (N, 3), when the scene has loaded. */
+export async function centersOf(/** @type {any} */ app) {
     const { resource } = app.assets.get(app.root.findByName("gsplat").gsplat.asset);
     if (resource.centers) return resource.centers;
     await resource.gsplatData.generateCenters();
@@ -60,8 +49,9 @@ async function centersOf(/** @type {any} */ app) {
  * @param {any} page see panel.js
  * @param {any} picker of the viewer: finds the surface at a place of the window
  * @param {Float32Array} centers (N, 3)
+ * @param {boolean} isEdited whether the scene was edited before
  */
-function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers) {
+export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers, isEdited) {
     const { app } = viewer;
     const entity = app.root.findByName("gsplat");
     const selection = new Selection(centers.length / 3);
@@ -337,7 +327,7 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
 
     const row = (/** @type {(Node | false)[]} */ ...parts) => make("div.snow-buttons", {}, ...parts);
     const content = make(
-        "div.snow-edit.snow-card",
+        "div.snow-edit.snow-tools.snow-card",
         { hidden: true },
         row(...tools.buttons),
         make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => selection.invert()))),
@@ -388,6 +378,3 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         true,
     );
 }
-
-speak(chosenLanguage());
-/** @type {any} */ (window).sse.edit = addTools;

@@ -275,6 +275,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const reports = Object.entries(result.reports).map(([kind, path]) =>
             make("a.button.plain", { href: `${address}/made/${path}`, target: "_blank", rel: "noopener" }, say(`report_${kind}`)),
         );
+        const film = make("section.card", { hidden: true });
+        let filmed = 0;
+        update = now => {
+            if (now.film === filmed) return;
+            filmed = now.film;
+            showFilm(film, address, filmed);
+        };
         const phone = make("section.card");
         showPhone(phone, site);
         return [
@@ -291,6 +298,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             result.verdict.length > 0 &&
                 make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, line))),
             make("section.card", {}, make("h2", {}, say("download")), ...Object.entries(scene.exports).map(([kind, line]) => download(kind, String(line)))),
+            film,
             phone,
             !scene.found && make("details.card", {}, make("summary", {}, say("again")), ...againPart(scene)),
         ].filter(part => part !== false);
@@ -393,6 +401,20 @@ function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement}
 
 function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {string[]} */ names) {
     strip.replaceChildren(...names.map((name, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+}
+
+/** The film of the scene; `made`: its time, 0 if there is none. */
+async function showFilm(/** @type {HTMLElement} */ card, /** @type {string} */ address, /** @type {number} */ made) {
+    card.hidden = !made;
+    if (!made) return;
+    const { bytes: size, command: line } = await ask(`${address}/film`);
+    const file = `${address}/film/file?${made}`;
+    card.replaceChildren(
+        make("h2", {}, say("film")),
+        make("video.film", { src: file, controls: true, preload: "metadata", "aria-label": say("film") }),
+        make("div.row", {}, make("a.button.plain", { href: file, download: true }, say("film_download", bytes(size)))),
+        line && command(line),
+    );
 }
 
 /** The addresses of the scene for phones, with codes. */

@@ -203,6 +203,6 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         panel.classList.toggle('snow-faded', hidden && strip.hidden && hiding.element.hidden)
     );
     document.querySelector('.sse-viewer').append(panel);
-    // The studio adds its tools for editing.
-    window.sse.edit?.({ viewer, scene, camera, canvas, hiding, panel, presentView });
+    // The studio adds its tools.
+    window.sse.tools?.({ viewer, scene, camera, canvas, hiding, panel, presentView, flyTo });
 });
