@@ -94,9 +94,10 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     /** Move to a view, in orbit around its target; for the view of a photo, with its limits. */
     const flyTo = (view, limitsThere = UNLIMITED) => {
         const { position, target, fov } = addView(view);
-        annotations[0] = { position: target, camera: { initial: { position, target, fov } } };
-        viewer.selectAnnotation(0);
-        annotations.length = 0;
+        // The engine flies to annotations: this one exists only while it is asked for.
+        const last = annotations.push({ position: target, camera: { initial: { position, target, fov } } }) - 1;
+        viewer.selectAnnotation(last);
+        annotations.pop();
         state.selectedAnnotation = null;
         limits = limitsThere;
     };

@@ -55,6 +55,11 @@ def view_of_page(numbers: Sequence[float]) -> InitialView:
     return InitialView((-x, -y, z), (-u, -v, w), fov, aspect)
 
 
+def numbers_of(view: InitialView) -> list[float]:
+    """Position, target, field of view and aspect of a view, as records store it."""
+    return [*view.position, *view.target, view.fov, view.aspect]
+
+
 def panel_settings(
     about: Description,
     gaussians: int,

@@ -29,7 +29,14 @@ from snowsplat.viewer.http.served_file import Served, ServedFile, served
 from snowsplat.viewer.web.hiding import Hiding, hiding_of
 from snowsplat.viewer.web.panel import Description, panel_settings
 from snowsplat.viewer.web.stops import Stops, stops_of
-from snowsplat.viewer.web.viewer_page import asset, content_policy, page, script, settings
+from snowsplat.viewer.web.viewer_page import (
+    Annotation,
+    asset,
+    content_policy,
+    page,
+    script,
+    settings,
+)
 
 _SCENE = "scene.compressed.ply"
 #: The file with the pictures of the stops.
@@ -50,6 +57,7 @@ def site(
     levels: Callable[[Gaussians], Path] | None = None,
     count: int | None = None,
     start: InitialView | None = None,
+    notes: Sequence[Annotation] = (),
 ) -> tuple[dict[str, Served], dict[str, str]]:
     """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
@@ -60,7 +68,7 @@ def site(
     only a coarse level. Then the levels stay as they are, and the page only scales them.
     """
     in_place = count is not None
-    scene = ready(gaussians, cameras, background, start, turn=not in_place)
+    scene = ready(gaussians, cameras, background, start, notes, turn=not in_place)
     if levels is not None:
         scene = scene.complete()
     content = _content(scene.gaussians, levels)
@@ -105,6 +113,7 @@ class ReadyScene(NamedTuple):
     hiding: Hiding  # what the page can hide
     scale: float  # of the frame, relative to that of the scene that was given
     chosen: bool  # whether the initial view was given
+    notes: Sequence[Annotation] = ()
 
     def complete(self) -> ReadyScene:
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
@@ -120,7 +129,7 @@ class ReadyScene(NamedTuple):
         """
         count = count or len(self.gaussians)
         return {
-            "settings": settings(self.start, self.background, self.film),
+            "settings": settings(self.start, self.background, self.film, self.notes),
             "antialiased": self.gaussians.antialiased,
             "panel": panel_settings(
                 about,
@@ -140,6 +149,7 @@ def ready(
     cameras: Sequence[Camera],
     background: Sequence[float] = (0.0, 0.0, 0.0),
     start: InitialView | None = None,
+    notes: Sequence[Annotation] = (),
     *,
     turn: bool = True,
 ) -> ReadyScene:
@@ -153,13 +163,14 @@ def ready(
         depth *= change.scale
         cameras = [camera.transformed(change) for camera in cameras]
         start = start and start.transformed(change)
+        notes = [note._replace(view=note.view.transformed(change)) for note in notes]
     stops = stops_of(gaussians, cameras, depth if cameras else 1.0, background)
     hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=not cameras)
     film = _film(cameras, depth) if cameras else []
     first = start or (stops.views[0] if cameras else overview(gaussians))
     scale = change.scale if change else 1.0
     return ReadyScene(
-        gaussians, first, film, stops, background, hiding, scale, chosen=start is not None
+        gaussians, first, film, stops, background, hiding, scale, start is not None, notes
     )
 
 
