@@ -102,7 +102,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     const haveNotesChanged = () => JSON.stringify(notes) !== notesBefore;
     const isChanged = () =>
         Boolean(start || scale !== 1 || title.value.trim() !== scene.title || selection.count(DELETED) || hidden() || haveNotesChanged());
-    const change = (/** @type {(event?: any) => void} */ run) => (/** @type {any} */ event) => {
+    const change = (/** @type {(event?: any) => void} */ run) => (/** @type {any} */ event = undefined) => {
         run(event);
         show();
     };
@@ -407,7 +407,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         if (content.hidden) choose("");
     });
     open.ariaExpanded = "false";
-    panel.querySelector(".snow-buttons").append(open);
+    panel.querySelector(".snow-copied").before(open);
     panel.querySelector(".snow-card").after(content);
     // The page fades its panel when its controls hide.
     viewer.events.on("controlsHidden:changed", () => {

@@ -261,7 +261,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         else look();
     });
     open.ariaExpanded = "false";
-    panel.querySelector(".snow-buttons").append(open);
+    panel.querySelector(".snow-copied").before(open);
     panel.querySelector(".snow-card").after(content);
     viewer.events.on("controlsHidden:changed", () => {
         if (!content.hidden) panel.classList.remove("snow-faded");
