@@ -11,9 +11,12 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import write_cameras
 from snowsplat.sfm.cost import Speed
 from snowsplat.studio import job, worker
 from snowsplat.studio.library import Scene
@@ -137,7 +140,21 @@ def test_progress_is_bounded(library):
     assert steps == sorted(steps)
     assert steps[-1] > 4900
     assert steps[0] < 100
-    assert "\x1b" not in state["notes"][0]
+    assert "\x1b" not in state["notes"][-1]
+    # There is no map of cameras that are not there, and one note about it.
+    assert len(state["notes"]) == 2
+
+
+def test_given_cameras_have_a_map(library):
+    scene = library.new("a", [])
+    recorder = worker._Recorder(scene)
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    (scene.made / "scene").mkdir(parents=True)
+    cameras = [("one", Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose))]
+    write_cameras(scene.made / "scene/cameras.json", cameras)
+    recorder.step(Progress(1, 1.0, 100, 5000, 1))
+    assert scene.map.read_text("utf-8").startswith("<svg")
+    assert not scene.state()["notes"]
 
 
 def test_a_worker_that_is_killed_is_an_error(library, monkeypatch):

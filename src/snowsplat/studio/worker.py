@@ -22,11 +22,12 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from snowsplat.pipeline.cameras_from_above import cameras_from_above
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
@@ -34,7 +35,7 @@ from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
-from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.output_folder import DATASET, SCENE
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
@@ -68,6 +69,7 @@ class _Recorder(Observer):
         self._scene, self._task = scene, task
         self._written = 0.0
         self._every = 1  # steps between two points of the curve
+        self._drawn = False  # the map
         self.state: dict[str, Any] = {
             "process": os.getpid(),
             "host": socket.gethostname(),
@@ -105,7 +107,7 @@ class _Recorder(Observer):
             {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
         )
         if stage == "images":
-            self._draw_map()
+            self._draw_map(lambda made: draw_from_above(made / DATASET))
         self.leave()
 
     def leave(self) -> None:
@@ -113,6 +115,8 @@ class _Recorder(Observer):
         self.write()
 
     def step(self, progress: Progress) -> None:
+        if not self._drawn:  # the poses were given
+            self._draw_map(lambda made: cameras_from_above(made / SCENE))
         self.state["steps"] = {
             "step": progress.step,
             "iterations": progress.iterations,
@@ -137,10 +141,10 @@ class _Recorder(Observer):
         self.state.pop("page", None)
         self.write()
 
-    def _draw_map(self) -> None:
+    def _draw_map(self, draw: Callable[[Path], str]) -> None:
+        self._drawn = True
         try:
-            drawing = draw_from_above(self._scene.made / DATASET)
-            write_text(self._scene.map, drawing)
+            write_text(self._scene.map, draw(self._scene.made))
         except (UserError, OSError) as error:  # the job goes on without it
             self.note(f"there is no map of the cameras: {error}")
 
@@ -181,6 +185,7 @@ def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[st
 
 def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
     job = scene.job
+    scene.map.unlink(missing_ok=True)  # the photos may be others now
     options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
     with LivePage(port=0) as page:
         made = make(

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from snowsplat.formats import GaussianArrays
@@ -19,7 +18,7 @@ from snowsplat.formats.lod import lod_files
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import Similarity, rotation_from_quat
+from snowsplat.scene.geometry import Similarity, rotation_from_quat, shortest_rotation
 from snowsplat.scene.initial_view import InitialView, bound, overview, view_of_camera
 from snowsplat.scene.orientation import VIEWING_DISTANCE, scene_up, up_of_surfaces
 from snowsplat.scene.render import render
@@ -208,7 +207,7 @@ def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
 def _change(direction: np.ndarray, depth: float, most: float = _TOO_LARGE) -> Similarity | None:
     """Transform to a frame with −y up and usual distances; None if the scene has both."""
     up = torch.from_numpy(direction)
-    rotation = _shortest_rotation(up, torch.from_numpy(_UP))
+    rotation = shortest_rotation(up, torch.from_numpy(_UP))
     tilt = math.acos(max(-1.0, min(1.0, -float(up[1]))))
     ratio = VIEWING_DISTANCE / depth
     is_level, is_near = tilt < _LEVEL_ENOUGH, 1 / most < ratio < most
@@ -233,17 +232,6 @@ def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     if len(areas):  # a few may be huge
         areas = areas.clamp_max(float(areas.quantile(0.9)))
     return normals.numpy(), areas.numpy(), gaussians.means.detach()[rows].double().numpy()
-
-
-def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
-    """(3, 3): rotates one unit vector to another, about their cross product."""
-    axis = torch.linalg.cross(source, target)
-    cosine = float(source @ target)
-    if cosine < -1 + 1e-9:  # by 180° about the x axis, which is perpendicular to ±y
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    x, y, z = axis.tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + cross + cross @ cross / (1 + cosine)
 
 
 def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:
