@@ -246,6 +246,7 @@ def test_lasso_delete_undo_delete_save(studio, finished):
         assert "Back to the original" in page.evaluate(
             "document.querySelector('.snow-edit').textContent"
         )
+        press(page, "Edit")  # its panel would cover the scene
         after = page.screenshot()
         assert not page.errors
     # What was in the lasso is gone; from the same place, the rest looks as before.

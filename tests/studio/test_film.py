@@ -94,7 +94,7 @@ def test_a_turn_in_the_page(studio):
         press(page, "Preview")
         page.wait_for("!document.querySelector('.snow-frame').hidden", 60)
         entity = "window.sse.viewer.app.root.findByName('camera').getPosition()"
-        scrub = "(() => { const slider = document.querySelector('.snow-tools input[type=range]');"
+        scrub = "(() => { const slider = document.querySelector('.snow-film input[type=range]');"
         page.evaluate(
             f"{scrub} slider.value = 0.5; slider.dispatchEvent(new Event('input')); }})()"
         )

@@ -1,6 +1,7 @@
 """Jobs: one per folder, stopped, killed; what a worker tells."""
 
 import io
+import json
 import os
 import shutil
 import signal
@@ -77,7 +78,8 @@ def test_a_job_of_another_computer_is_not_stopped(library, holder):
     job.start(scene)
     process = begun(scene)
     started = job._started.pop(scene.lock())
-    scene.write_state({"process": os.getpid(), "host": "elsewhere"})
+    # The file of the lock is what tells.
+    scene.lock().write_text(json.dumps({"host": "elsewhere", "process": os.getpid()}))
     with pytest.raises(UserError, match="is being made on elsewhere"):
         job.stop(scene)
     os.kill(process, signal.SIGKILL)

@@ -17,7 +17,7 @@ from ..sfm.colmap import scenes
 _HURRIED = """
 import sys
 from snowsplat.pipeline import make
-from snowsplat.studio.worker import main
+from snowsplat.studio.__main__ import main
 make._MIN_SECONDS = 6.0
 sys.exit(main(sys.argv[1:]))
 """

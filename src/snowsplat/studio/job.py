@@ -14,9 +14,9 @@ from typing import Any
 
 from snowsplat.studio.library import Scene
 from snowsplat.util.errors import UserError
-from snowsplat.util.run_lock import InUse, locked
+from snowsplat.util.run_lock import InUse, holder, locked
 
-_WORKER = [sys.executable, "-m", "snowsplat.studio.worker"]
+_WORKER = [sys.executable, "-m", "snowsplat.studio"]
 # By their lock: jobs that this process has started. They are asked whether they have ended, or
 # they would stay in the table of processes.
 _started: dict[Path, subprocess.Popen[bytes]] = {}
@@ -63,14 +63,13 @@ def stop(scene: Scene, task: str = "make") -> None:
     """
     if not is_running(scene, task):
         return
-    process = _started.get(scene.lock(task))
-    state = scene.state(task)
+    process, other = _started.get(scene.lock(task)), holder(scene.lock(task))
     if process is not None:
         process.terminate()
-    elif state.get("host") == socket.gethostname():
-        os.kill(int(state["process"]), signal.SIGTERM)
+    elif other.host == socket.gethostname():
+        os.kill(other.process, signal.SIGTERM)
     else:
-        raise UserError(f"this scene is being made on {state.get('host', 'another computer')}")
+        raise UserError(f"this scene is being made on {other.host or 'another computer'}")
 
 
 def work(*words: str | Path) -> dict[str, Any]:

@@ -1,13 +1,13 @@
 """What the studio does in other processes: all that takes long, or needs torch.
 
-    python -m snowsplat.studio.worker make FOLDER          the job of a scene of the library
-    python -m snowsplat.studio.worker film FOLDER          its film, as film.json says
-    python -m snowsplat.studio.worker preview FOLDER       the path of this film
-    python -m snowsplat.studio.worker survey FOLDER        what its photos are, and the time needed
-    python -m snowsplat.studio.worker export FOLDER KIND   a file in another format
-    python -m snowsplat.studio.worker show FOLDER          the site of a scene, anew
-    python -m snowsplat.studio.worker edit FOLDER          what was changed in the page of a scene
-    python -m snowsplat.studio.worker undo FOLDER          the scene as it was made
+    python -m snowsplat.studio make FOLDER          the job of a scene of the library
+    python -m snowsplat.studio film FOLDER          its film, as film.json says
+    python -m snowsplat.studio preview FOLDER       the path of this film
+    python -m snowsplat.studio survey FOLDER        what its photos are, and the time needed
+    python -m snowsplat.studio export FOLDER KIND   a file in another format
+    python -m snowsplat.studio show FOLDER          the site of a scene, anew
+    python -m snowsplat.studio edit FOLDER          what was changed in the page of a scene
+    python -m snowsplat.studio undo FOLDER          the scene as it was made
 
 The first two write their progress to a file in the folder. The others print one line of JSON.
 """
@@ -18,8 +18,6 @@ import json
 import logging
 import os
 import shutil
-import socket
-import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -54,7 +52,6 @@ from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, printable, read_json
 from snowsplat.util.stages import Outcome
 
@@ -71,8 +68,6 @@ class _Recorder(Observer):
         self._every = 1  # steps between two points of the curve
         self._drawn = False  # the map
         self.state: dict[str, Any] = {
-            "process": os.getpid(),
-            "host": socket.gethostname(),
             "started": time.time(),
             "stages": [],
             "notes": [],
@@ -150,19 +145,14 @@ class _Recorder(Observer):
 
 
 def run_job(scene: Scene, task: str) -> int:
-    """Do one of the `TASKS`, or resume it; returns the exit code."""
-    try:
-        with locked(scene.lock(task), f"{scene.folder}: in use by"):
-            recorder = _Recorder(scene, task)
-            code, outcome = _outcome(scene, task, recorder)
-            for name in ("now", "page"):
-                recorder.state.pop(name, None)
-            recorder.state |= outcome
-            recorder.write()
-            return code
-    except InUse as error:
-        print(error, file=sys.stderr)
-        return 2
+    """Do one of the `TASKS`, or resume it, under its lock; returns the exit code."""
+    recorder = _Recorder(scene, task)
+    code, outcome = _outcome(scene, task, recorder)
+    for name in ("now", "page"):
+        recorder.state.pop(name, None)
+    recorder.state |= outcome
+    recorder.write()
+    return code
 
 
 def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
@@ -354,7 +344,3 @@ def main(words: list[str]) -> int:
     if words[0] in TASKS:
         return run_job(scene, words[0])
     return _printed(scene, [words[0], *words[2:]])
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

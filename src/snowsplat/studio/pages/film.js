@@ -239,7 +239,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
 
     const row = (/** @type {Node[]} */ ...parts) => make("div.snow-buttons", {}, ...parts);
     const content = make(
-        "div.snow-tools.snow-card",
+        "div.snow-film.snow-tools.snow-card",
         { hidden: true },
         row(add, replace, remove, turn),
         empty,
