@@ -1,7 +1,9 @@
 """`edit`: the order of the page, scale, views, titles, and the way back."""
 
 import base64
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import torch
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
-from snowsplat.pipeline.output.edit_record import PageEdit, read_record, shown_file
+from snowsplat.pipeline.output.edit_record import Note, PageEdit, read_record, shown_file
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.publish import publish
@@ -21,6 +23,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
+from snowsplat.viewer.web.scene import viewing_frame
 
 N = 203  # no multiple of 8
 
@@ -33,14 +36,18 @@ def bits(rows: np.ndarray) -> str:
 
 @pytest.fixture(params=[False, True], ids=["file", "cameras"])
 def scene(request, tmp_path):
+    return write_scene(tmp_path, with_cameras=request.param)
+
+
+def write_scene(folder: Path, with_cameras: bool) -> Path:
     """A scene file; with cameras, in the folder of `make`, tilted and large: the page turns it."""
     box = torch.tensor([[-40.0, -40.0, -40.0], [40.0, 40.0, 40.0]])
     gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
     gaussians = replace(gaussians, log_scales=gaussians.log_scales + 2.0)
-    file = tmp_path / "made" / "tour.ply"
+    file = folder / "made" / "tour.ply"
     file.parent.mkdir()
     write_gaussians(file, gaussians)
-    if request.param:
+    if with_cameras:
         trained = OutputFolder(file.parent / "scene")
         trained.scene_path(1).parent.mkdir(parents=True)
         write_gaussians(trained.scene_path(1), gaussians)
@@ -50,7 +57,7 @@ def scene(request, tmp_path):
         poses = [look_at(eye, torch.zeros(3, dtype=torch.float64), up) for eye in eyes]
         cameras = [Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose) for pose in poses]
         write_cameras(trained.path / "cameras.json", zip("ab", cameras, strict=True))
-    publish(file, tmp_path / "site")
+    publish(file, folder / "site")
     return file
 
 
@@ -72,6 +79,67 @@ def test_what_is_removed_in_the_page_is_removed_in_the_scene(scene, tmp_path):
     assert rows == sorted(rows)
     for name, tensor in kept.parameters().items():
         assert torch.equal(tensor, whole.parameters()[name][rows])
+
+
+def test_what_the_sliders_hide_is_removed(scene, tmp_path):
+    """As the page does it: by the centres and sizes that it shows."""
+    shown = read_sog(tmp_path / "site" / "scene.sog")
+    # The world of the viewer is rotated about the z axis.
+    x, y, z = np.median(shown.means, axis=0)
+    distances = np.linalg.norm(shown.means - [x, y, z], axis=1)
+    sizes = np.exp(shown.log_scales.max(1))
+    # The numbers of the page have steps: limits between two of the numbers.
+    distance, size = (np.sort(v)[[N // 2, N // 2 + 1]].mean() for v in (distances, sizes))
+    hidden = (-float(x), -float(y), float(z), float(distance), float(size))
+    target = edit(scene, tmp_path / "site", PageEdit(N, bits(np.zeros(N, bool)), hidden=hidden))
+    removed = read_record(target).removed
+    assert abs(removed - ((distances > distance) | (sizes > size)).sum()) <= 2
+    assert N - len(read_gaussians(target)) == removed > N // 2
+    far = PageEdit(len(read_gaussians(target)), bits(np.zeros(N - removed, bool)), hidden=None)
+    publish(target, tmp_path / "site", overwrite=True)
+    edit(target, tmp_path / "site", far)
+    assert read_record(target).removed == removed
+
+
+def test_annotations_stay_at_their_places(scene, tmp_path):
+    """In the page, with a scale, and over further edits; the page flies to them."""
+    note = Note("A <b>", "text", [*VIEW[:3], 1.0, 2.0, 3.0, *VIEW[6:]])
+    change = PageEdit(N, bits(np.arange(N) < 1), 2.0, notes=(note,))
+    target = edit(scene, tmp_path / "site", change)
+    publish(target, tmp_path / "site", overwrite=True)
+    ratio = page_scale(target) * 2 / page_scale(scene)
+    expected = np.array(note.view[:6]) * ratio
+    for _ in range(2):
+        (shown,) = settings_of(tmp_path / "site")["annotations"]
+        assert (shown["title"], shown["text"]) == ("A <b>", "text")
+        assert np.allclose(shown["position"], expected[3:])
+        assert np.allclose(shown["camera"]["initial"]["position"], expected[:3])
+        assert np.allclose(shown["camera"]["initial"]["target"], expected[3:])
+        edit(target, tmp_path / "site", PageEdit(N - 1, bits(np.zeros(N - 1, bool))))
+        publish(target, tmp_path / "site", overwrite=True)
+    edit(target, tmp_path / "site", PageEdit(N - 1, bits(np.zeros(N - 1, bool)), notes=()))
+    assert read_record(target).notes == ()
+    for wrong in (
+        ("", "x", VIEW),
+        ("x" * 61, "", VIEW),
+        ("x", "y" * 281, VIEW),
+        ("x", "", VIEW[1:]),
+    ):
+        with pytest.raises(ValueError, match="annotation"):
+            Note(*wrong)
+    with pytest.raises(ValueError, match="at most 25"):
+        PageEdit(N, bits(np.zeros(N, bool)), notes=26 * (note,))
+
+
+def page_scale(scene: Path) -> float:
+    source = load_viewable(scene)
+    change = viewing_frame(source.gaussians, source.cameras)[0]
+    return 1.0 if change is None else change.scale
+
+
+def settings_of(site: Path) -> dict:
+    page = (site / "index.html").read_text("utf-8")
+    return json.loads(page.split('id="sse-bootstrap">')[1].split("</script>")[0])["settings"]
 
 
 def test_scale_view_and_title(scene, tmp_path):

@@ -5,15 +5,22 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+import torch
 
+from snowsplat.formats import write_gaussians
+from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.studio import job
 from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library
 from snowsplat.viewer.http.server import WebServer
+
+from ..browser import Page
 
 #: A worker that only holds the lock of a job, and saves when it is asked to end.
 HOLDER = """
@@ -21,18 +28,37 @@ import os, signal, socket, sys, time
 from pathlib import Path
 from snowsplat.studio.library import Scene
 from snowsplat.util.run_lock import InUse, locked
-scene = Scene(Path(sys.argv[2]))
+task, scene = sys.argv[1], Scene(Path(sys.argv[2]))
 def end(*_):
-    scene.write_state({"outcome": "stopped"})
+    scene.write_state({"outcome": "stopped"}, task)
     sys.exit(130)
 signal.signal(signal.SIGTERM, end)
 try:
-    with locked(scene.lock, "", wait=0.0):
-        scene.write_state({"process": os.getpid(), "host": socket.gethostname()})
+    with locked(scene.lock(task), "", wait=0.0):
+        scene.write_state({"process": os.getpid(), "host": socket.gethostname()}, task)
         time.sleep(60)
 except InUse:
     sys.exit(2)
 """
+
+
+def of_the_command_line(folder: Path, step: int = 5) -> Path:
+    """An output folder of training; returns its scene."""
+    folder.mkdir(exist_ok=True)
+    settings = "eval=True, images='images', resolution=-1, sh_degree=1, source_path='photos'"
+    (folder / "cfg_args").write_text(f"Namespace({settings}, white_background=False)")
+    file = OutputFolder(folder).scene_path(step)
+    file.parent.mkdir(parents=True)
+    box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
+    write_gaussians(file, Gaussians.random_in_bounds(box, 50, torch.Generator().manual_seed(0), 1))
+    return file
+
+
+def press(page: Page, text: str) -> None:
+    page.evaluate(
+        f"[...document.querySelectorAll('.snow-panel button')]"
+        f".find(each => each.textContent === {text!r}).click()"
+    )
 
 
 @dataclass

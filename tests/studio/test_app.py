@@ -101,7 +101,7 @@ def test_small_photos_of_a_dataset(studio):
     (folder / "b.jpg").write_bytes(b"damaged")
     assert studio.ask(f"scenes/{name}/photos") == (200, ["a.jpg", "b.jpg"])
     small = Image.open(io.BytesIO(studio.ask(f"scenes/{name}/photos/0")[1]))
-    assert small.size == (240, 120)
+    assert small.size == (320, 160)
     assert studio.ask(f"scenes/{name}/photos/1")[0] == 400
     assert studio.ask(f"scenes/{name}/photos/2")[0] == 404
 

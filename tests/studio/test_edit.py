@@ -15,8 +15,10 @@ from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.publish import publish
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.studio.library import Scene
+from snowsplat.util.files import write_json
 
 from ..browser import Browser, Page
+from .conftest import of_the_command_line, press
 
 N = 301
 
@@ -64,6 +66,46 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert studio.ask(f"{address}/edit", "DELETE")[0] == 400
 
 
+def test_a_scene_is_renamed_and_removed(studio, finished):
+    address = f"scenes/{finished.name}"
+    assert studio.ask("scenes")[1][0]["picture"]
+    assert studio.ask(f"{address}/picture")[1].startswith(b"\xff\xd8")
+    for title in ("", " \n", None, 7):
+        assert studio.ask(f"{address}/rename", "POST", {"title": title})[0] == 400
+    assert studio.ask(f"{address}/rename", "POST", {"title": "My\nbox"}) == (200, {})
+    assert studio.ask(address)[1]["title"] == "My box"
+    assert "<title>My box</title>" in (finished.site / "index.html").read_text("utf-8")
+    assert studio.ask(address, "DELETE") == (200, {"photos": None})
+    assert studio.ask(address)[0] == 404
+    assert studio.ask("scenes") == (200, [])
+
+
+def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
+    file = of_the_command_line(studio.library.folder / "tour")
+    write_json(file.parents[2] / "metrics.json", {"split": "test", "psnr": 27.5})
+    address = "scenes/tour"
+    assert studio.ask(address)[1]["status"] == "found"
+    assert studio.ask(f"{address}/open", "POST", {}) == (200, {"file": "point_cloud.ply"})
+    about = studio.ask(address)[1]
+    assert (about["status"], about["found"]) == ("done", True)
+    assert (about["state"]["result"]["gaussians"], about["state"]["result"]["psnr"]) == (50, 27.5)
+    assert studio.ask(f"{address}/open", "POST", {}) == (200, {})  # it is there
+    changes = edit_of(np.arange(50) < 20)
+    assert studio.ask(f"{address}/edit", "POST", changes) == (
+        200,
+        {"file": f"{file.stem}_edited.ply"},
+    )
+    assert studio.ask(f"{address}/exports/spz", "POST", {})[0] == 200
+    assert len(read_gaussians(file.parents[2] / "studio/exports/tour.spz")) == 30
+    # The training goes on: the page is that of another scene.
+    of_the_command_line(studio.library.folder / "tour", 7)
+    assert studio.ask(address)[1]["status"] == "found"
+    assert studio.ask(f"{address}/start", "POST", {})[0] == 400
+    assert studio.ask(f"{address}/uploads?path=a&size=1&start=0", "PUT", b"x")[0] == 400
+    assert studio.ask(address, "DELETE")[0] == 400
+    assert file.is_file()
+
+
 def test_hostile_changes(studio, finished):
     address = f"scenes/{finished.name}/edit"
     nothing = np.zeros(N, bool)
@@ -95,11 +137,12 @@ def test_hostile_changes(studio, finished):
 
 def test_a_site_has_no_tools_but_its_page_in_the_studio_has(studio, finished):
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
-    assert '<script type="module" src="../../../edit.js" data-edited="false">' in page
-    assert "edit.js" not in (finished.site / "index.html").read_text("utf-8")
-    # The tools are for the page that is one file.
+    assert 'src="../../../tools.js" data-whole="true" data-edited="false">' in page
+    assert "tools.js" not in (finished.site / "index.html").read_text("utf-8")
+    # Editing is for the page that is one file.
     (finished.site / "scene.sog").unlink()
-    assert b"edit.js" not in studio.ask(f"scenes/{finished.name}/site/index.html")[1]
+    page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
+    assert 'data-whole="false"' in page
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
@@ -166,13 +209,6 @@ def test_undo_returns_the_same_bytes():
     assert answer["outside"] == beyond.any(1).astype(int).tolist()
 
 
-def press(page: Page, text: str) -> None:
-    page.evaluate(
-        f"[...document.querySelectorAll('.snow-panel button')]"
-        f".find(each => each.textContent === {text!r}).click()"
-    )
-
-
 def counts(page: Page) -> str:
     return page.evaluate("document.querySelector('.snow-edit > p').textContent")
 
@@ -210,6 +246,7 @@ def test_lasso_delete_undo_delete_save(studio, finished):
         assert "Back to the original" in page.evaluate(
             "document.querySelector('.snow-edit').textContent"
         )
+        press(page, "Edit")  # its panel would cover the scene
         after = page.screenshot()
         assert not page.errors
     # What was in the lasso is gone; from the same place, the rest looks as before.

@@ -1,6 +1,7 @@
 """Jobs: one per folder, stopped, killed; what a worker tells."""
 
 import io
+import json
 import os
 import shutil
 import signal
@@ -11,9 +12,12 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.camera_json import write_cameras
 from snowsplat.sfm.cost import Speed
 from snowsplat.studio import job, worker
 from snowsplat.studio.library import Scene
@@ -73,8 +77,9 @@ def test_a_job_of_another_computer_is_not_stopped(library, holder):
     scene = library.new("a", [])
     job.start(scene)
     process = begun(scene)
-    started = job._started.pop(scene.folder)
-    scene.write_state({"process": os.getpid(), "host": "elsewhere"})
+    started = job._started.pop(scene.lock())
+    # The file of the lock is what tells.
+    scene.lock().write_text(json.dumps({"host": "elsewhere", "process": os.getpid()}))
     with pytest.raises(UserError, match="is being made on elsewhere"):
         job.stop(scene)
     os.kill(process, signal.SIGKILL)
@@ -137,7 +142,21 @@ def test_progress_is_bounded(library):
     assert steps == sorted(steps)
     assert steps[-1] > 4900
     assert steps[0] < 100
-    assert "\x1b" not in state["notes"][0]
+    assert "\x1b" not in state["notes"][-1]
+    # There is no map of cameras that are not there, and one note about it.
+    assert len(state["notes"]) == 2
+
+
+def test_given_cameras_have_a_map(library):
+    scene = library.new("a", [])
+    recorder = worker._Recorder(scene)
+    pose = torch.eye(3, 4, dtype=torch.float64)
+    (scene.made / "scene").mkdir(parents=True)
+    cameras = [("one", Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose))]
+    write_cameras(scene.made / "scene/cameras.json", cameras)
+    recorder.step(Progress(1, 1.0, 100, 5000, 1))
+    assert scene.map.read_text("utf-8").startswith("<svg")
+    assert not scene.state()["notes"]
 
 
 def test_a_worker_that_is_killed_is_an_error(library, monkeypatch):

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snowsplat.studio.library import Library, UnknownScene, safe_name
+from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name
 from snowsplat.util.errors import UserError
+
+from .conftest import of_the_command_line
 
 
 def test_a_new_scene_is_found_again(library, tmp_path):
@@ -53,6 +55,50 @@ def test_a_damaged_job_is_named(library):
     (scene.folder / "job.json").write_text("{")
     with pytest.raises(UserError, match=r"job\.json: damaged"):
         _ = scene.job
+
+
+def test_output_folders_of_the_command_line_are_scenes(library):
+    (library.folder / "photos").mkdir()
+    (library.folder / "photos/a.jpg").touch()
+    file = of_the_command_line(library.folder / "The tour: 1")
+    (scene,) = library.scenes()
+    assert (scene.found, scene.job.title) == (True, "The tour: 1")
+    assert library.find(scene.name).scene_file() == file
+    scene.change(title="A tour")
+    assert Scene(scene.folder).job.title == "A tour"
+    assert {each.name for each in scene.folder.iterdir()} == {
+        "cfg_args",
+        "point_cloud",
+        "studio",
+    }
+    for action in (scene.inputs, scene.remove):
+        with pytest.raises(UserError, match="made in a terminal"):
+            action()
+    assert file.is_file()
+
+
+def test_a_scene_is_removed_without_its_photos(library, tmp_path):
+    other = library.new("other", [])
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "kept.txt").touch()
+    scene = library.new("a", [])
+    (scene.made / "dataset").mkdir(parents=True)
+    (scene.made / "link").symlink_to(outside)
+    scene.site.symlink_to(outside)
+    scene.write_state({"outcome": "done"})
+    scene.photos.mkdir()
+    (scene.photos / "one.jpg").touch()
+    assert scene.remove() == scene.photos
+    assert [path.name for path in scene.folder.rglob("*")] == ["photos", "one.jpg"]
+    assert [each.name for each in library.scenes()] == ["other"]
+    assert (outside / "kept.txt").is_file()
+    assert other.remove() is None
+    assert not other.folder.exists()
+    link = library.folder / "link"
+    link.symlink_to(library.new("b", []).folder)
+    with pytest.raises(UserError, match="made in a terminal"):
+        Scene(link).remove()
 
 
 @given(st.text())

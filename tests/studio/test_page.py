@@ -1,5 +1,6 @@
 """The page in a real browser: by clicks, from an empty page to a downloaded file."""
 
+import sys
 import zipfile
 from pathlib import Path
 from urllib.parse import quote
@@ -11,6 +12,15 @@ from snowsplat.studio import job
 
 from ..browser import Browser, Page
 from ..sfm.colmap import scenes
+
+# The worker, with shorter trainings: `make` would take at least 15 seconds for one.
+_HURRIED = """
+import sys
+from snowsplat.pipeline import make
+from snowsplat.studio.__main__ import main
+make._MIN_SECONDS = 6.0
+sys.exit(main(sys.argv[1:]))
+"""
 
 pytestmark = [pytest.mark.browser, pytest.mark.sfm]
 
@@ -34,8 +44,9 @@ def status(page: Page) -> str:
     return page.evaluate("document.querySelector('.status')?.dataset.status ?? ''")
 
 
-def test_from_photos_to_a_file(studio, tmp_path):
+def test_from_photos_to_a_file(studio, tmp_path, monkeypatch):
     """The browser is closed and the job is killed on the way; nothing is lost."""
+    monkeypatch.setattr(job, "_WORKER", [sys.executable, "-c", _HURRIED])
     photos = scenes.write_photos(tmp_path / "Häuser am See", 9)
     asked: set[str] = set()
     with Browser(1280, 800, frames=2.0) as browser:
@@ -49,14 +60,14 @@ def test_from_photos_to_a_file(studio, tmp_path):
             "(() => { const form = document.querySelector('form.card');"
             "form.querySelector('input[type=text]').value = 'My tour';"
             "form.querySelector('input[type=number]').focus();"
-            "form.querySelector('input[type=number]').value = '0.5'; })()"
+            "form.querySelector('input[type=number]').value = '0.1'; })()"
         )
         click(page, "Make the scene")
         page.wait_for("!!document.querySelector('.stages li[data-state=now]')", 60)
         (scene,) = studio.library.scenes()
         hash_ = page.evaluate("location.hash")
-    job._started[scene.folder].kill()
-    job._started[scene.folder].wait()
+    job._started[scene.lock()].kill()
+    job._started[scene.lock()].wait()
     with Browser(1280, 800, frames=2.0) as browser:
         page = browser.open(studio.server.url + hash_)
         page.wait_for("document.querySelector('.status')?.dataset.status === 'interrupted'", 30)

@@ -84,6 +84,24 @@ def test_key_path_passes_through_its_keys():
     assert float(moved.max() / moved.min()) < 1.02
 
 
+def test_an_eased_path_is_the_same_way_at_another_speed():
+    given = ring(5, 3.0, 3.0, turn=3.0)
+    even, eased = key_path(given, 101, 3.0), key_path(given, 101, 3.0, ease=True)
+    # After a quarter of the time, 3t² − 2t³ of the way is done.
+    for at in (0, 25, 50, 75, 100):
+        way = (at / 100) ** 2 * (3 - 2 * at / 100)
+        there = interpolate_position(even, 100 * way)
+        assert float((eased[at].position - there).norm()) < 1e-3
+    steps = speeds(eased, closed=False)
+    assert float(steps[0]) < 0.1 * float(steps.median()) > float(steps[-1])
+
+
+def interpolate_position(path: list[Camera], at: float) -> torch.Tensor:
+    before = min(int(at), len(path) - 2)
+    one, two = path[before].position, path[before + 1].position
+    return one + (at - before) * (two - one)
+
+
 def test_key_path_that_ends_at_its_start_is_a_loop():
     given = [keys()[i] for i in (0, 1, 2, 3)]
     given += [camera_at((-2.5, -0.4, 1.0)), given[0]]

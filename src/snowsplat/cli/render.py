@@ -76,6 +76,8 @@ class Render(SceneFlags, Reports):
     """Length of the video in seconds."""
     fps: Annotated[float | None, flag("F", default="30")] = None
     """Frames per second of the video."""
+    ease: Annotated[bool, switch()] = False
+    """Begin and end slowly; for a path through the cameras of a file."""
     size: Annotated[str | None, flag("WxH|W", default="that of the photos")] = None
     """Width and height of the video in pixels, or only its width."""
     side_by_side: Annotated[bool, switch()] = False
@@ -89,7 +91,7 @@ class Render(SceneFlags, Reports):
             self._render_video(self.path)
             return 0
         around = self.projection == "equirectangular"
-        for name in ("seconds", "fps", "size", "side_by_side", "video"):
+        for name in ("seconds", "fps", "ease", "size", "side_by_side", "video"):
             if getattr(self, name) and not (around and name == "size"):
                 raise UserError(f"`{name}` is for videos; add a camera path with --path")
         splits: list[Split] = []
@@ -139,6 +141,7 @@ class Render(SceneFlags, Reports):
             side_by_side=self.side_by_side,
             antialias=self._antialias(),
             projection=self.projection,
+            ease=self.ease,
         )
         with TerminalObserver() as observer:
             videos = render_video(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,9 +23,9 @@ from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
+from snowsplat.viewer.web.panel import numbers_of, view_of_page
 from snowsplat.viewer.web.publication import SCENE
 from snowsplat.viewer.web.scene import viewing_frame
 
@@ -64,6 +63,8 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     removed = np.zeros(len(source.gaussians), bool)
     bits = np.unpackbits(np.frombuffer(changes.bits(), np.uint8), bitorder="little")
     removed[rows] = bits[: len(rows)] == 1
+    if changes.hidden is not None:
+        removed |= _hidden(moved, changes.hidden)
     if removed.all():
         raise UserError("nothing would be left of the scene; keep some of it")
     kept = source.gaussians.select(torch.from_numpy(~removed))
@@ -73,17 +74,25 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         moved_to = changes.scale * x, changes.scale * y, changes.scale * z
         # The page asks for the true distance in metres, so a unit is a metre now.
         kept = replace(transform(kept, larger), origin=moved_to, metres_per_unit=1.0)
-    start = source.start and source.start.transformed(larger)
+    back = Similarity.identity() if change is None else change.inverse()
+
+    def in_scene(view: list[float]) -> list[float]:
+        return numbers_of(view_of_page(view).transformed(back).transformed(larger))
+
+    start = None if source.start is None else numbers_of(source.start.transformed(larger))
+    notes = [replace(n, view=numbers_of(v.transformed(larger))) for n, v in source.notes]
     if changes.start is not None:
-        back = Similarity.identity() if change is None else change.inverse()
-        start = _view(changes.start).transformed(back).transformed(larger)
+        start = in_scene(changes.start)
+    if changes.notes is not None:
+        notes = [replace(note, view=in_scene(note.view)) for note in changes.notes]
     before = read_record(scene) or EditRecord(scene.name, 0)
     record = replace(
         before,
         removed=before.removed + int(removed.sum()),
         scale=before.scale * changes.scale,
         title=changes.title or before.title,
-        start=None if start is None else [*start.position, *start.target, start.fov, start.aspect],
+        start=start,
+        notes=tuple(notes),
     )
     target = edited_file(scene)
     with atomic_path(target) as temporary:
@@ -108,6 +117,15 @@ def undo_edits(edited: Path | str) -> Path:
     return edited.with_name(Path(record.scene).name)
 
 
+def _hidden(gaussians: Gaussians, limits: tuple[float, float, float, float, float]) -> np.ndarray:
+    """(N,) what the sliders hide of the Gaussians in the frame of the page; see `PageEdit`."""
+    x, y, z, distance, size = limits
+    middle = torch.tensor([-x, -y, z])  # the world of the viewer is rotated about the z axis
+    far = (gaussians.means.detach().cpu() - middle).norm(dim=1) > distance
+    large = gaussians.log_scales.detach().cpu().amax(1).exp() > size
+    return (far | large).numpy()
+
+
 def _rows_of_page(scene: Path, gaussians: Gaussians, site: Path) -> np.ndarray:
     """(N,) the rows of a scene, in the frame of its page, in the order of the page.
 
@@ -128,9 +146,3 @@ def _logs(means: np.ndarray) -> np.ndarray:
     """The numbers that SOG stores in even steps."""
     values = means.astype(np.float64)
     return np.sign(values) * np.log1p(np.abs(values))
-
-
-def _view(numbers: Sequence[float]) -> InitialView:
-    """A view of the page, whose world is rotated by 180° about the z axis; see `view_numbers`."""
-    x, y, z, u, v, w, fov, aspect = numbers
-    return InitialView((-x, -y, z), (-u, -v, w), fov, aspect)

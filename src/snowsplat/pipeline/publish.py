@@ -16,7 +16,7 @@ from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.viewer.web.panel import Description, made_on
-from snowsplat.viewer.web.publication import SCENE, is_site, write_site
+from snowsplat.viewer.web.publication import SCENE, is_site, write_one_file, write_site
 
 #: Larger scenes are written in levels of detail. Phones show at most that many Gaussians at a time.
 _LARGE = 2_000_000
@@ -98,11 +98,10 @@ def publish(
         observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
     what = source.gaussians, source.cameras, source.background, about, url
+    large = len(source.gaussians) > _LARGE
+    write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):
-        if len(source.gaussians) <= _LARGE:
-            write_site(folder, *what, start=source.start)
-        else:
-            write_site(folder, *what, partial(_write_levels, observer), source.start)
+        write_site(folder, *what, write, source.start, source.annotations())
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
 

@@ -119,6 +119,7 @@ class VideoOptions:
         side_by_side: render only one video, with colour on the left and depth on the right.
         antialias: whether to render with the 2D mip filter, see `Gaussians`; None: as trained.
         projection: "equirectangular": a 360° video, level, with the heading of the cameras.
+        ease: slow at the start and at the end; for a file of key cameras.
 
     Raises:
         UserError: an unusable length, rate or size.
@@ -132,6 +133,7 @@ class VideoOptions:
     side_by_side: bool = False
     antialias: bool | None = None
     projection: Projection = "pinhole"
+    ease: bool = False
 
     def __post_init__(self) -> None:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
@@ -143,6 +145,8 @@ class VideoOptions:
                 f"{self.seconds:g} with `fps` {self.fps:g} is more than {_MAX_FRAMES:,} frames; "
                 "make the video shorter",
             )
+        if self.ease and self.path in CAMERA_PATHS:
+            raise SettingError("ease", "is for a path through the cameras of a file; leave it out")
         if self.projection == "equirectangular":
             if self.depth or self.side_by_side:
                 raise SettingError("projection", "equirectangular has no depth; render it alone")
@@ -201,6 +205,7 @@ def render_video(
         source.cameras,
         options.frames,
         VideoSize.parse(options.size),
+        ease=options.ease,
     )
     around = None
     if options.projection == "equirectangular":
@@ -242,7 +247,9 @@ def _load(scene: Path, iteration: int | None, name: str) -> _Source:
         file = folder.videos / f"{name}.mp4"
     _, background = folder.settings()
     gaussians = seen_by_cameras(gaussians, folder)
-    return _Source(gaussians, read_cameras(folder.path / "cameras.json"), background, file)
+    trained = folder.path / "cameras.json"
+    cameras = read_cameras(trained) if trained.is_file() else None
+    return _Source(gaussians, cameras, background, file)
 
 
 def cameras_along(
@@ -251,12 +258,15 @@ def cameras_along(
     trained: tuple[list[str], list[Camera]] | None,
     frames: int,
     size: VideoSize,
+    *,
+    ease: bool = False,
 ) -> list[Camera]:
     """One camera per frame.
 
     Args:
         path: one of `CAMERA_PATHS`, or a file of key cameras.
         trained: names and cameras of the photos; None for a scene file without an output folder.
+        ease: see `VideoOptions`.
 
     Raises:
         UserError: no such path or file, or one that needs the cameras of a training run.
@@ -269,7 +279,7 @@ def cameras_along(
         _, keys = read_cameras(Path(path))
         keys = _in_frame_of(gaussians, keys)
         distance = trajectory.viewing_distance(keys, gaussians.means)
-        cameras = trajectory.key_path(keys, frames, distance)
+        cameras = trajectory.key_path(keys, frames, distance, ease=ease)
     elif trained is not None:
         names, given = trained
         distance = trajectory.viewing_distance(given, gaussians.means)

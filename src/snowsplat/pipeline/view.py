@@ -69,7 +69,7 @@ def viewed_scene(
     what = about, scene.gaussians, scene.cameras, scene.background
     if len(scene.gaussians) <= _LARGE:
         with observer.waiting("preparing"):
-            page = site(*what, start=scene.start)
+            page = site(*what, start=scene.start, notes=scene.annotations())
         yield ViewedScene(scene.file, len(scene.gaussians), *page)
         return
     with TemporaryDirectory(prefix="snowsplat-levels-") as folder:
@@ -81,7 +81,7 @@ def viewed_scene(
             return target
 
         with observer.waiting("preparing"):
-            page = site(*what, levels, start=scene.start)
+            page = site(*what, levels, start=scene.start, notes=scene.annotations())
         yield ViewedScene(scene.file, len(scene.gaussians), *page)
 
 

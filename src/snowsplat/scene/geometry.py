@@ -122,6 +122,17 @@ def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     return torch.cat([rotation, -rotation @ position.unsqueeze(-1)], -1)
 
 
+def shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
+    """(3, 3): rotates one unit vector to another, about their cross product."""
+    axis = torch.linalg.cross(source, target)
+    cosine = float(source @ target)
+    if cosine < -1 + 1e-9:  # by 180° about the x axis, which is perpendicular to ±y
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    x, y, z = axis.tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + cross + cross @ cross / (1 + cosine)
+
+
 @dataclass(frozen=True, eq=False)
 class Similarity:
     """A transform from an old to a new world frame: x_new = scale · R · x_old + t.

@@ -4,13 +4,18 @@
     GET  /about                       addresses for other devices
     GET  /browse?path=                folders of this machine
     GET  /scenes                      all scenes; POST makes a new one
-    GET  /scenes/NAME                 a scene: its settings, progress and result
+    GET  /scenes/NAME                 a scene: its settings, progress and result; DELETE removes it
+    GET  /scenes/NAME/picture         a small picture of it
+    POST /scenes/NAME/open, /rename   writes the site of a scene of the command line; its title
     GET  /scenes/NAME/uploads         what has arrived; PUT adds a part
     POST /scenes/NAME/survey          what the photos are, and how long it takes
     POST /scenes/NAME/start, /stop    its job
     GET  /scenes/NAME/photos          names of its photos; /photos/N is a small one
     GET  /scenes/NAME/map             the cameras and points from above
     POST /scenes/NAME/exports/KIND    writes a file; GET sends it
+    GET  /scenes/NAME/film            its film; POST renders one, DELETE stops that
+    POST /scenes/NAME/film/path       the path of a film
+    GET  /scenes/NAME/film/file       the film
     POST /scenes/NAME/edit            stores what was changed in the viewer; DELETE takes it back
     GET  /scenes/NAME/site/…, /made/… the scene in the viewer, its reports
     GET  /scenes/NAME/live/…          the page of the running training, with its WebSocket
@@ -42,14 +47,23 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from snowsplat.pipeline.output.edit_record import PageEdit, read_record
+from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.page_film import PageFilm
+from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.studio import job
-from snowsplat.studio.hand_on import FORMATS, export_command, export_file, make_command
-from snowsplat.studio.library import Library, Scene, UnknownScene, safe_title
+from snowsplat.studio.hand_on import (
+    FORMATS,
+    export_command,
+    export_file,
+    film_command,
+    make_command,
+)
+from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
-from snowsplat.util.safe_json import from_json, is_file, printable
+from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -57,14 +71,14 @@ _PAGES = Path(__file__).parent / "pages"
 _QUALITIES = ("draft", "normal", "best")
 _LONGEST_MINUTES = 7 * 24 * 60
 _PHOTOS = 120  # of which small pictures are shown
-_SMALL = 240  # pixels of their longer side
+_SMALL = 320  # pixels of their longer side
 _FOLDERS = 500  # that are listed
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".tif", ".tiff", ".mp4", ".mov", ".zip")
 #: The content security policy of the page.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-    "connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'"
+    "media-src 'self'; connect-src 'self'; frame-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
 )
 # The site has the rest of its policy in its page.
 _SITE_POLICY = "frame-ancestors 'self'"
@@ -73,11 +87,12 @@ _REPORT_POLICY = (
     "img-src 'self' data:; frame-ancestors 'self'"
 )
 
-# The page of a scene gets tools for editing, except for levels of detail. They come before the
-# script of the page, which looks for them.
-_EDITOR = (
-    '<link rel="stylesheet" href="../../../edit.css" />'
-    '<script type="module" src="../../../edit.js" data-edited="{edited}"></script>'
+# The page of a scene gets tools: a film and, except for levels of detail, editing. They come before
+# the script of the page, which looks for them.
+_TOOLS = (
+    '<link rel="stylesheet" href="../../../tools.css" />'
+    '<script type="module" src="../../../tools.js" data-whole="{whole}" data-edited="{edited}">'
+    "</script>"
 )
 
 _Answer = Callable[[Request, Scene], Awaitable[Any]]
@@ -111,6 +126,10 @@ class _Studio:
         page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
         scene = [
             ("", "GET", self._scene),
+            ("", "DELETE", self._remove),
+            ("/picture", "GET", self._picture),
+            ("/open", "POST", self._open),
+            ("/rename", "POST", self._rename),
             ("/uploads", "GET", self._received),
             ("/uploads", "PUT", self._upload),
             ("/survey", "POST", self._survey),
@@ -121,6 +140,11 @@ class _Studio:
             ("/map", "GET", self._map),
             ("/exports/{kind}", "POST", self._export),
             ("/exports/{kind}", "GET", self._exported),
+            ("/film", "GET", self._film),
+            ("/film", "POST", self._render_film),
+            ("/film", "DELETE", self._stop_film),
+            ("/film/path", "POST", self._film_path),
+            ("/film/file", "GET", self._film_file),
             ("/edit", "POST", self._edit),
             ("/edit", "DELETE", self._undo),
             ("/site/{path:path}", "GET", self._site),
@@ -181,6 +205,8 @@ class _Studio:
         return {
             "name": scene.name,
             "title": made.title,
+            "folder": str(scene.folder),
+            "found": scene.found,
             "inputs": made.inputs,
             "quality": made.quality,
             "minutes": made.minutes,
@@ -188,10 +214,42 @@ class _Studio:
             "state": state,
             "has_page": has_page,
             "edited": _edited(scene),
-            "has_map": (scene.folder / "map.svg").is_file(),
+            "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
+            "has_map": scene.map.is_file(),
             "command": make_command(scene, made),
             "exports": {kind: export_command(scene, kind) for kind in FORMATS},
         }
+
+    async def _remove(self, request: Request, scene: Scene) -> Any:
+        if job.is_running(scene) or job.is_running(scene, "film"):
+            raise UserError("the scene or its film is being made; stop that, then remove it")
+        async with self._locks[scene.name, "edit"]:
+            photos = await asyncio.to_thread(scene.remove)
+        return {"photos": None if photos is None else str(photos)}
+
+    async def _picture(self, request: Request, scene: Scene) -> Any:
+        picture = await asyncio.to_thread(_picture_of, scene)
+        if picture is None:
+            raise UnknownScene("there is no picture yet")
+        return Response(await asyncio.to_thread(_small, picture), media_type="image/jpeg")
+
+    async def _open(self, request: Request, scene: Scene) -> Any:
+        async with self._locks[scene.name, "edit"]:
+            if scene.is_shown():
+                return {}
+            return await asyncio.to_thread(job.work, "show", scene.folder)
+
+    async def _rename(self, request: Request, scene: Scene) -> Any:
+        title = (await _object(request)).get("title")
+        if not isinstance(title, str) or not title.strip():
+            raise UserError("the title is empty; write one")
+        if job.is_running(scene):
+            raise UserError("the scene is being made; stop it, then rename it")
+        async with self._locks[scene.name, "edit"]:
+            before = scene.job.title
+            if scene.change(title=safe_title(title)).title != before and scene.scene_file():
+                await asyncio.to_thread(job.work, "show", scene.folder)
+        return {}
 
     async def _received(self, request: Request, scene: Scene) -> Any:
         return await asyncio.to_thread(received, scene)
@@ -201,6 +259,8 @@ class _Studio:
         size, start = (_whole(query.get(name)) for name in ("size", "start"))
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then add photos")
+        if scene.found:
+            scene.inputs()  # says why not
         if scene.job.inputs:
             raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
         data = await request.body()
@@ -248,7 +308,7 @@ class _Studio:
         return Response(await asyncio.to_thread(_small, shown[number]), media_type="image/jpeg")
 
     async def _map(self, request: Request, scene: Scene) -> Any:
-        return _File(scene.folder / "map.svg")
+        return _File(scene.map)
 
     async def _export(self, request: Request, scene: Scene) -> Any:
         kind = _kind(request)
@@ -259,6 +319,47 @@ class _Studio:
         file = export_file(scene, _kind(request))
         name = f"attachment; filename*=UTF-8''{quote(file.name)}"
         return _File(file, **{"Content-Disposition": name})
+
+    async def _film(self, request: Request, scene: Scene) -> Any:
+        state = scene.state("film")
+        try:
+            plan = from_json(PageFilm, read_json(scene.plan))
+        except (OSError, ValueError):  # there is none
+            plan = None
+        return {
+            "running": job.is_running(scene, "film"),
+            "plan": plan and asdict(plan),
+            "now": state.get("now"),
+            "outcome": state.get("outcome"),
+            "error": state.get("error"),
+            "bytes": scene.film.stat().st_size if is_file(scene.film) else 0,
+            "command": plan and film_command(scene, plan),
+        }
+
+    async def _render_film(self, request: Request, scene: Scene) -> Any:
+        plan = await _planned(request)
+        async with self._locks[scene.name, "film"]:
+            if not job.is_running(scene, "film"):
+                write_json(scene.plan, asdict(plan))
+                scene.write_state({}, "film")
+            job.start(scene, "film")
+        return {}
+
+    async def _stop_film(self, request: Request, scene: Scene) -> Any:
+        job.stop(scene, "film")
+        return {}
+
+    async def _film_path(self, request: Request, scene: Scene) -> Any:
+        plan = await _planned(request)
+        async with self._locks[scene.name, "film"]:
+            if job.is_running(scene, "film"):
+                raise UserError("a film is being rendered; wait until it ends, or stop it")
+            write_json(scene.plan, asdict(plan))
+            return await asyncio.to_thread(job.work, "preview", scene.folder)
+
+    async def _film_file(self, request: Request, scene: Scene) -> Any:
+        name = f"inline; filename*=UTF-8''{quote(safe_name(scene.job.title))}.mp4"
+        return _File(scene.film, **{"Content-Disposition": name})
 
     async def _edit(self, request: Request, scene: Scene) -> Any:
         try:
@@ -278,9 +379,11 @@ class _Studio:
     async def _site(self, request: Request, scene: Scene) -> Any:
         path = request.path_params["path"] or "index.html"
         file = _inside(scene.site, path)
-        if path == "index.html" and (scene.site / "scene.sog").is_file():
+        if path == "index.html" and is_file(file):
             page = await asyncio.to_thread(file.read_text, "utf-8")
-            head = _EDITOR.format(edited=str(bool(_edited(scene))).lower())
+            facts = (scene.site / "scene.sog").is_file(), bool(_edited(scene))
+            whole, edited = (str(fact).lower() for fact in facts)
+            head = _TOOLS.format(whole=whole, edited=edited)
             text = page.replace("</head>", f"{head}</head>", 1)
             return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
         return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
@@ -337,12 +440,16 @@ def _summary(scene: Scene) -> dict[str, Any]:
         about["status"] = _status(scene, scene.state())
     except UserError:
         about = {"title": scene.name, "created": "", "status": "failed"}
-    picture = (scene.site / "poster.jpg").is_file()
-    return {"name": scene.name, "picture": picture, **about}
+    return {"name": scene.name, "picture": _picture_of(scene) is not None, **about}
 
 
 def _status(scene: Scene, state: dict[str, Any]) -> str:
-    """One of new, running, done, stopped, failed or, if the process was killed, interrupted."""
+    """One of new, running, done, stopped, failed or, if the process was killed, interrupted.
+
+    A scene of the command line is "found" until its site was written.
+    """
+    if scene.found:
+        return "done" if scene.is_shown() else "found"
     if job.is_running(scene):
         return "running"
     if not state and scene.job.quality is None and scene.job.minutes is None:
@@ -354,6 +461,13 @@ def _edited(scene: Scene) -> float:
     """When the scene that is shown was edited, in seconds; 0 if it was not."""
     file = scene.scene_file()
     return file.stat().st_mtime if file and read_record(file) else 0
+
+
+async def _planned(request: Request) -> PageFilm:
+    try:
+        return from_json(PageFilm, await _object(request))
+    except ValueError as error:
+        raise UserError(f"no such film is possible: {error}") from None
 
 
 async def _object(request: Request) -> dict[str, Any]:
@@ -419,13 +533,23 @@ def _is_folder(path: Path) -> bool:
 
 def _shown_photos(scene: Scene) -> list[Path]:
     """The photos of the dataset: those with a pose as soon as they are known, before that all."""
+    dataset = scene.made / DATASET
     for name in ("images", "input"):
-        folder = scene.made / "dataset" / name
+        folder = dataset / name
         if folder.is_dir():
             found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
             step = max(1, math.ceil(len(found) / _PHOTOS))
             return found[::step]
     return []
+
+
+def _picture_of(scene: Scene) -> Path | None:
+    """Of the site; before that a rendered test view, or a photo."""
+    poster = scene.site / "poster.jpg"
+    if is_file(poster):
+        return poster
+    views = training_folder(scene.made).path.glob("test/ours_*/renders/*.png")
+    return next(iter([*sorted(views)[:1], *_shown_photos(scene)[:1]]), None)
 
 
 def _small(path: Path) -> bytes:

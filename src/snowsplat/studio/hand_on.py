@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.studio.library import Job, Scene, safe_name
 
 #: By kind: the end of the file's name.
@@ -29,6 +30,13 @@ def export_command(scene: Scene, kind: str) -> str:
     if kind == "zip":
         return shlex.join(["snowsplat", "publish", str(file), "-o", "site"])
     return shlex.join(["snowsplat", "convert", str(file), export_file(scene, kind).name])
+
+
+def film_command(scene: Scene, plan: PageFilm) -> str:
+    """The command line that renders the film again."""
+    words = ["snowsplat", "render", str(scene.scene_file() or scene.made), "--path"]
+    words += [str(scene.keys), "--seconds", f"{plan.seconds:g}", "--size", plan.size]
+    return shlex.join([*words, *["--ease"] * plan.ease, "--video", "film.mp4"])
 
 
 def make_command(scene: Scene, job: Job) -> str:

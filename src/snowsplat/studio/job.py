@@ -14,24 +14,25 @@ from typing import Any
 
 from snowsplat.studio.library import Scene
 from snowsplat.util.errors import UserError
-from snowsplat.util.run_lock import InUse, locked
+from snowsplat.util.run_lock import InUse, holder, locked
 
-_WORKER = [sys.executable, "-m", "snowsplat.studio.worker"]
-# Jobs that this process has started: they are asked whether they have ended, or they would stay
-# in the table of processes.
+_WORKER = [sys.executable, "-m", "snowsplat.studio"]
+# By their lock: jobs that this process has started. They are asked whether they have ended, or
+# they would stay in the table of processes.
 _started: dict[Path, subprocess.Popen[bytes]] = {}
 
 
-def start(scene: Scene) -> None:
-    """Start the job of a scene, or resume it. It goes on if this process ends.
+def start(scene: Scene, task: str = "make") -> None:
+    """Start one of the `TASKS` of a scene, or resume it. It goes on if this process ends.
 
     Raises: UserError: it runs already.
     """
-    if is_running(scene):
-        raise UserError("this scene is being made already")
-    with open(scene.log, "wb") as log:
-        _started[scene.folder] = subprocess.Popen(
-            [*_WORKER, "make", str(scene.folder)],
+    if is_running(scene, task):
+        what = "this scene" if task == "make" else "a film of this scene"
+        raise UserError(f"{what} is being made already")
+    with open(scene.log(task), "wb") as log:
+        _started[scene.lock(task)] = subprocess.Popen(
+            [*_WORKER, task, str(scene.folder)],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -39,36 +40,36 @@ def start(scene: Scene) -> None:
         )
 
 
-def is_running(scene: Scene) -> bool:
-    """Whether a process, started here or elsewhere, makes the scene."""
-    process = _started.get(scene.folder)
+def is_running(scene: Scene, task: str = "make") -> bool:
+    """Whether a process, started here or elsewhere, does this."""
+    lock = scene.lock(task)
+    process = _started.get(lock)
     if process is not None and process.poll() is None:
         return True
-    _started.pop(scene.folder, None)
-    if not scene.lock.exists():
+    _started.pop(lock, None)
+    if not lock.exists():
         return False
     try:
-        with locked(scene.lock, "", wait=0.0):
+        with locked(lock, "", wait=0.0):
             return False
     except InUse:
         return True
 
 
-def stop(scene: Scene) -> None:
+def stop(scene: Scene, task: str = "make") -> None:
     """Ask the job to save what it has, and to end; does nothing if none runs.
 
     Raises: UserError: it runs on another computer.
     """
-    if not is_running(scene):
+    if not is_running(scene, task):
         return
-    process = _started.get(scene.folder)
-    state = scene.state()
+    process, other = _started.get(scene.lock(task)), holder(scene.lock(task))
     if process is not None:
         process.terminate()
-    elif state.get("host") == socket.gethostname():
-        os.kill(int(state["process"]), signal.SIGTERM)
+    elif other.host == socket.gethostname():
+        os.kill(other.process, signal.SIGTERM)
     else:
-        raise UserError(f"this scene is being made on {state.get('host', 'another computer')}")
+        raise UserError(f"this scene is being made on {other.host or 'another computer'}")
 
 
 def work(*words: str | Path) -> dict[str, Any]:

@@ -8,7 +8,11 @@ A scene NAME has:
     NAME/site/       the web site of the scene
     NAME/exports/    its files in other formats
     NAME/edit.json   what was changed in its page last
-    NAME/state.json  the progress of the job, and its result
+    NAME/film.json   the plan of its film; film_cameras.json and film.mp4 are the film
+    NAME/state.json  the progress of the job, and its result; film_state.json: of the film
+
+An output folder of the command line is a scene, too. What the studio adds to it is in its folder
+`studio/`.
 """
 
 from __future__ import annotations
@@ -17,17 +21,31 @@ import datetime
 import json
 import os
 import re
+import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from snowsplat.pipeline.output.edit_record import shown_file
+from snowsplat.pipeline.output.scene_paths import (
+    file_of_make,
+    scene_file,
+    scene_name,
+    training_folder,
+)
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
 
-_JOB, _STATE = "job.json", "state.json"
+_JOB = "job.json"
+#: What a process of its own does for a scene, and the files of its state, lock and output.
+TASKS = {
+    "make": ("state.json", ".job.lock", "log.txt"),
+    "film": ("film_state.json", ".film.lock", "film_log.txt"),
+}
 _DEFAULT = "snowsplat_scenes"
+_STUDIO = "studio"  # in output folders of the command line
 _LONGEST = 80  # characters of a name
 # Names that Windows reserves.
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
@@ -57,17 +75,27 @@ class Job:
 
 
 class Scene:
-    """A scene of the library; its files need not exist."""
+    """A scene of the library; its files need not exist.
+
+    Attributes:
+        folder: that of the scene.
+        found: whether ``folder`` is an output folder of the command line.
+        kept: the folder of the studio's own files.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.photos = folder / "photos"
-        self.made = folder / "made"
-        self.site = folder / "site"
-        self.exports = folder / "exports"
-        self.edits = folder / "edit.json"
-        self.lock = folder / ".job.lock"
-        self.log = folder / "log.txt"
+        self.found = not (folder / _JOB).is_file() and _has_scene(folder)
+        self.kept = kept = folder / _STUDIO if self.found else folder
+        self.made = folder if self.found else folder / "made"
+        self.photos = kept / "photos"
+        self.site = kept / "site"
+        self.exports = kept / "exports"
+        self.edits = kept / "edit.json"
+        self.map = kept / "map.svg"
+        self.plan = kept / "film.json"
+        self.keys = kept / "film_cameras.json"
+        self.film = kept / "film.mp4"
 
     @property
     def name(self) -> str:
@@ -76,32 +104,47 @@ class Scene:
     @property
     def job(self) -> Job:
         """Raises UserError: its file is missing or damaged."""
+        file = self.kept / _JOB
+        if self.found and not file.is_file():
+            made = datetime.datetime.fromtimestamp(
+                scene_file(self.folder).stat().st_mtime, datetime.timezone.utc
+            )
+            return Job(scene_name(self.folder), made.isoformat(timespec="seconds"), [])
         try:
-            return from_json(Job, read_json(self.folder / _JOB))
+            return from_json(Job, read_json(file))
         except (OSError, ValueError, KeyError, TypeError):
-            raise UserError(f"{self.folder / _JOB}: damaged; make the scene again") from None
+            raise UserError(f"{file}: damaged; make the scene again") from None
 
     def change(self, **changes: Any) -> Job:
         """Store changed fields of the job."""
         job = replace(self.job, **changes)
-        write_json(self.folder / _JOB, asdict(job))
+        self.kept.mkdir(exist_ok=True, mode=0o700)
+        write_json(self.kept / _JOB, asdict(job))
         return job
 
-    def state(self) -> dict[str, Any]:
-        """What the last process of the job has told; empty if there was none."""
+    def lock(self, task: str = "make") -> Path:
+        return self.kept / TASKS[task][1]
+
+    def log(self, task: str = "make") -> Path:
+        return self.kept / TASKS[task][2]
+
+    def state(self, task: str = "make") -> dict[str, Any]:
+        """What the last process of a task has told; empty if there was none."""
         try:
-            return dict(json.loads((self.folder / _STATE).read_text("utf-8")))
+            return dict(json.loads((self.kept / TASKS[task][0]).read_text("utf-8")))
         except (OSError, ValueError, TypeError):
             return {}
 
-    def write_state(self, state: dict[str, Any]) -> None:
-        write_json(self.folder / _STATE, state)
+    def write_state(self, state: dict[str, Any], task: str = "make") -> None:
+        write_json(self.kept / TASKS[task][0], state)
 
     def inputs(self) -> list[Path]:
         """What the scene is made of, for `make`.
 
-        Raises: UserError: nothing was uploaded.
+        Raises: UserError: nothing was uploaded, or the command line has made the scene.
         """
+        if self.found:
+            raise UserError(f"{self.folder}: made in a terminal; continue it there")
         given = self.job.inputs
         if given:
             return [Path(path) for path in given]
@@ -117,9 +160,49 @@ class Scene:
 
     def scene_file(self) -> Path | None:
         """The finished scene, as it was edited."""
+        if self.found:
+            return shown_file(scene_file(self.folder))
         result = self.state().get("result") or {}
         file = self.made / Path(str(result.get("file", ""))).name
         return shown_file(file) if file.is_file() else None
+
+    def is_shown(self) -> bool:
+        """Whether the site shows what `scene_file` is now; of scenes of the studio, it always does.
+
+        A training in a terminal may have gone on since the site was written.
+        """
+        if not self.found:
+            return True
+        page, file = self.site / "index.html", self.scene_file()
+        if file is None or not page.is_file() or "outcome" not in self.state():
+            return False
+        return page.stat().st_mtime_ns >= file.stat().st_mtime_ns
+
+    def remove(self) -> Path | None:
+        """Remove the scene, but not its photos; returns their folder, or None if it has none.
+
+        Raises:
+            UserError: the command line has made it.
+            OSError: a file cannot be removed.
+        """
+        if self.found or self.folder.is_symlink():
+            raise UserError(
+                f"{self.folder}: made in a terminal; it may have other files, so remove it there"
+            )
+        # The job is last: until then, the scene is listed and can be removed again.
+        for folder in (self.made, self.site, self.exports):
+            if folder.is_symlink():
+                folder.unlink()
+            elif folder.exists():
+                shutil.rmtree(folder)
+        files = [self.edits, self.map, self.plan, self.keys, self.film]
+        files += [self.folder / name for names in TASKS.values() for name in names]
+        for file in (*files, self.folder / _JOB):
+            file.unlink(missing_ok=True)
+        for folder in (self.photos, self.folder):
+            with suppress(OSError):  # there are photos, or other files
+                folder.rmdir()
+        return self.photos if self.photos.exists() else None
 
 
 class Library:
@@ -131,15 +214,16 @@ class Library:
 
     def scenes(self) -> list[Scene]:
         """All scenes, the newest first."""
-        found = [Scene(file.parent) for file in self.folder.glob(f"*/{_JOB}")]
+        folders = [each for each in self.folder.iterdir() if _is_scene(each)]
+        found = [Scene(folder) for folder in folders]
         return sorted(found, key=lambda scene: scene.folder.stat().st_ctime, reverse=True)
 
     def find(self, name: str) -> Scene:
         """Raises UnknownScene: there is none, or this is no name."""
-        scene = Scene(self.folder / name)
-        if safe_name(name) != name or not (scene.folder / _JOB).is_file():
+        folder = next((each for each in self.folder.iterdir() if each.name == name), None)
+        if folder is None or not _is_scene(folder):
             raise UnknownScene(f"{printable(name)}: there is no such scene")
-        return scene
+        return Scene(folder)
 
     def new(self, title: str, inputs: list[Path]) -> Scene:
         """A new scene with an own folder. Raises UserError: an input does not exist."""
@@ -165,6 +249,21 @@ class Library:
         job = Job(title, now, [str(path.absolute()) for path in inputs])
         write_json(scene.folder / _JOB, asdict(job))
         return scene
+
+
+def _is_scene(folder: Path) -> bool:
+    """Whether it belongs to the library: it has a job, or a scene of the command line."""
+    try:
+        return (folder / _JOB).is_file() or _has_scene(folder)
+    except OSError:  # it cannot be read
+        return False
+
+
+def _has_scene(folder: Path) -> bool:
+    trained = training_folder(folder)
+    return file_of_make(folder) is not None or (
+        trained.is_output_folder() and bool(trained.scenes())
+    )
 
 
 def default_folder() -> Path:

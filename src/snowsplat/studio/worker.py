@@ -1,12 +1,15 @@
 """What the studio does in other processes: all that takes long, or needs torch.
 
-    python -m snowsplat.studio.worker make FOLDER          the job of a scene of the library
-    python -m snowsplat.studio.worker survey FOLDER        what its photos are, and the time needed
-    python -m snowsplat.studio.worker export FOLDER KIND   a file in another format
-    python -m snowsplat.studio.worker edit FOLDER          what was changed in the page of a scene
-    python -m snowsplat.studio.worker undo FOLDER          the scene as it was made
+    python -m snowsplat.studio make FOLDER          the job of a scene of the library
+    python -m snowsplat.studio film FOLDER          its film, as film.json says
+    python -m snowsplat.studio preview FOLDER       the path of this film
+    python -m snowsplat.studio survey FOLDER        what its photos are, and the time needed
+    python -m snowsplat.studio export FOLDER KIND   a file in another format
+    python -m snowsplat.studio show FOLDER          the site of a scene, anew
+    python -m snowsplat.studio edit FOLDER          what was changed in the page of a scene
+    python -m snowsplat.studio undo FOLDER          the scene as it was made
 
-The first one writes its progress to state.json in the folder. The others print one line of JSON.
+The first two write their progress to a file in the folder. The others print one line of JSON.
 """
 
 from __future__ import annotations
@@ -15,57 +18,56 @@ import json
 import logging
 import os
 import shutil
-import socket
-import sys
 import time
 import traceback
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from snowsplat.pipeline.cameras_from_above import cameras_from_above
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
+from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
-from snowsplat.pipeline.output.output_folder import DATASET
+from snowsplat.pipeline.output.output_folder import DATASET, SCENE
+from snowsplat.pipeline.output.page_film import PageFilm
+from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of
-from snowsplat.sfm.dataset_report import draw_from_above
+from snowsplat.sfm.dataset_report import REPORT, draw_from_above
 from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.survey import survey
 from snowsplat.studio.hand_on import export_file
-from snowsplat.studio.library import Scene, safe_title
+from snowsplat.studio.library import TASKS, Scene, safe_title
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, printable, read_json
 from snowsplat.util.stages import Outcome
 
 _PAUSE = 1.0  # seconds between two files of the state
 _CURVE = 400  # points of the curve of the loss
-#: Shown beside the progress while the scene is trained.
-MAP = "map.svg"
 
 
 class _Recorder(Observer):
-    """Writes the progress of a job to the state of its scene."""
+    """Writes the progress of a task to the state of its scene."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+    def __init__(self, scene: Scene, task: str = "make") -> None:
+        self._scene, self._task = scene, task
         self._written = 0.0
         self._every = 1  # steps between two points of the curve
+        self._drawn = False  # the map
         self.state: dict[str, Any] = {
-            "process": os.getpid(),
-            "host": socket.gethostname(),
             "started": time.time(),
             "stages": [],
             "notes": [],
@@ -77,7 +79,7 @@ class _Recorder(Observer):
         """Write the state; unless ``now``, only if the last time is a moment ago."""
         if now or time.monotonic() - self._written > _PAUSE:
             with suppress(OSError):  # a full disk is for the job to tell
-                self._scene.write_state(self.state)
+                self._scene.write_state(self.state, self._task)
             self._written = time.monotonic()
 
     def note(self, line: str) -> None:
@@ -100,7 +102,7 @@ class _Recorder(Observer):
             {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
         )
         if stage == "images":
-            self._draw_map()
+            self._draw_map(lambda made: draw_from_above(made / DATASET))
         self.leave()
 
     def leave(self) -> None:
@@ -108,6 +110,8 @@ class _Recorder(Observer):
         self.write()
 
     def step(self, progress: Progress) -> None:
+        if not self._drawn:  # the poses were given
+            self._draw_map(lambda made: cameras_from_above(made / SCENE))
         self.state["steps"] = {
             "step": progress.step,
             "iterations": progress.iterations,
@@ -132,51 +136,31 @@ class _Recorder(Observer):
         self.state.pop("page", None)
         self.write()
 
-    def _draw_map(self) -> None:
+    def _draw_map(self, draw: Callable[[Path], str]) -> None:
+        self._drawn = True
         try:
-            drawing = draw_from_above(self._scene.made / DATASET)
-            write_text(self._scene.folder / MAP, drawing)
+            write_text(self._scene.map, draw(self._scene.made))
         except (UserError, OSError) as error:  # the job goes on without it
             self.note(f"there is no map of the cameras: {error}")
 
 
-def run_job(scene: Scene) -> int:
-    """Make the scene and its page, or resume; returns the exit code."""
-    try:
-        with locked(scene.lock, f"{scene.folder}: in use by"):
-            recorder = _Recorder(scene)
-            code, outcome = _outcome(scene, recorder)
-            for name in ("now", "page"):
-                recorder.state.pop(name, None)
-            recorder.state |= outcome
-            recorder.write()
-            return code
-    except InUse as error:
-        print(error, file=sys.stderr)
-        return 2
+def run_job(scene: Scene, task: str) -> int:
+    """Do one of the `TASKS`, or resume it, under its lock; returns the exit code."""
+    recorder = _Recorder(scene, task)
+    code, outcome = _outcome(scene, task, recorder)
+    for name in ("now", "page"):
+        recorder.state.pop(name, None)
+    recorder.state |= outcome
+    recorder.write()
+    return code
 
 
-def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
+def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
     """The exit code of the job, and what it adds to the state."""
     try:
         with ended_by_signals():
-            job = scene.job
-            options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
-            with LivePage(port=0) as page:
-                made = make(
-                    scene.inputs(),
-                    scene.made,
-                    options,
-                    overwrite=True,
-                    observer=recorder,
-                    page=page,
-                )
-            recorder.begin("page")
-            site = publish(
-                shown_file(made.scene), scene.site, PublishOptions(job.title), overwrite=True
-            )
-            recorder.leave()
-        return 0, {"outcome": "done", "result": _result(scene, made, site.gaussians)}
+            result = _make(scene, recorder) if task == "make" else _film(scene, recorder)
+        return 0, {"outcome": "done", "result": result}
     except KeyboardInterrupt:
         return 130, {"outcome": "stopped"}
     except (UserError, OSError, MemoryError) as error:
@@ -184,8 +168,40 @@ def _outcome(scene: Scene, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
         return 2, {"outcome": "failed", "error": printable(" ".join(message.split()))}
     except Exception as error:
         traceback.print_exc()
-        about = f"an unexpected fault: {type(error).__name__}: {error}; details are in {scene.log}"
+        what, log = f"{type(error).__name__}: {error}", scene.log(task)
+        about = f"an unexpected fault: {what}; details are in {log}"
         return 1, {"outcome": "failed", "error": printable(about)}
+
+
+def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
+    job = scene.job
+    scene.map.unlink(missing_ok=True)  # the photos may be others now
+    options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
+    with LivePage(port=0) as page:
+        made = make(
+            scene.inputs(), scene.made, options, overwrite=True, observer=recorder, page=page
+        )
+    recorder.begin("page")
+    site = publish(shown_file(made.scene), scene.site, PublishOptions(job.title), overwrite=True)
+    recorder.leave()
+    return _result(scene, made, site.gaussians)
+
+
+def _film(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
+    file = film(_finished(scene), _plan(scene), scene.keys, scene.film, observer=recorder)
+    return {"bytes": file.stat().st_size}
+
+
+def _plan(scene: Scene) -> PageFilm:
+    return from_json(PageFilm, read_json(scene.plan))
+
+
+def _finished(scene: Scene) -> Path:
+    """The scene file. Raises: UserError: the scene is not finished."""
+    file = scene.scene_file()
+    if file is None:
+        raise UserError("the scene is not finished")
+    return file
 
 
 def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
@@ -199,11 +215,7 @@ def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
         "aligned": made.exposures,
         "seconds": made.seconds,
         "verdict": [] if made.verdict is None else made.verdict.lines("The scene"),
-        "reports": {
-            name: path.relative_to(scene.made).as_posix()
-            for name, path in reports.items()
-            if path is not None and path.is_relative_to(scene.made) and path.is_file()
-        },
+        "reports": _reports(scene, reports),
     }
 
 
@@ -230,9 +242,7 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished.
     """
-    file = scene.scene_file()
-    if file is None:
-        raise UserError("the scene is not finished")
+    file = _finished(scene)
     target = export_file(scene, kind)
     if not target.is_file() or target.stat().st_mtime_ns < file.stat().st_mtime_ns:
         target.parent.mkdir(exist_ok=True)
@@ -250,9 +260,7 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished, or the page does not show it.
     """
-    file = scene.scene_file()
-    if file is None:
-        raise UserError("the scene is not finished")
+    file = _finished(scene)
     if undo:
         file = undo_edits(file)
     else:
@@ -264,12 +272,52 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
             raise UserError(f"{error}. Open the page anew, then edit it") from None
         if changes.title:
             scene.change(title=safe_title(changes.title))
-    shutil.rmtree(scene.exports, ignore_errors=True)  # they have other Gaussians
+    return show_scene(scene)
+
+
+def show_scene(scene: Scene) -> dict[str, Any]:
+    """Write the site of a finished scene as it is now, and its figures.
+
+    Raises: UserError: the scene is not finished.
+    """
+    file = _finished(scene)
+    shutil.rmtree(scene.exports, ignore_errors=True)  # they have another title, or other Gaussians
+    scene.site.mkdir(parents=True, exist_ok=True)
     site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
     state = scene.state()
+    if scene.found:
+        state = {"outcome": "done", "result": _found(scene)}
     state["result"] |= {"gaussians": site.gaussians, "bytes": file.stat().st_size}
     scene.write_state(state)
     return {"file": file.name}
+
+
+def _found(scene: Scene) -> dict[str, Any]:
+    """What a scene of the command line tells about its training."""
+    folder = training_folder(scene.folder)
+    try:
+        facts = dict(read_json(folder.path / "metrics.json"))
+    except (OSError, ValueError, TypeError):  # it was not evaluated, or not by this program
+        facts = {}
+    aligned = bool(folder.exposures())
+    psnr = facts.get("psnr_aligned" if aligned else "psnr")
+    reports = {"training": folder.report, "photos": scene.made / DATASET / REPORT}
+    return {
+        "psnr": psnr if facts.get("split") == "test" and isinstance(psnr, float) else None,
+        "aligned": aligned,
+        "seconds": None,
+        "verdict": [],
+        "reports": _reports(scene, reports),
+    }
+
+
+def _reports(scene: Scene, reports: Mapping[str, Path | None]) -> dict[str, str]:
+    """The paths of the reports that exist, in the output folder."""
+    return {
+        name: path.relative_to(scene.made).as_posix()
+        for name, path in reports.items()
+        if path is not None and path.is_relative_to(scene.made) and path.is_file()
+    }
 
 
 def _printed(scene: Scene, words: list[str]) -> int:
@@ -278,6 +326,10 @@ def _printed(scene: Scene, words: list[str]) -> int:
             answer = survey_photos(scene)
         elif words[0] == "export":
             answer = export(scene, words[1])
+        elif words[0] == "show":
+            answer = show_scene(scene)
+        elif words[0] == "preview":
+            answer = {"path": film_preview(_finished(scene), _plan(scene))}
         else:
             answer = edit_scene(scene, words[0] == "undo")
     except (UserError, OSError) as error:
@@ -289,10 +341,6 @@ def _printed(scene: Scene, words: list[str]) -> int:
 def main(words: list[str]) -> int:
     logging.basicConfig(level=logging.WARNING)
     scene = Scene(Path(words[1]))
-    if words[0] == "make":
-        return run_job(scene)
+    if words[0] in TASKS:
+        return run_job(scene, words[0])
     return _printed(scene, [words[0], *words[2:]])
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -42,12 +42,14 @@ def training_path(
     return _path(lens, positions_of(ordered), rotations, zooms, frames, distance, _SMOOTHING)
 
 
-def key_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Camera]:
+def key_path(
+    cameras: Sequence[Camera], frames: int, distance: float, *, ease: bool = False
+) -> list[Camera]:
     """A smooth path through key cameras, in their order and with their fields of view.
 
     If the last key is the same as the first, the path is a closed loop without a corner. The frames
     have the image size of the first camera. ``distance``: world units from the cameras to what they
-    see.
+    see. ``ease``: slow at the start and at the end, instead of a constant speed.
 
     Raises:
         UserError: fewer than two keys differ.
@@ -55,7 +57,9 @@ def key_path(cameras: Sequence[Camera], frames: int, distance: float) -> list[Ca
     lens = cameras[0]
     logs = [[math.log(camera.fx / camera.width)] for camera in cameras]
     zooms = torch.tensor(logs, dtype=torch.float64)
-    return _path(lens, positions_of(cameras), rotations_of(cameras), zooms, frames, distance)
+    return _path(
+        lens, positions_of(cameras), rotations_of(cameras), zooms, frames, distance, ease=ease
+    )
 
 
 def _same_roll(rotations: Tensor, up: Tensor) -> Tensor:
@@ -79,6 +83,8 @@ def _path(
     frames: int,
     distance: float,
     smoothing: float = 0.0,
+    *,
+    ease: bool = False,
 ) -> list[Camera]:
     """Frames along a spline, at equal distances in terms of `_steps`.
 
@@ -94,6 +100,7 @@ def _path(
         frames: number of frames.
         distance: world units from the cameras to what they see.
         smoothing: see `Spline`.
+        ease: the way is 3t² − 2t³ of the time t in 0..1: the speed at both ends is 0.
     """
     quats = quat_from_rotation(rotations)
     differ = torch.cat([torch.tensor([True]), _steps(positions, quats, distance) > 1e-6])
@@ -123,6 +130,8 @@ def _path(
     rows = spline(dense)
     length = torch.cat([rows.new_zeros(1), _steps(rows[:, :3], rows[:, 3:7], distance).cumsum(0)])
     shares = torch.arange(frames, dtype=torch.float64) / max(1, frames if closed else frames - 1)
+    if ease:
+        shares = shares.square() * (3 - 2 * shares)
     at = spline(interpolate(shares * length[-1], length, dense))
     return [_camera(lens, *row.split([3, 4, 1])) for row in at]
 

@@ -126,7 +126,7 @@ def _acquired(file: Path, what: str, wait: float) -> int:
         time.sleep(0.05)
     handle, has_locks = found
     try:
-        before = _holder(file)
+        before = holder(file)
         sure = has_locks and before.host == socket.gethostname()
         if before.host and not sure and _is_renewed(file):
             raise _in_use(what, file)
@@ -140,7 +140,7 @@ def _acquired(file: Path, what: str, wait: float) -> int:
 
 def _in_use(what: str, file: Path) -> InUse:
     advice = "wait until it ends, stop it, or use another folder"
-    return InUse(f"{what} {_holder(file)}; {advice}")
+    return InUse(f"{what} {holder(file)}; {advice}")
 
 
 def _try(file: Path) -> tuple[int, bool] | None:
@@ -184,7 +184,8 @@ def _is_at(file: Path, handle: int) -> bool:
         return False
 
 
-def _holder(file: Path) -> Holder:
+def holder(file: Path) -> Holder:
+    """The process that holds a lock, or that was killed while it held it, as its file says."""
     try:
         with open(file, "rb") as opened:
             return from_json(Holder, parse_json(opened.read(_MAX_BYTES)))

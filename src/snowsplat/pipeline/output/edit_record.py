@@ -17,6 +17,36 @@ from snowsplat.util.safe_json import from_json, read_json
 _ENDING = "_edited"
 
 
+#: The limits of the viewer that shows them.
+MOST_NOTES, _LONGEST_TITLE, _LONGEST_TEXT = 25, 60, 280
+
+
+@dataclass(frozen=True)
+class Note:
+    """What a person has written at a place of the scene.
+
+    Attributes:
+        title, text: at most 60 and 280 characters.
+        view: the view that shows it, whose target is the place; see `EditRecord.start`.
+
+    Raises:
+        ValueError: the title is empty, a text is too long, or the view is none.
+    """
+
+    title: str
+    text: str
+    view: list[float]
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.title) <= _LONGEST_TITLE or len(self.text) > _LONGEST_TEXT:
+            raise ValueError(
+                f"an annotation has a title of at most {_LONGEST_TITLE} characters, and a text of "
+                f"at most {_LONGEST_TEXT}"
+            )
+        if not is_view(self.view):
+            raise ValueError("the view of an annotation is none")
+
+
 @dataclass(frozen=True)
 class EditRecord:
     """How an edited scene was made from another one.
@@ -28,9 +58,10 @@ class EditRecord:
         title: the name of the scene for people; "": that of the other scene.
         start: the initial view in the world of the edited scene: position, target, field of view in
             degrees, aspect (`InitialView`); None: not chosen.
+        notes: annotations, whose views are in the world of the edited scene.
 
     Raises:
-        ValueError: the scale is not positive, or the view is none.
+        ValueError: the scale is not positive, the view is none, or there are too many annotations.
     """
 
     scene: str
@@ -38,15 +69,15 @@ class EditRecord:
     scale: float = 1.0
     title: str = ""
     start: list[float] | None = None
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 < self.scale < math.inf:
             raise ValueError(f"the scale {self.scale} is not positive")
-        view = self.start
-        if view is not None and not (
-            len(view) == 8 and view[:3] != view[3:6] and 0 < view[6] < 180 and view[7] > 0
-        ):
+        if self.start is not None and not is_view(self.start):
             raise ValueError("the initial view is none")
+        if len(self.notes) > MOST_NOTES:
+            raise ValueError(f"a scene has at most {MOST_NOTES} annotations")
 
 
 @dataclass(frozen=True)
@@ -61,9 +92,13 @@ class PageEdit:
         title: the name of the scene for people; "": as it is.
         start: the initial view in the frame of the page: position, target, field of view in degrees
             and aspect, see `InitialView`; None: as it is.
+        hidden: what the sliders of the page hide is removed, too: the place from which they
+            measure, in the frame of the page; the largest distance from it and the largest size
+            (standard deviation of the longest axis) that they show. None: they do not count.
+        notes: all annotations, whose views are in the frame of the page; None: as they are.
 
     Raises:
-        ValueError: the number of bits, the scale or the view is not possible.
+        ValueError: the number of bits, the scale, a view or a limit is not possible.
     """
 
     count: int
@@ -71,9 +106,14 @@ class PageEdit:
     scale: float = 1.0
     title: str = ""
     start: list[float] | None = None
+    hidden: tuple[float, float, float, float, float] | None = None
+    notes: tuple[Note, ...] | None = None
 
     def __post_init__(self) -> None:
-        EditRecord("", 0, self.scale, self.title, self.start)  # checks these
+        # This checks these values.
+        EditRecord("", 0, self.scale, self.title, self.start, self.notes or ())
+        if self.hidden is not None and not min(self.hidden[3:]) > 0:
+            raise ValueError("the sliders hide everything")
         if not 1e-9 < self.scale < 1e9:
             raise ValueError(f"a scene cannot become {self.scale:g} times as large")
         if self.count < 1 or len(self.bits()) != -(-self.count // 8):
@@ -85,6 +125,14 @@ class PageEdit:
             return base64.b64decode(self.removed, validate=True)
         except binascii.Error:
             raise ValueError("the removed Gaussians are not in base64") from None
+
+
+def is_view(numbers: list[float]) -> bool:
+    """Whether these are position, target, field of view in degrees and aspect of a view."""
+    if len(numbers) != 8:
+        return False
+    *points, fov, aspect = numbers
+    return points[:3] != points[3:] and 0 < fov < 180 and aspect > 0
 
 
 def edited_file(scene: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from snowsplat.data import Dataset
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.output.edit_record import read_record
+from snowsplat.pipeline.output.edit_record import Note, read_record
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.output.scene_paths import (
     existing_folder,
@@ -27,6 +28,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.web.viewer_page import Annotation
 
 Color = tuple[float, float, float]
 
@@ -129,6 +131,11 @@ class ViewableScene:
     cameras: list[Camera]  # the cameras of its photos; empty if unknown
     background: Color
     start: InitialView | None = None  # the initial view; None: not chosen
+    notes: Sequence[tuple[Note, InitialView]] = ()  # annotations, and the views that show them
+
+    def annotations(self) -> list[Annotation]:
+        """The annotations for a page."""
+        return [Annotation(note.title, note.text, view) for note, view in self.notes]
 
 
 def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
@@ -175,8 +182,11 @@ def viewable(file: Path, gaussians: Gaussians) -> ViewableScene:
     gaussians = seen_from_dataset(gaussians, at_scale and tuple(at_scale))
     larger = replace(Similarity.identity(), scale=record.scale)
     cameras = [camera.transformed(larger) for camera in cameras_of(folder)]
-    start = None
-    if record.start is not None:
-        x, y, z, u, v, w, fov, aspect = record.start
-        start = InitialView((x, y, z), (u, v, w), fov, aspect)
-    return ViewableScene(file, gaussians, cameras, background_of(folder), start)
+    start = None if record.start is None else _view(record.start)
+    notes = [(note, _view(note.view)) for note in record.notes]
+    return ViewableScene(file, gaussians, cameras, background_of(folder), start, notes)
+
+
+def _view(numbers: Sequence[float]) -> InitialView:
+    x, y, z, u, v, w, fov, aspect = numbers
+    return InitialView((x, y, z), (u, v, w), fov, aspect)

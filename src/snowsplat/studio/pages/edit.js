@@ -1,13 +1,13 @@
-// Tools for editing in the page of a finished scene. The studio adds this module to the page, whose
-// script (panel.js) calls `window.sse.edit`. "Save" sends what was changed to the studio.
+// Tools for editing in the page of a finished scene; see tools.js. "Save" sends what was changed to
+// the studio.
 
 import { ask, make, Refused } from "./page.js";
 import { bounds, DELETED, outside, project, SELECTED, Selection, times, within } from "./selection.js";
-import { chosenLanguage, say, speak } from "./text.js";
+import { say } from "./text.js";
 
 const BRUSH = 24; // its radius at first, in CSS pixels
 const AXES = ["x", "y", "z"];
-const isEdited = /** @type {HTMLElement} */ (document.querySelector("script[data-edited]")).dataset.edited === "true";
+const MOST_NOTES = 25; // the limit of the viewer
 // The engine copies the Gaussians into a buffer before it draws them; this code changes the copies.
 const STREAM = "snowState";
 const R8U = 33; // PIXELFORMAT_R8U of the engine: a byte per Gaussian
@@ -38,18 +38,8 @@ fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
     };
 }
 
-/** Called by the script of the page, before the scene has loaded. */
-function addTools(/** @type {any} */ page) {
-    const { events, state } = page.viewer;
-    /** @type {any} */
-    let picker;
-    events.once("picker:ready", (/** @type {any} */ ready) => (picker = ready));
-    const begin = async () => edit(page, picker, await centersOf(page.viewer.app));
-    if (state.loaded) begin();
-    else events.once("loaded:changed", begin);
-}
-
-async function centersOf(/** @type {any} */ app) {
+/** The centres of the Gaussians (N, 3), when the scene has loaded. */
+export async function centersOf(/** @type {any} */ app) {
     const { resource } = app.assets.get(app.root.findByName("gsplat").gsplat.asset);
     if (resource.centers) return resource.centers;
     await resource.gsplatData.generateCenters();
@@ -60,8 +50,9 @@ async function centersOf(/** @type {any} */ app) {
  * @param {any} page see panel.js
  * @param {any} picker of the viewer: finds the surface at a place of the window
  * @param {Float32Array} centers (N, 3)
+ * @param {boolean} isEdited whether the scene was edited before
  */
-function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers) {
+export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers, isEdited) {
     const { app } = viewer;
     const entity = app.root.findByName("gsplat");
     const selection = new Selection(centers.length / 3);
@@ -74,6 +65,11 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
     let measured = []; // at most two points of the world of the page
     /** @type {number[][]} */
     let stroke = []; // points of the window, CSS pixels
+    /** @type {{title: string, text: string, view: number[]}[]} */
+    let notes = viewer.annotations.map((/** @type {any} */ { title, text, camera: { initial } }) => {
+        return { title, text, view: [...initial.position, ...initial.target, initial.fov, scene.aspect] };
+    });
+    const notesBefore = JSON.stringify(notes);
     let saving = false;
     const [low, high] = bounds(centers);
     const box = [[...low], [...high]];
@@ -102,9 +98,12 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         save.disabled = saving || !isChanged();
         viewer.app.renderNextFrame = true;
     }
-    const isChanged = () => Boolean(start || scale !== 1 || title.value.trim() !== scene.title || selection.count(DELETED));
-    const change = (/** @type {() => void} */ run) => () => {
-        run();
+    const hidden = () => (hides.checked ? hiding.limits() : null);
+    const haveNotesChanged = () => JSON.stringify(notes) !== notesBefore;
+    const isChanged = () =>
+        Boolean(start || scale !== 1 || title.value.trim() !== scene.title || selection.count(DELETED) || hidden() || haveNotesChanged());
+    const change = (/** @type {(event?: any) => void} */ run) => (/** @type {any} */ event = undefined) => {
+        run(event);
         show();
     };
 
@@ -142,18 +141,25 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
             drawing.fillStyle = drawing.strokeStyle = "#ffb45466";
             trace(drawing);
         }
+        if (tool === "note") notes.forEach(({ view }, i) => mark(view.slice(3, 6), String(i + 1)));
         if (tool === "box") lines(model(), edges(), width, height);
         if (tool === "measure") {
             lines(world(), measured.length === 2 ? [measured] : [], width, height);
-            for (const point of measured) {
-                const [x, y, depth] = project(world(), point, width, height);
-                if (depth <= 0) continue;
-                drawing.beginPath();
-                drawing.arc(x, y, 5, 0, 7);
-                drawing.fillStyle = "#ffb454";
-                drawing.fill();
-            }
+            for (const point of measured) mark(point, "");
         }
+    }
+
+    /** A dot at a point of the world, or a number in it. */
+    function mark(/** @type {number[]} */ point, /** @type {string} */ number) {
+        const [x, y, depth] = project(world(), point, canvas.clientWidth, canvas.clientHeight);
+        if (depth <= 0) return;
+        drawing.beginPath();
+        drawing.arc(x, y, number ? 11 : 5, 0, 7);
+        drawing.fillStyle = "#ffb454";
+        drawing.fill();
+        drawing.fillStyle = "#14171b";
+        drawing.textAlign = "center";
+        drawing.fillText(number, x, y + 4);
     }
 
     function lines(/** @type {Float64Array} */ m, /** @type {number[][][]} */ pairs, /** @type {number} */ width, /** @type {number} */ height) {
@@ -198,12 +204,41 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         show();
     }
 
-    async function measure(/** @type {number} */ x, /** @type {number} */ y) {
+    /** The point of the surface at a place of the window; null, and a text, if there is none. */
+    async function surface(/** @type {number} */ x, /** @type {number} */ y) {
         const found = await picker?.pickSurface(x / canvas.clientWidth, y / canvas.clientHeight);
-        if (!found) return tell(say("edit_no_surface"));
-        const { position } = found;
-        measured = [...(measured.length === 2 ? [] : measured), [position.x, position.y, position.z]];
+        tell(found ? "" : say("edit_no_surface"));
+        return found ? [found.position.x, found.position.y, found.position.z] : null;
+    }
+
+    async function measure(/** @type {number} */ x, /** @type {number} */ y) {
+        const point = await surface(x, y);
+        if (!point) return;
+        measured = [...(measured.length === 2 ? [] : measured), point];
         tellDistance();
+    }
+
+    async function annotate(/** @type {number} */ x, /** @type {number} */ y) {
+        const point = await surface(x, y);
+        if (!point || notes.length >= MOST_NOTES) return;
+        const [u, v, w, , , , fov] = presentView();
+        notes.push({ title: say("edit_note_new", notes.length + 1), text: "", view: [u, v, w, ...point, fov, scene.aspect] });
+        listNotes();
+        show();
+    }
+
+    function listNotes() {
+        const field = (/** @type {any} */ note, /** @type {"title" | "text"} */ key, /** @type {number} */ most) =>
+            make("input", { type: "text", maxlength: most, value: note[key], "aria-label": say(`edit_note_${key}`), placeholder: say(`edit_note_${key}`),
+                input: change((/** @type {any} */ event) => (note[key] = event.target.value)) });
+        const drop = (/** @type {any} */ note) => change(() => {
+            notes = notes.filter(each => each !== note);
+            listNotes();
+        });
+        noteList.replaceChildren(
+            ...notes.map((note, i) => make("div.snow-buttons", {}, make("b", {}, String(i + 1)), field(note, "title", 60), field(note, "text", 280), button("film_remove", drop(note)))),
+        );
+        draw();
     }
 
     /** The measured distance in units of the scene that is saved; 0 if there is none. */
@@ -227,6 +262,7 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         if (!event.isPrimary || event.button) return;
         event.preventDefault();
         if (tool === "measure") measure(event.offsetX, event.offsetY);
+        else if (tool === "note") annotate(event.offsetX, event.offsetY);
         else {
             overlay.setPointerCapture(event.pointerId);
             stroke = [[event.offsetX, event.offsetY]];
@@ -257,7 +293,7 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         const mark = (/** @type {string} */ chosen) => buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
         return { buttons, mark };
     };
-    const tools = choices(["rectangle", "lasso", "brush", "box", "measure"], name => choose(tool === name ? "" : name));
+    const tools = choices(["rectangle", "lasso", "brush", "box", "measure", "note"], name => choose(tool === name ? "" : name));
     const modes = choices(["replace", "add", "remove"], name => modes.mark((mode = name)));
     function choose(/** @type {string} */ name) {
         tool = name;
@@ -268,6 +304,7 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         forBrush.hidden = name !== "brush";
         forBox.hidden = name !== "box";
         forMeasure.hidden = name !== "measure";
+        forNotes.hidden = name !== "note";
     }
 
     const radius = /** @type {HTMLInputElement} */ (make("input", { type: "range", min: 4, max: 120, value: BRUSH }));
@@ -297,6 +334,9 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
     rescale.disabled = true;
     const size = make("span");
     const forMeasure = make("div.snow-buttons", {}, measure_, truth, rescale, size);
+    const noteList = make("div");
+    const forNotes = make("div", {}, make("p", {}, say("edit_note_how")), noteList);
+    const hides = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: change(() => {}) }));
     const remove = button("edit_delete", change(() => selection.delete()));
     const undo = button("edit_undo", change(() => selection.undo()));
     const redo = button("edit_redo", change(() => selection.redo()));
@@ -328,7 +368,16 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
     }
     const save = button("edit_save", () => {
         const changed = title.value.trim();
-        send("POST", { count: selection.state.length, removed: selection.deleted(), scale, title: changed === scene.title ? "" : changed, start });
+        if (notes.some(note => !note.title.trim())) return tell(say("edit_note_untitled"));
+        send("POST", {
+            count: selection.state.length,
+            removed: selection.deleted(),
+            scale,
+            title: changed === scene.title ? "" : changed,
+            start,
+            hidden: hidden(),
+            notes: haveNotesChanged() ? notes : null,
+        });
     });
     const back = button("edit_back", () => {
         if (confirm(say("edit_back_sure"))) send("DELETE", undefined);
@@ -340,13 +389,15 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
 
     const row = (/** @type {(Node | false)[]} */ ...parts) => make("div.snow-buttons", {}, ...parts);
     const content = make(
-        "div.snow-edit.snow-card",
+        "div.snow-edit.snow-tools.snow-card",
         { hidden: true },
         row(...tools.buttons),
         make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => selection.invert()))),
         forBrush,
         forBox,
         forMeasure,
+        forNotes,
+        make("label.snow-check", {}, hides, say("edit_hides")),
         row(remove, undo, redo),
         counts,
         row(title, view),
@@ -359,25 +410,29 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         if (content.hidden) choose("");
     });
     open.ariaExpanded = "false";
-    panel.querySelector(".snow-buttons").append(open);
+    panel.querySelector(".snow-copied").before(open);
     panel.querySelector(".snow-card").after(content);
     // The page fades its panel when its controls hide.
     viewer.events.on("controlsHidden:changed", () => {
         if (!content.hidden) panel.classList.remove("snow-faded");
     });
+    // The sliders change what is saved.
+    hiding.element.addEventListener("input", () => show());
     choose("");
+    listNotes();
     modes.mark(mode);
     show();
 
+    const isField = (/** @type {Event} */ event) => event.target instanceof HTMLInputElement && ["text", "number"].includes(event.target.type);
     // Keys in fields are not for the camera.
     for (const kind of ["keydown", "keyup"])
         content.addEventListener(kind, event => {
-            if (event.target === title || event.target === truth) event.stopPropagation();
+            if (isField(event)) event.stopPropagation();
         });
     addEventListener(
         "keydown",
         event => {
-            if (content.hidden || saving || event.target === title || event.target === truth) return;
+            if (content.hidden || saving || isField(event)) return;
             const command = event.ctrlKey || event.metaKey;
             const key = event.key.toLowerCase();
             if (command && key === "z") change(() => (event.shiftKey ? selection.redo() : selection.undo()))();
@@ -391,6 +446,3 @@ function edit({ viewer, scene, camera, canvas, hiding, panel, presentView }, pic
         true,
     );
 }
-
-speak(chosenLanguage());
-/** @type {any} */ (window).sse.edit = addTools;

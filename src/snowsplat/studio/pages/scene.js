@@ -65,14 +65,14 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const sending = uploads.has(name);
         status.textContent = sending ? "" : say(scene.status);
         status.dataset.status = scene.status;
-        uploaded = scene.inputs.length === 0;
+        uploaded = scene.inputs.length === 0 && !scene.found;
         const parts = sending ? "upload" : scene.status;
         if (parts !== shown) {
             shown = parts;
             update = undefined;
             /** @type {Record<string, (scene: any) => HTMLElement[]>} */
-            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart };
-            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene));
+            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart, found: openingPart };
+            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene), ...(["upload", "running", "found"].includes(parts) ? [] : [keptPart(scene)]));
         }
         update?.(scene);
     }
@@ -98,6 +98,38 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             more.hidden = !sending.error;
         };
         return [make("section.card", {}, bar, line, more)];
+    }
+
+    /** A scene of the command line has no site yet. */
+    function openingPart() {
+        const line = make("p", { role: "status" }, say("opening"));
+        const tell = (/** @type {any} */ error) => (line.textContent = error instanceof Refused ? error.message : say("offline"));
+        ask(`${address}/open`, "POST", {}).then(refresh, tell);
+        return [make("section.card", {}, line)];
+    }
+
+    /** Its name, its folder, and how to remove it. */
+    function keptPart(/** @type {any} */ scene) {
+        const name = /** @type {HTMLInputElement} */ (make("input", { type: "text", value: scene.title, maxlength: 80, "aria-label": say("title_label") }));
+        const rename = async () => {
+            await ask(`${address}/rename`, "POST", { title: name.value });
+            shown = "";
+            await refresh();
+        };
+        const remove = async () => {
+            if (!confirm(say("remove_sure", scene.title))) return;
+            const { photos } = await ask(address, "DELETE");
+            location.hash = "";
+            // The other page hides notices when it begins.
+            setTimeout(() => notice(photos ? say("removed_but", photos) : say("removed")));
+        };
+        return make(
+            "section.card",
+            {},
+            make("form.row", {}, name, make("button.plain", { type: "submit", click: action(rename) }, say("rename"))),
+            make("p.soft", {}, say("kept_at", scene.folder)),
+            !scene.found && make("div.row", {}, make("button.plain", { type: "button", click: action(remove) }, say("remove")), make("span.soft", {}, say("remove_help"))),
+        );
     }
 
     /** What the photos are, and a form that starts the job. */
@@ -243,6 +275,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const reports = Object.entries(result.reports).map(([kind, path]) =>
             make("a.button.plain", { href: `${address}/made/${path}`, target: "_blank", rel: "noopener" }, say(`report_${kind}`)),
         );
+        const film = make("section.card", { hidden: true });
+        let filmed = 0;
+        update = now => {
+            if (now.film === filmed) return;
+            filmed = now.film;
+            showFilm(film, address, filmed);
+        };
         const phone = make("section.card");
         showPhone(phone, site);
         return [
@@ -254,13 +293,14 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 ...fact("gaussians", result.gaussians.toLocaleString()),
                 ...fact("size", bytes(result.bytes)),
                 ...(result.psnr === null ? [] : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
-                ...fact("took", duration(result.seconds)),
+                ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
             ),
             result.verdict.length > 0 &&
                 make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, line))),
             make("section.card", {}, make("h2", {}, say("download")), ...Object.entries(scene.exports).map(([kind, line]) => download(kind, String(line)))),
+            film,
             phone,
-            make("details.card", {}, make("summary", {}, say("again")), ...againPart(scene)),
+            !scene.found && make("details.card", {}, make("summary", {}, say("again")), ...againPart(scene)),
         ].filter(part => part !== false);
     }
 
@@ -361,6 +401,20 @@ function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement}
 
 function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {string[]} */ names) {
     strip.replaceChildren(...names.map((name, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+}
+
+/** The film of the scene; `made`: its time, 0 if there is none. */
+async function showFilm(/** @type {HTMLElement} */ card, /** @type {string} */ address, /** @type {number} */ made) {
+    card.hidden = !made;
+    if (!made) return;
+    const { bytes: size, command: line } = await ask(`${address}/film`);
+    const file = `${address}/film/file?${made}`;
+    card.replaceChildren(
+        make("h2", {}, say("film")),
+        make("video.film", { src: file, controls: true, preload: "metadata", "aria-label": say("film") }),
+        make("div.row", {}, make("a.button.plain", { href: file, download: true }, say("film_download", bytes(size)))),
+        line && command(line),
+    );
 }
 
 /** The addresses of the scene for phones, with codes. */

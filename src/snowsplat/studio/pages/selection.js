@@ -18,7 +18,7 @@ export function times(/** @type {ArrayLike<number>} */ a, /** @type {ArrayLike<n
 /**
  * The place of a point in a window, and its depth; behind the camera, the depth is not positive.
  * @param {ArrayLike<number>} m the clip space from the space of the point
- * @param {ArrayLike<number>} point
+ * @param {number[]} point
  * @param {number} width
  * @param {number} height
  */
@@ -82,6 +82,7 @@ export function bounds(/** @type {Float32Array} */ centers) {
 export class Selection {
     /** @param {number} count of Gaussians */
     constructor(count) {
+        /** @type {Uint8Array} */
         this.state = new Uint8Array(count);
         /** @type {Uint8Array[]} */
         this.past = [];

@@ -64,7 +64,7 @@ function tile(/** @type {any} */ scene) {
     return make(
         "a.tile",
         { href: `#${encodeURIComponent(scene.name)}` },
-        scene.picture ? make("img", { src: `${address}/site/poster.jpg`, alt: "", loading: "lazy" }) : make("div.empty"),
+        scene.picture ? make("img", { src: `${address}/picture`, alt: "", loading: "lazy" }) : make("div.empty"),
         make("b", {}, scene.title),
         make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString()}`}`),
     );

@@ -57,11 +57,13 @@ const hidingSliders = (app, [x, y, z], limits) => {
         ({ gsplat } = app.root.findByName('gsplat'));
         gsplat.setWorkBufferModifier(code);
     };
+    /** The largest distance and the largest size that are shown. */
+    const shown = () => sliders.map(({ value }, i) => {
+        const [all, least] = limits[['distance', 'size'][i]];
+        return value > 0 ? all * (least / all) ** (value / 100) : EVERYTHING;
+    });
     const apply = () => {
-        const [distance, size] = sliders.map(({ value }, i) => {
-            const [all, least] = limits[['distance', 'size'][i]];
-            return value > 0 ? all * (least / all) ** (value / 100) : EVERYTHING;
-        });
+        const [distance, size] = shown();
         if (!gsplat) {
             if (Math.min(distance, size) === EVERYTHING) return;
             use(HIDING);
@@ -86,6 +88,8 @@ const hidingSliders = (app, [x, y, z], limits) => {
             use(code);
             apply();
         },
+        /** Everything that is hidden: from [x, y, z], beyond a distance, or larger than a size; null if nothing is. */
+        limits: () => (sliders.some(({ value }) => value > 0) ? [x, y, z, ...shown()] : null),
         values: () => sliders.map(({ value }) => Number(value)),
         set: (values) => {
             values.forEach((value, i) => { sliders[i].value = value; });

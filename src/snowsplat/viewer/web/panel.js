@@ -94,9 +94,10 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     /** Move to a view, in orbit around its target; for the view of a photo, with its limits. */
     const flyTo = (view, limitsThere = UNLIMITED) => {
         const { position, target, fov } = addView(view);
-        annotations[0] = { position: target, camera: { initial: { position, target, fov } } };
-        viewer.selectAnnotation(0);
-        annotations.length = 0;
+        // The engine flies to annotations: this one exists only while it is asked for.
+        const last = annotations.push({ position: target, camera: { initial: { position, target, fov } } }) - 1;
+        viewer.selectAnnotation(last);
+        annotations.pop();
         state.selectedAnnotation = null;
         limits = limitsThere;
     };
@@ -203,6 +204,6 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         panel.classList.toggle('snow-faded', hidden && strip.hidden && hiding.element.hidden)
     );
     document.querySelector('.sse-viewer').append(panel);
-    // The studio adds its tools for editing.
-    window.sse.edit?.({ viewer, scene, camera, canvas, hiding, panel, presentView });
+    // The studio adds its tools.
+    window.sse.tools?.({ viewer, scene, camera, canvas, hiding, panel, presentView, flyTo });
 });

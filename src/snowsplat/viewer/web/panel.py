@@ -7,6 +7,7 @@ scripts are `panel.css`, `hiding.js` and `panel.js`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -46,6 +47,17 @@ def view_numbers(view: InitialView, aspect: float) -> list[float]:
     """
     (x, y, z), (u, v, w) = view.position, view.target
     return [-x, -y, z, -u, -v, w, view.with_aspect(aspect).fov]
+
+
+def view_of_page(numbers: Sequence[float]) -> InitialView:
+    """The view of such numbers, and its aspect; the inverse of `view_numbers`."""
+    x, y, z, u, v, w, fov, aspect = numbers
+    return InitialView((-x, -y, z), (-u, -v, w), fov, aspect)
+
+
+def numbers_of(view: InitialView) -> list[float]:
+    """Position, target, field of view and aspect of a view, as records store it."""
+    return [*view.position, *view.target, view.fov, view.aspect]
 
 
 def panel_settings(

@@ -22,7 +22,7 @@ from snowsplat.util.files import atomic_path, write_text
 from snowsplat.viewer.http.served_file import Served, served
 from snowsplat.viewer.web.panel import Description
 from snowsplat.viewer.web.scene import PICTURES, ReadyScene, ready
-from snowsplat.viewer.web.viewer_page import asset, content_policy, page
+from snowsplat.viewer.web.viewer_page import Annotation, asset, content_policy, page
 
 PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
 #: The size that services recommend for the picture of a link (Open Graph).
@@ -45,6 +45,7 @@ def write_site(
     url: str = "",
     write_scene: Callable[[Path, Gaussians], str] = write_one_file,
     start: InitialView | None = None,
+    notes: Sequence[Annotation] = (),
 ) -> None:
     """Write the page, its viewer, the scene and a picture into a folder.
 
@@ -56,11 +57,12 @@ def write_site(
             Services that show a preview of a link need it to find the picture.
         write_scene: writes the scene into the folder, and returns the name of the file to load.
         start: the initial view; None: see `scene.ready`.
+        notes: annotations, whose views are in the world of the scene.
 
     Raises:
         OSError: a file cannot be written.
     """
-    scene = ready(gaussians, cameras, background, start)
+    scene = ready(gaussians, cameras, background, start, notes)
     content = write_scene(folder, scene.gaussians)
     if content == INDEX:
         scene = scene.complete()

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from snowsplat.formats import GaussianArrays
@@ -19,7 +18,7 @@ from snowsplat.formats.lod import lod_files
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import Similarity, rotation_from_quat
+from snowsplat.scene.geometry import Similarity, rotation_from_quat, shortest_rotation
 from snowsplat.scene.initial_view import InitialView, bound, overview, view_of_camera
 from snowsplat.scene.orientation import VIEWING_DISTANCE, scene_up, up_of_surfaces
 from snowsplat.scene.render import render
@@ -29,7 +28,14 @@ from snowsplat.viewer.http.served_file import Served, ServedFile, served
 from snowsplat.viewer.web.hiding import Hiding, hiding_of
 from snowsplat.viewer.web.panel import Description, panel_settings
 from snowsplat.viewer.web.stops import Stops, stops_of
-from snowsplat.viewer.web.viewer_page import asset, content_policy, page, script, settings
+from snowsplat.viewer.web.viewer_page import (
+    Annotation,
+    asset,
+    content_policy,
+    page,
+    script,
+    settings,
+)
 
 _SCENE = "scene.compressed.ply"
 #: The file with the pictures of the stops.
@@ -50,6 +56,7 @@ def site(
     levels: Callable[[Gaussians], Path] | None = None,
     count: int | None = None,
     start: InitialView | None = None,
+    notes: Sequence[Annotation] = (),
 ) -> tuple[dict[str, Served], dict[str, str]]:
     """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
@@ -60,7 +67,7 @@ def site(
     only a coarse level. Then the levels stay as they are, and the page only scales them.
     """
     in_place = count is not None
-    scene = ready(gaussians, cameras, background, start, turn=not in_place)
+    scene = ready(gaussians, cameras, background, start, notes, turn=not in_place)
     if levels is not None:
         scene = scene.complete()
     content = _content(scene.gaussians, levels)
@@ -106,6 +113,7 @@ class ReadyScene(NamedTuple):
     scale: float  # of the frame, relative to that of the scene that was given
     metres: float | None  # in a unit of the scene that was given, if that is known
     chosen: bool  # whether the initial view was given
+    notes: Sequence[Annotation] = ()
 
     def complete(self) -> ReadyScene:
         """Nothing is hidden at first; for levels of detail, whose coarse Gaussians are large."""
@@ -121,7 +129,7 @@ class ReadyScene(NamedTuple):
         """
         count = count or len(self.gaussians)
         return {
-            "settings": settings(self.start, self.background, self.film),
+            "settings": settings(self.start, self.background, self.film, self.notes),
             "antialiased": self.gaussians.antialiased,
             "panel": panel_settings(
                 about,
@@ -142,6 +150,7 @@ def ready(
     cameras: Sequence[Camera],
     background: Sequence[float] = (0.0, 0.0, 0.0),
     start: InitialView | None = None,
+    notes: Sequence[Annotation] = (),
     *,
     turn: bool = True,
 ) -> ReadyScene:
@@ -156,13 +165,16 @@ def ready(
         depth *= change.scale
         cameras = [camera.transformed(change) for camera in cameras]
         start = start and start.transformed(change)
+        notes = [note._replace(view=note.view.transformed(change)) for note in notes]
     stops = stops_of(gaussians, cameras, depth if cameras else 1.0, background)
     hiding = hiding_of(gaussians, stops.middle, stops.radius, hide=not cameras)
     film = _film(cameras, depth) if cameras else []
     first = start or (stops.views[0] if cameras else overview(gaussians))
     scale = change.scale if change else 1.0
     chosen = start is not None
-    return ReadyScene(gaussians, first, film, stops, background, hiding, scale, metres, chosen)
+    return ReadyScene(
+        gaussians, first, film, stops, background, hiding, scale, metres, chosen, notes
+    )
 
 
 def viewing_frame(
@@ -199,7 +211,7 @@ def _film(cameras: Sequence[Camera], depth: float) -> list[InitialView]:
 def _change(direction: np.ndarray, depth: float, most: float = _TOO_LARGE) -> Similarity | None:
     """Transform to a frame with −y up and usual distances; None if the scene has both."""
     up = torch.from_numpy(direction)
-    rotation = _shortest_rotation(up, torch.from_numpy(_UP))
+    rotation = shortest_rotation(up, torch.from_numpy(_UP))
     tilt = math.acos(max(-1.0, min(1.0, -float(up[1]))))
     ratio = VIEWING_DISTANCE / depth
     is_level, is_near = tilt < _LEVEL_ENOUGH, 1 / most < ratio < most
@@ -224,17 +236,6 @@ def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     if len(areas):  # a few may be huge
         areas = areas.clamp_max(float(areas.quantile(0.9)))
     return normals.numpy(), areas.numpy(), gaussians.means.detach()[rows].double().numpy()
-
-
-def _shortest_rotation(source: Tensor, target: Tensor) -> Tensor:
-    """(3, 3): rotates one unit vector to another, about their cross product."""
-    axis = torch.linalg.cross(source, target)
-    cosine = float(source @ target)
-    if cosine < -1 + 1e-9:  # by 180° about the x axis, which is perpendicular to ±y
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    x, y, z = axis.tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + cross + cross @ cross / (1 + cosine)
 
 
 def _depth_ahead(gaussians: Gaussians, camera: Camera) -> float:

@@ -14,7 +14,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
@@ -59,8 +59,19 @@ def script(scale: float = 1.0) -> str:
     return _replaced(text, _PLACED, f"{_PLACED} {larger}")
 
 
+class Annotation(NamedTuple):
+    """A text at a place: the target of the view that shows it."""
+
+    title: str
+    text: str
+    view: InitialView
+
+
 def settings(
-    start: InitialView, background: Sequence[float], film: Sequence[InitialView] = ()
+    start: InitialView,
+    background: Sequence[float],
+    film: Sequence[InitialView] = (),
+    notes: Sequence[Annotation] = (),
 ) -> dict[str, Any]:
     """The viewer's settings: its initial view, and a background colour in 0..1.
 
@@ -83,9 +94,17 @@ def settings(
         },
         "animTracks": [_track(film, start.aspect)] if film else [],
         "cameras": [{"initial": {"position": first[:3], "target": first[3:6], "fov": first[6]}}],
-        "annotations": [],
+        "annotations": [_annotation(note, start.aspect) for note in notes],
         "startMode": "animTrack" if film else "default",
     }
+
+
+def _annotation(note: Annotation, aspect: float) -> dict[str, Any]:
+    numbers = view_numbers(note.view, aspect)
+    position, target, fov = numbers[:3], numbers[3:6], numbers[6]
+    initial = {"position": position, "target": target, "fov": fov}
+    texts = {"title": note.title, "text": note.text}
+    return {"position": target, **texts, "extras": {}, "camera": {"initial": initial}}
 
 
 def _track(film: Sequence[InitialView], aspect: float) -> dict[str, Any]:

@@ -1,0 +1,55 @@
+"""`PageFilm`: a film that was planned in a page: its key cameras, length and size.
+
+It imports no torch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from snowsplat.pipeline.output.edit_record import is_view
+
+#: Width and height of the films, in pixels.
+SIZES = ("1920x1080", "1080x1920", "1080x1080")
+_MOST_KEYS = 200
+_LONGEST = 600.0  # seconds
+
+
+@dataclass(frozen=True)
+class PageFilm:
+    """A film that was planned in a page.
+
+    Attributes:
+        keys: at least two views in the frame of the page, in their order: position, target, field
+            of view in degrees, aspect; see `InitialView`.
+        seconds: its length.
+        size: one of `SIZES`.
+        ease: slow at the start and at the end.
+        loop: from the last key back to the first one; it needs at least three keys.
+
+    Raises:
+        ValueError: a value is not possible.
+    """
+
+    keys: list[list[float]]
+    seconds: float = 10.0
+    size: str = SIZES[0]
+    ease: bool = False
+    loop: bool = False
+
+    def __post_init__(self) -> None:
+        least = 3 if self.loop else 2
+        if not least <= len(self.keys) <= _MOST_KEYS:
+            raise ValueError(f"a film needs {least} to {_MOST_KEYS} keys")
+        if not all(is_view(key) and all(map(math.isfinite, key)) for key in self.keys):
+            raise ValueError("a key is no view")
+        if not 0 < self.seconds <= _LONGEST:
+            raise ValueError(f"a film has at most {_LONGEST:g} seconds")
+        if self.size not in SIZES:
+            raise ValueError(f"the sizes are {', '.join(SIZES)}")
+
+    def pixels(self) -> tuple[int, int]:
+        """Width and height."""
+        width, height = self.size.split("x")
+        return int(width), int(height)

@@ -1,0 +1,36 @@
+"""Starts the worker; see `snowsplat.studio.worker`.
+
+A job holds its lock before the worker is imported, which takes seconds: a studio that starts in
+these seconds knows that the job runs.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from snowsplat.studio.library import TASKS, Scene
+from snowsplat.util.run_lock import InUse, locked
+
+
+def main(words: list[str]) -> int:
+    """Returns the exit code; 2 if another process does the task."""
+    if words[0] not in TASKS:
+        return _work(words)
+    scene = Scene(Path(words[1]))
+    try:
+        with locked(scene.lock(words[0]), f"{scene.folder}: in use by"):
+            return _work(words)
+    except InUse as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def _work(words: list[str]) -> int:
+    from snowsplat.studio.worker import main as work  # torch
+
+    return work(words)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

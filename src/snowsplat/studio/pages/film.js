@@ -1,0 +1,276 @@
+// A film of a finished scene: key views on a time line, a preview, and the video that the studio
+// renders. The path through the keys is that of the studio, so the preview is what is rendered.
+
+import { action, ask, bytes, command, make, Refused } from "./page.js";
+import { say } from "./text.js";
+
+const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
+const TURN = 8; // keys of a turn around the target
+const ADDRESS = "../film"; // relative to the page
+
+/**
+ * Views around the target of a view, at equal angles about the vertical, beginning with it.
+ * @param {number[]} view position, target, field of view, aspect
+ * @param {number} count
+ */
+export function around([x, y, z, u, v, w, ...lens], count) {
+    return Array.from({ length: count }, (_, i) => {
+        const [sine, cosine] = [Math.sin((2 * Math.PI * i) / count), Math.cos((2 * Math.PI * i) / count)];
+        return [u + cosine * (x - u) + sine * (z - w), y, w + cosine * (z - w) - sine * (x - u), u, v, w, ...lens];
+    });
+}
+
+/**
+ * The camera at a share of the time of a path, between two of its cameras.
+ * @param {number[][]} path position, point ahead, up, field of view
+ * @param {number} share 0..1
+ */
+export function cameraAt(path, share) {
+    const at = share * (path.length - 1);
+    const before = Math.min(Math.floor(at), path.length - 2);
+    return path[before].map((value, i) => value + (at - before) * (path[before + 1][i] - value));
+}
+
+/** @param {any} page see panel.js */
+export function addFilm({ viewer, scene, camera, canvas, panel, presentView, flyTo }) {
+    /** @type {number[][]} */
+    let keys = [];
+    let chosen = -1; // the key that was added or shown last
+    /** @type {number[][] | null} */
+    let path = null; // of the present plan, when the studio has computed it
+    let share = 0; // of the time of the film
+    let playing = false;
+    let previewing = false;
+    /** @type {ReturnType<typeof setTimeout> | undefined} */
+    let timer;
+
+    const button = (/** @type {string} */ key, /** @type {any} */ click) =>
+        /** @type {HTMLButtonElement} */ (make("button", { type: "button", click }, say(key)));
+    const told = make("p", { role: "status" });
+    const tell = (/** @type {string} */ text) => (told.textContent = text);
+
+    // The plan
+
+    const seconds = /** @type {HTMLInputElement} */ (make("input", { type: "number", min: 1, max: 600, step: "any", value: 10, change: changed }));
+    const size = /** @type {HTMLSelectElement} */ (
+        make("select", { change: changed }, ...SIZES.map(value => make("option", { value }, say(`film_${value}`))))
+    );
+    const ease = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", checked: true, change: changed }));
+    const loop = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: changed }));
+    const plan = () => ({ keys, seconds: Number(seconds.value), size: size.value, ease: ease.checked, loop: loop.checked });
+    const canPlay = () => keys.length >= (loop.checked ? 3 : 2) && Number(seconds.value) > 0;
+
+    function changed() {
+        path = null;
+        stopPreview();
+        draw();
+    }
+
+    function draw() {
+        line.replaceChildren(
+            ...keys.map((key, i) => {
+                const show = () => {
+                    stopPreview();
+                    chosen = i;
+                    flyTo(key.slice(0, 7));
+                    draw();
+                };
+                return make("button", { type: "button", "aria-label": say("film_key", i + 1), "aria-current": i === chosen && "true", click: show }, String(i + 1));
+            }),
+        );
+        empty.hidden = keys.length > 0;
+        replace.disabled = remove.disabled = chosen < 0;
+        play.disabled = render.disabled = position.disabled = !canPlay();
+        play.textContent = say(playing ? "film_pause" : "film_preview");
+        position.value = String(share);
+        viewer.app.renderNextFrame = true;
+    }
+
+    const view = () => [...presentView(), scene.aspect];
+    const add = button("film_add", () => {
+        keys.splice(chosen + 1, 0, view());
+        chosen += 1;
+        changed();
+    });
+    const replace = button("film_replace", () => {
+        keys[chosen] = view();
+        changed();
+    });
+    const remove = button("film_remove", () => {
+        keys.splice(chosen, 1);
+        chosen = Math.min(chosen, keys.length - 1);
+        changed();
+    });
+    const turn = button("film_turn", () => {
+        keys = around(view(), TURN);
+        chosen = TURN - 1;
+        loop.checked = true;
+        ease.checked = false;
+        changed();
+    });
+    const line = make("div.snow-keys", { role: "group", "aria-label": say("film_line") });
+    const empty = make("p", {}, say("film_empty"));
+
+    // The preview
+
+    const position = /** @type {HTMLInputElement} */ (
+        make("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0, "aria-label": say("film_line"), input: () => scrub() })
+    );
+    const frame = make("div.snow-frame", { hidden: true, "aria-hidden": "true" });
+    canvas.after(frame);
+
+    async function findPath() {
+        if (path) return;
+        tell(say("preparing"));
+        const asked = JSON.stringify(plan());
+        const found = await ask(`${ADDRESS}/path`, "POST", plan());
+        tell("");
+        if (asked === JSON.stringify(plan())) path = found.path;
+    }
+
+    async function begin() {
+        await findPath();
+        previewing = Boolean(path);
+        frame.hidden = !previewing;
+    }
+
+    const fail = (/** @type {any} */ error) => tell(error instanceof Refused ? error.message : say("offline"));
+    function scrub() {
+        playing = false;
+        share = Number(position.value);
+        begin().then(draw, fail);
+    }
+
+    const play = button("film_preview", action(async () => {
+        if (playing) {
+            playing = false;
+        } else {
+            await begin().catch(fail);
+            playing = previewing;
+            if (share >= 1) share = 0;
+        }
+        // The action enables its button when this has ended.
+        setTimeout(draw);
+    }));
+
+    /** The camera is that of the visitor again. */
+    function stopPreview() {
+        playing = previewing = false;
+        frame.hidden = true;
+    }
+
+    // This follows the handlers of the viewer and of the panel, which set the camera, too.
+    viewer.app.on("update", (/** @type {number} */ passed) => {
+        if (!previewing || !path) return;
+        if (playing) {
+            share = Math.min(1, share + passed / Number(seconds.value));
+            position.value = String(share);
+            if (share >= 1) {
+                playing = false;
+                draw();
+            }
+        }
+        const [x, y, z, u, v, w, a, b, c, fov] = cameraAt(path, share);
+        camera.entity.setPosition(x, y, z);
+        camera.entity.lookAt(u, v, w, a, b, c);
+        // The window shows the whole picture of the film, in a frame.
+        const [wide, high] = size.value.split("x").map(Number);
+        const { clientWidth: width, clientHeight: height } = canvas;
+        const scale = Math.min(width / wide, height / high);
+        const half = (Math.tan((fov * Math.PI) / 360) * height) / (high * scale);
+        const longer = camera.horizontalFov ? (half * width) / height : half;
+        camera.fov = (Math.atan(longer) * 360) / Math.PI;
+        Object.assign(frame.style, { width: `${wide * scale}px`, height: `${high * scale}px` });
+        viewer.app.renderNextFrame = true;
+    });
+    // Whoever moves the camera wants it back.
+    canvas.addEventListener("pointerdown", () => {
+        if (previewing) stopPreview(), draw();
+    });
+
+    // The video
+
+    const progress = make("progress", { max: 1, value: 0, hidden: true, "aria-label": say("film_rendering") });
+    const result = make("div");
+    const render = button("film_render", action(async () => {
+        stopPreview();
+        await ask(ADDRESS, "POST", plan()).catch(fail);
+        await look();
+        setTimeout(draw);
+    }));
+    const stop = button("stop", action(() => ask(ADDRESS, "DELETE").then(look, fail)));
+
+    /** What the studio has; while it renders, again and again. */
+    async function look() {
+        clearTimeout(timer);
+        const now = await ask(ADDRESS).catch(() => null);
+        if (!now) {
+            timer = setTimeout(look, 3000);
+            return;
+        }
+        const wasRunning = !progress.hidden;
+        progress.hidden = stop.hidden = !now.running;
+        render.hidden = now.running;
+        if (now.running) {
+            const { done = 0, total = 0, left } = now.now ?? {};
+            progress.setAttribute("value", String(total ? done / total : 0));
+            tell(total ? `${say("film_rendering")} ${say("of", done, total)}` : say("film_rendering"));
+            timer = setTimeout(look, 1000);
+            return left;
+        }
+        if (wasRunning) tell(now.outcome === "failed" ? now.error : now.outcome === "done" ? "" : say("film_stopped"));
+        result.replaceChildren();
+        if (now.bytes && !now.running) {
+            const download = make("a", { href: `${ADDRESS}/file`, download: true }, say("film_download", bytes(now.bytes)));
+            result.append(make("p", {}, download), command(now.command));
+        }
+        if (!keys.length && now.plan) {
+            ({ keys } = now.plan);
+            chosen = keys.length - 1;
+            seconds.value = now.plan.seconds;
+            size.value = now.plan.size;
+            ease.checked = now.plan.ease;
+            loop.checked = now.plan.loop;
+            draw();
+        }
+    }
+
+    // The panel
+
+    const row = (/** @type {Node[]} */ ...parts) => make("div.snow-buttons", {}, ...parts);
+    const content = make(
+        "div.snow-film.snow-tools.snow-card",
+        { hidden: true },
+        row(add, replace, remove, turn),
+        empty,
+        line,
+        make("label", {}, say("film_seconds"), seconds),
+        make("label", {}, say("film_size"), size),
+        make("label.snow-check", {}, ease, say("film_ease")),
+        make("label.snow-check", {}, loop, say("film_loop")),
+        position,
+        row(play, render, stop),
+        progress,
+        told,
+        result,
+    );
+    const open = button("film", () => {
+        content.hidden = !content.hidden;
+        open.ariaExpanded = String(!content.hidden);
+        if (content.hidden) stopPreview();
+        else look();
+    });
+    open.ariaExpanded = "false";
+    panel.querySelector(".snow-copied").before(open);
+    panel.querySelector(".snow-card").after(content);
+    viewer.events.on("controlsHidden:changed", () => {
+        if (!content.hidden) panel.classList.remove("snow-faded");
+    });
+    // Keys in fields are not for the camera.
+    for (const kind of ["keydown", "keyup"])
+        content.addEventListener(kind, event => {
+            if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) event.stopPropagation();
+        });
+    stop.hidden = true;
+    draw();
+}
