@@ -96,7 +96,7 @@ def errors(trainer: Trainer, folder: Path) -> dict[str, float]:
         known = truth.isfinite() & (shown.alpha > 0.5)
         depth.append((z / truth - 1.0).abs()[known])
         normals = [normals_of_depth(d, camera) for d in (z, truth.where(known, 0.0))]
-        cosine = (normals[0] * normals[1]).sum(2)[known].clamp(-1, 1)
+        cosine = (normals[0] * normals[1]).sum(0)[known].clamp(-1, 1)
         angle.append(torch.rad2deg(cosine.acos()))
     d, a = torch.cat(depth), torch.cat(angle)
     figures = {"depth": d.median(), "depth_mean": d.mean(), "normal": a.median()}

@@ -29,14 +29,14 @@ def camera(size: int = 12) -> Camera:
 
 def wall(at: Camera) -> Tensor:
     """(H, W): the depth of the plane NORMAL · x = -3 in the frame of the camera."""
-    return -3.0 / (rays_of(at, NORMAL) @ NORMAL)
+    return -3.0 / torch.einsum("chw,c->hw", rays_of(at, NORMAL), NORMAL)
 
 
 def test_the_normals_of_a_plane() -> None:
     found = normals_of_depth(wall(camera()), camera())
-    torch.testing.assert_close(found[1:-1, 1:-1], NORMAL.expand(10, 10, 3))
-    assert not found[0].any()
-    assert not found[:, -1].any()
+    torch.testing.assert_close(found[:, 1:-1, 1:-1], NORMAL[:, None, None].expand(3, 10, 10))
+    assert not found[:, 0].any()
+    assert not found[:, :, -1].any()
 
 
 def splats_on_the_wall(at: Camera) -> tuple[Splats2D, Tensor]:
@@ -59,7 +59,7 @@ def test_a_flat_wall_is_consistent_wherever_the_centres_are() -> None:
     assert float(consistency(splats, planes, camera())) == pytest.approx(0.0, abs=1e-12)
     tilted = torch.nn.functional.normalize(NORMAL + torch.tensor([0.2, 0.0, 0.0]), dim=0)
     x, y = splats.means2d.floor().long().unbind(1)
-    distances = splats.depths * (rays_of(camera(), NORMAL)[y, x] @ tilted)
+    distances = splats.depths * (rays_of(camera(), NORMAL)[:, y, x].T @ tilted)
     across = torch.cat([tilted.expand(len(planes), 3), distances[:, None]], dim=1)
     assert float(consistency(splats, across, camera())) > 1e-3
 
@@ -75,15 +75,16 @@ def test_its_gradient_by_finite_differences() -> None:
     def parts(packed: Tensor, planes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rows = torch.cat([packed[:, :8], planes, packed[:, 12:]], dim=1)
         image, alpha, _ = ops.rasterize(Splats2D(rows, None, 4), 12, 12)
-        depth = image[..., 3] / (image[..., :3] * rays).sum(2)
-        return image[..., :3], normals_of_depth(depth, camera()), alpha
+        *normals, distances = image.unbind(2)
+        normals = torch.stack(normals)
+        return normals, normals_of_depth(distances / (normals * rays).sum(0), camera()), alpha
 
     _, before, alpha = (tensor.detach() for tensor in parts(*leaves))
-    weight = -(before * torch.nn.functional.normalize(rays, dim=2)).sum(2)
+    weight = -(before * torch.nn.functional.normalize(rays, dim=0)).sum(0)
 
     def loss(packed: Tensor, planes: Tensor) -> Tensor:  # the weight and alpha are constant
         normals, from_depth, _ = parts(packed, planes)
-        return (weight * (alpha - (normals * from_depth).sum(2))).mean()
+        return (weight * (alpha - (normals * from_depth).sum(0))).mean()
 
     found = torch.autograd.grad(
         consistency(Splats2D(leaves[0], None, 3), leaves[1], camera()), leaves

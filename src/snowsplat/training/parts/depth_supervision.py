@@ -40,9 +40,6 @@ if TYPE_CHECKING:
 _RESIDUAL = 0.03
 #: The fitted scale is 1 ± this.
 _SCALE_RANGE = 0.05
-#: The weight falls to this share until the last step: the maps tell where the surfaces are, and
-#: then the photos, which are more exact, decide.
-_LAST_WEIGHT = 0.05
 #: All maps together have at most this number of pixels, of two bytes; with more photos, they are
 #: smaller.
 _MOST_PIXELS = 32_000_000
@@ -112,7 +109,7 @@ class DepthSupervision(Part):
         )
         term, error = depth_term(depth, alpha, target, self._middles[view.index])
         self._present[view] = error  # if a step is repeated, this replaces that of the last attempt
-        return self.weight * _LAST_WEIGHT ** run.schedule.share(run.step) * term
+        return self.weight * term
 
     def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
         """Keep the errors of the batch, in every process."""

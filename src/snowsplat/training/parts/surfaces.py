@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import max_pool2d
 
 from snowsplat import ops
 from snowsplat.ops.capacity import Capacity
@@ -121,7 +121,7 @@ def planes_of(means: Tensor, quats: Tensor, axis: Tensor, camera: Camera) -> Ten
     """
     cam_from_world = camera.cam_from_world.to(means)
     index = axis[:, None, None].expand(-1, 3, 1)
-    normals = rotation_from_quat(normalize(quats, dim=1)).gather(2, index)[..., 0]
+    normals = rotation_from_quat(quats).gather(2, index)[..., 0]
     normals = normals @ cam_from_world[:, :3].T
     distances = (normals * transform_points(cam_from_world, means)).sum(1, keepdim=True)
     return torch.where(distances > 0, -1.0, 1.0) * torch.cat([normals, distances], dim=1)
@@ -144,13 +144,14 @@ def consistency(
     size = camera.width, camera.height
     drawn = Splats2D(packed, splats.ids, planes.shape[1])
     image, alpha, _ = ops.rasterize(drawn, *size, capacity=capacity)
-    normals, distances = image[..., :3], image[..., 3]
+    normals, distances = image.permute(2, 0, 1).split([3, 1])
     rays = rays_of(camera, packed)
-    along = (normals * rays).sum(2)
+    along, lengths = (normals * rays).sum(0), rays.square().sum(0).sqrt()
     # The planes face the camera, so `along` is negative. Those seen from the side have no depth.
-    shown = (along < -_SIDEWAYS * rays.norm(dim=2)) & (distances < 0)
-    depth = torch.where(shown, distances, -1.0) / torch.where(shown, along, -1.0)
+    shown = (along < -_SIDEWAYS * lengths) & (distances[0] < 0)
+    depth = torch.where(shown, distances[0], -1.0) / torch.where(shown, along, -1.0)
     from_depth = normals_of_depth(depth, camera)
-    around = max_pool2d((~shown).to(depth)[None, None], 3, 1, 1)[0, 0] == 0
-    weight = around * -(from_depth.detach() * normalize(rays, dim=2)).sum(2).clamp(max=0.0)
-    return (weight * (alpha.detach() - (normals * from_depth).sum(2))).mean()
+    with torch.no_grad():
+        around = max_pool2d((~shown).to(depth)[None], 3, 1, 1)[0] == 0
+        weight = around * -((from_depth * rays).sum(0) / lengths).clamp(max=0.0)
+    return (weight * (alpha.detach() - (normals * from_depth).sum(0))).mean()
