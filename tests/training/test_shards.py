@@ -7,9 +7,11 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from snowsplat.data.load import load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.processes.shards import ALONE, share
 
@@ -27,6 +29,7 @@ RUNS = [
         "leave_out_after": 0.3,
         "exposure": "on",
         "transients": "on",
+        "depth_weight": 0.5,
     },
     {
         **DENSE,
@@ -79,6 +82,13 @@ def trained(folder: Path, processes: int) -> list[dict]:
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("shards")
     write_toy_dataset(folder / "dataset", "colmap-bin", 9, 48, 36, n_points=400)
+    (folder / "dataset/depths").mkdir()
+    data = load_dataset(folder / "dataset", hold_out=None)
+    pixels = torch.stack(torch.meshgrid(torch.arange(48.0), torch.arange(36.0), indexing="xy"), 2)
+    for view in data.train[::2]:  # the depth of the nearest point in the photo
+        at, z = view.camera.project(data.points.xyz.double())
+        nearest = torch.cdist(pixels.double().reshape(-1, 2), at).argmin(1)
+        np.save(folder / f"dataset/depths/{Path(view.name).stem}.npy", z[nearest].reshape(36, 48))
     return folder
 
 

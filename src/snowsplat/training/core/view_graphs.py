@@ -55,7 +55,8 @@ def recordable(parts: Sequence[Part]) -> bool:
     The Python code of such a part would run when it is recorded, but not in later steps.
     """
     hooks = ("background", "image", "loss")
-    return all(getattr(type(part), hook) is getattr(Part, hook) for part in parts for hook in hooks)
+    active = [type(part) for part in parts if not part.idle]
+    return all(getattr(kind, hook) is getattr(Part, hook) for kind in active for hook in hooks)
 
 
 @dataclass

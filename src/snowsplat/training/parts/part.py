@@ -46,19 +46,21 @@ class Part:
     `loss` and `regularizer`. With several processes, all of them call the same methods in the same
     order, but `background`, `target`, `image` and `loss` only in the process that blends the view:
     these must not call `Run.render` or methods of ``run.shards``. On a GPU, these four may be
-    called twice for a view. A GPU is faster if no part overrides `background`, `image` or `loss`:
-    see `training.core.view_graphs`.
+    called twice for a view. A GPU is faster if no part that is not `idle` overrides `background`,
+    `image` or `loss`: see `training.core.view_graphs`.
 
     Attributes:
         name: of the part in checkpoints and messages; default: the name of the class.
         with_depth: whether the part uses ``rendered.depth``. Rendering it takes time.
-        abs_grad: whether the part uses ``gradient.splats.abs_grad``. Both are set at the latest in
-            `prepare`.
+        abs_grad: whether the part uses ``gradient.splats.abs_grad``.
+        idle: whether `background`, `image` and `loss` have no effect in this training. All three
+            are set at the latest in `prepare`.
     """
 
     name: ClassVar[str]
     with_depth: bool = False
     abs_grad: bool = False
+    idle: bool = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

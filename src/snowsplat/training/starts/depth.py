@@ -16,7 +16,7 @@ from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
 from snowsplat.data.image_loader import Photos
 from snowsplat.data.lens.resample import nearest
 from snowsplat.scene.camera import Camera
-from snowsplat.training.starts.depth_map import DepthMap, map_size, photo_for_map
+from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, map_size, photo_for_map
 from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.photos import usable_pixels
@@ -58,7 +58,7 @@ def depth_points(
         )
     chosen = choose_views(dataset, images, generator)
     points = None if dataset.points is None else chosen.points
-    maps = [_depth_map(view, images, points) for view in chosen.views]
+    maps = [aligned_depth_map(view, images, points) for view in chosen.views]
     unused = sum(view.depth is not None for view in chosen.views) - sum(map(bool, maps))
     if not any(maps):
         raise UserError(
@@ -70,8 +70,20 @@ def depth_points(
     return fused_points(chosen, maps, images, count, generator)
 
 
-def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | None:
-    """The map of a view in world units; None without a map, or if it contradicts the points."""
+def aligned_depth_map(
+    view: View, images: Photos, points: Tensor | None, longer_side: int = LONGER_SIDE
+) -> DepthMap | None:
+    """The map of a view in world units; None without a map, or if it contradicts the points.
+
+    See `depth_points`.
+
+    Args:
+        points: (P, 3) in the world frame; None: the values are z, in units of ``View.depth_unit``.
+        longer_side: the maximum size of the result, in pixels.
+
+    Raises:
+        UserError: the map is damaged, or not one of its photo.
+    """
     if view.depth is None:
         return None
     values = view.depth_unit * read_depth_file(view.depth)
@@ -89,7 +101,7 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
             f"{view.depth}: has {width}x{height} pixels, but its photo has {photo.width}x"
             f"{photo.height}; use a depth map of the whole photo"
         )
-    width, height = map_size(camera.width, camera.height)
+    width, height = map_size(camera.width, camera.height, longer_side)
     camera = camera.scaled(width, height)
     if part is None:
         whole = torch.from_numpy(values)[None, None]
@@ -101,7 +113,7 @@ def _depth_map(view: View, images: Photos, points: Tensor | None) -> DepthMap | 
     if z is None:
         return None
     known = z.isfinite()
-    usable = usable_pixels(photo_for_map(view, images))
+    usable = usable_pixels(photo_for_map(view, images, longer_side))
     if usable is not None:
         known &= usable
     return DepthMap(camera, torch.where(known, 1.0 / z, 0.0))
@@ -122,7 +134,17 @@ def _world_z(
             alignment = align(z, points, camera, with_shift=kind == "disparity")
         except UserError:  # not this kind, or the photo shows too few points
             continue
-        usable = alignment.error <= max(_SMALL_ERROR, _LARGEST_ERROR * alignment.spread)
+        usable = not contradicts(alignment.error, alignment.spread)
         if usable and alignment.error < least:
             best, least = alignment.apply(z), alignment.error
     return best
+
+
+def contradicts(error: float, spread: float) -> bool:
+    """Whether the errors of a depth map are so large that it is a map of something else.
+
+    Args:
+        error: the median error of its inverse depths, relative to their median.
+        spread: that of a map of one depth.
+    """
+    return error > max(_SMALL_ERROR, _LARGEST_ERROR * spread)

@@ -1,0 +1,132 @@
+"""PSNR and depth error of a room, with and without depth maps in the loss.
+
+    python benchmarks/depth.py -o out/depth --maps none true scaled wrong
+    python benchmarks/depth.py -o out/depth --maps none --set depth_weight=0.2 surfaces=True
+
+Ray-traced photos of a still life in a room, with the true poses and noisy points as structure from
+motion finds them. The true depth of the held-out photos is compared with the rendered one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import resource
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from snowsplat import Trainer, load_dataset, recipe
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
+from snowsplat.scene.render import render
+from snowsplat.scene.surface_normals import normals_of_depth
+from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
+from snowsplat.synthetic.still_life import still_life
+
+#: Points per photo, and their error relative to the depth.
+POINTS, POINT_ERROR = 60, 0.004
+KINDS = ("none", "true", "scaled", "wrong")
+
+
+def write_room(folder: Path, views: int, width: int, height: int) -> None:
+    """Photos, true depths ``truth/IMG.npy``, and a COLMAP model of the room."""
+    if (folder / "sparse").exists():
+        return
+    lens = phone_lens(width, height, (0.0, 0.0, 0.0, 0.0))
+    scene = still_life(0)
+    truth = take_photos(folder / "images", lambda: scene, lens, walk(views, 0), 0)
+    (folder / "truth").mkdir(exist_ok=True)
+    random, points = np.random.default_rng(0), []
+    for name, pose in truth.poses.items():
+        z = depth_map(scene, lens, pose)
+        np.save(folder / "truth" / f"{Path(name).stem}.npy", z)
+        y, x = random.integers(0, height, POINTS), random.integers(0, width, POINTS)
+        seen = z[y, x] * (1.0 + POINT_ERROR * random.standard_normal(POINTS))
+        cam = np.stack([x + 0.5 - width / 2, y + 0.5 - height / 2, np.full(POINTS, lens.focal)])
+        world = invert_rigid(pose).numpy()
+        points.append((world[:, :3] @ (cam / lens.focal * seen)).T + world[:, 3])
+    xyz = np.concatenate(points)
+    images = [
+        ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
+        for name, pose in truth.poses.items()
+    ]
+    pinhole = ColmapCamera(
+        "PINHOLE", width, height, (lens.focal, lens.focal, width / 2, height / 2)
+    )
+    grey = np.full(xyz.shape, 128, np.uint8)
+    write_model(folder / "sparse" / "0", {1: pinhole}, images, xyz, grey)
+
+
+def write_maps(folder: Path, kind: str) -> None:
+    """``depths/`` from the truth: as it is; as a network estimates it (another scale and shift of
+    the disparity for each photo, blurred noise of 5%); or half of them those of other photos.
+    """
+    shutil.rmtree(folder / "depths", ignore_errors=True)
+    if kind == "none":
+        return
+    (folder / "depths").mkdir()
+    files = sorted((folder / "truth").iterdir())
+    random = np.random.default_rng(1)
+    for i, file in enumerate(files):
+        z = np.load(file)
+        if kind == "scaled":
+            coarse = random.standard_normal((z.shape[0] // 8 + 1, z.shape[1] // 8 + 1))
+            noise = np.kron(coarse, np.ones((8, 8)))[: z.shape[0], : z.shape[1]]
+            disparity = (1.0 + 0.05 * noise) / z
+            z = random.uniform(20, 60) * disparity + random.uniform(0, 10)
+        elif kind == "wrong" and i % 2:
+            z = np.load(files[(i + len(files) // 2) % len(files)])[::-1, ::-1]
+        np.save(folder / "depths" / file.name, z.astype(np.float32))
+
+
+def errors(trainer: Trainer, folder: Path) -> dict[str, float]:
+    """Median and mean relative depth error, and angles in degrees, of the held-out views."""
+    depth, angle = [], []
+    for view in trainer.dataset.test:
+        truth = torch.from_numpy(np.load(folder / "truth" / f"{Path(view.name).stem}.npy"))
+        camera: Camera = view.camera.to(trainer.device)
+        shown = render(trainer.gaussians, camera, with_depth=True)
+        assert shown.depth is not None
+        z = shown.depth / shown.alpha.clamp_min(1e-6)
+        known = truth.isfinite() & (shown.alpha > 0.5)
+        depth.append((z / truth - 1.0).abs()[known])
+        normals = [normals_of_depth(d, camera) for d in (z, truth.where(known, 0.0))]
+        cosine = (normals[0] * normals[1]).sum(0)[known].clamp(-1, 1)
+        angle.append(torch.rad2deg(cosine.acos()))
+    d, a = torch.cat(depth), torch.cat(angle)
+    figures = {"depth": d.median(), "depth_mean": d.mean(), "normal": a.median()}
+    figures |= {"normal_mean": a.mean()}
+    return {name: float(value) for name, value in figures.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
+    parser.add_argument("--maps", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--iterations", type=int, default=800)
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE")
+    args = parser.parse_args()
+    settings = {name: ast.literal_eval(value) for name, value in (s.split("=") for s in args.set)}
+    room = args.output / "room"
+    write_room(room, args.views, *args.size)
+    for kind in args.maps:
+        write_maps(room, kind)
+        config = recipe("default", iterations=args.iterations, few_passes=0.0, **settings)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        trainer = Trainer(load_dataset(room), config, note=lambda line: print("  ", line))
+        trainer.run()
+        seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
+        found = {"maps": kind, **settings, "psnr": trainer.evaluate().psnr, "cpu_s": seconds}
+        found |= errors(trainer, room)
+        print(json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}))
+
+
+if __name__ == "__main__":
+    main()
