@@ -15,14 +15,15 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tests.scenes.street import street
+from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
+
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, take_photos, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
-from tests.scenes.street import street
-from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 
 _POINT_ERROR = 0.004  # metres: of the points of the dataset, as in structure from motion
 _POINTS = 120  # of the dataset, per photo
