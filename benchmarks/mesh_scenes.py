@@ -1,4 +1,4 @@
-"""Datasets of procedural scenes with exact poses, and true points on their surfaces, for mesh.py."""
+"""Datasets of procedural scenes with exact poses, and true points on their surfaces."""
 
 from __future__ import annotations
 
@@ -93,8 +93,10 @@ def write_dataset(folder: Path, scene: Procedural, width: int) -> Scene:
     return built
 
 
-def true_points(built: Scene, scene: Procedural, width: int, count: int) -> np.ndarray:
-    """(P, 3): random points on the surfaces that at least two photos show, in the dataset's frame."""
+def true_points(
+    built: Scene, scene: Procedural, width: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random points (P, 3) on the surfaces that photos show, and those that two photos show."""
     lens = scene.lens(width)
     depths = [depth_map(built, lens, pose) for pose in scene.poses]
     random = np.random.default_rng(1)
@@ -102,9 +104,9 @@ def true_points(built: Scene, scene: Procedural, width: int, count: int) -> np.n
     for pose, depth in zip(scene.poses, depths, strict=True):
         rows, columns = np.nonzero(depth < scene.reach)
         chosen = random.choice(len(rows), min(len(rows), count // len(depths)), replace=False)
-        points = _points(lens, pose, depth, rows[chosen], columns[chosen])
-        found.append(points[_views(points, scene, lens, depths) >= 2])
-    return np.concatenate(found)
+        found.append(_points(lens, pose, depth, rows[chosen], columns[chosen]))
+    points = np.concatenate(found)
+    return points, points[_views(points, scene, lens, depths) >= 2]
 
 
 def _views(
