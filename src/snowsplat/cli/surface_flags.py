@@ -27,7 +27,7 @@ class SurfaceFlags(Reports):
     """The file to write."""
     dataset: Annotated[Path | None, flag("DATASET", "-s", default="as trained")] = None
     """Folder of the dataset: for a scene file, or if it was moved after the training."""
-    voxel: Annotated[float | None, flag("LENGTH", default="1.5 pixels of the photos")] = None
+    voxel: Annotated[float | None, flag("LENGTH", default="2 pixels of the photos")] = None
     """Side of the voxels in which the depth maps are fused: the smallest detail."""
     far: Annotated[float | None, flag("LENGTH", default="3 times the median depth")] = None
     """Leave out what is farther than this from every camera."""

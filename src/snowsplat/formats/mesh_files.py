@@ -1,7 +1,7 @@
 """Files of meshes and point clouds: PLY, GLB, OBJ, LAS and LAZ.
 
-PLY and LAS keep the frame of the scene. In GLB and OBJ, y is up, as other programs expect it of these
-formats: our frame, in which y is down, is rotated by 180° about x.
+PLY and LAS keep the frame of the scene. In GLB and OBJ, y is up, as other programs expect it of
+these formats.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats import glb
-from snowsplat.scene.mesh import Mesh
+from snowsplat.scene.mesh import Mesh, y_up
 from snowsplat.scene.origin import HERE
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -21,7 +21,6 @@ from snowsplat.util.ply import header_of
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 POINTS_SUFFIXES = (".ply", ".las", ".laz")
-_UP_BACK = np.array([1, -1, -1], np.float32)
 _GLB_LIMIT = (1 << 32) - (1 << 20)
 _OBJ_ROWS = 1 << 16
 
@@ -88,11 +87,12 @@ def _write_ply(path: Path, mesh: Mesh, comments: list[str]) -> None:
 
 
 def _write_glb(path: Path, mesh: Mesh, comments: list[str]) -> None:
+    turn = y_up(mesh.up).T
     colors = np.full((len(mesh.colors), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * _linear(mesh.colors / 255.0))
     arrays = {
-        "POSITION": (mesh.vertices * _UP_BACK).astype("<f4"),
-        "NORMAL": (_unit(mesh.normals) * _UP_BACK).astype("<f4"),
+        "POSITION": (mesh.vertices @ turn).astype("<f4"),
+        "NORMAL": (_unit(mesh.normals) @ turn).astype("<f4"),
         "COLOR_0": colors,
         "": mesh.faces.astype("<u4").reshape(-1, 1),
     }
@@ -116,7 +116,7 @@ def _write_glb(path: Path, mesh: Mesh, comments: list[str]) -> None:
     accessors[0] |= {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
     node: dict[str, Any] = {"mesh": 0, "name": "mesh"}
     if mesh.origin != HERE:
-        node["translation"] = (np.array(mesh.origin) * _UP_BACK).tolist()
+        node["translation"] = (np.array(mesh.origin) @ turn).tolist()
     attributes = {name: i for i, name in enumerate(arrays) if name}
     primitive = {"attributes": attributes, "indices": 3, "mode": 4, "material": 0}
     # The light of the scene is in the colours of the photos.
@@ -149,13 +149,14 @@ def _unit(normals: np.ndarray) -> np.ndarray:
 
 
 def _write_obj(path: Path, mesh: Mesh, comments: list[str]) -> None:
-    rows = np.concatenate([_world(mesh) * _UP_BACK, mesh.colors / 255.0], 1)
+    turn = y_up(mesh.up).T
+    rows = np.concatenate([_world(mesh) @ turn, mesh.colors / 255.0], 1)
     with open(path, "w", encoding="ascii", newline="\n") as file:
         file.writelines(f"# {comment}\n" for comment in comments)
         for start in range(0, len(rows), _OBJ_ROWS):
             part = slice(start, start + _OBJ_ROWS)
             np.savetxt(file, rows[part], "v %.9g %.9g %.9g %.4f %.4f %.4f")
-            np.savetxt(file, mesh.normals[part] * _UP_BACK, "vn %.4f %.4f %.4f")
+            np.savetxt(file, mesh.normals[part] @ turn, "vn %.4f %.4f %.4f")
         for start in range(0, len(mesh.faces), _OBJ_ROWS):
             corners = np.repeat(mesh.faces[start : start + _OBJ_ROWS] + 1, 2, axis=1)
             np.savetxt(file, corners, "f %d//%d %d//%d %d//%d")

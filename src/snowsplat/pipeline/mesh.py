@@ -1,10 +1,10 @@
-"""`write_mesh` and `write_points`: the surfaces of a scene as triangles or as a dense point cloud."""
+"""`write_mesh` and `write_points`: the surfaces of a scene as triangles or as dense points."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,10 +18,11 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.mesh import Mesh, compacted, filled_holes, largest_parts, vertex_normals
+from snowsplat.scene.orientation import scene_up
 from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
 from snowsplat.surface.isosurface import zero_level
-from snowsplat.surface.volume import TRUNCATION, Report, fused, occupied_blocks
+from snowsplat.surface.volume import Report, fused, occupied_blocks
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
@@ -30,11 +31,15 @@ from snowsplat.util.process import single_threaded
 #: Memory: pixels of all depth maps, with 5 bytes each, and blocks of 512 voxels with 8 bytes each.
 _MOST_PIXELS, _MOST_BLOCKS = 120_000_000, 100_000
 #: The side of a voxel, in widths of a pixel at the usual depth.
-_VOXEL_PIXELS = 1.5
+_VOXEL_PIXELS = 2.0
 #: Surfaces that are farther away than this multiple of the usual depth are cut.
 _REACH = 3.0
 #: Parts of a mesh with a smaller share of the triangles of the largest part are removed.
 _SMALLEST_PART = 0.01
+#: A photo shows a vertex if its depth differs by less than this number of voxels.
+_SAME_PLACE = 2.0
+_TRANSPARENT = 16  # of 255: a pixel of a photo with less alpha shows nothing
+_OPAQUE = (".jpg", ".jpeg")  # other photos can have transparent pixels
 _SAMPLE_VIEWS = 32  # that determine the usual depth
 
 
@@ -43,7 +48,7 @@ class MeshOptions:
     """How surfaces become triangles.
 
     Attributes:
-        voxel: side of a voxel in world units; default: 1.5 widths of a pixel, or more if the
+        voxel: side of a voxel in world units; default: 2 widths of a pixel, or more if the
             voxels would not fit into memory.
         far: surfaces whose depth is larger in a photo are not used, world units; default: three
             times the median depth.
@@ -135,8 +140,7 @@ def write_points(
     _check(target, mesh_files.POINTS_SUFFIXES, overwrite)
     surface = _loaded(load, options, observer)
     mesh = surface.mesh
-    points = Mesh(mesh.vertices, mesh.faces[:0], mesh.normals, mesh.colors, mesh.origin)
-    return _written(target, Surface(**{**vars(surface), "mesh": points}))
+    return _written(target, replace(surface, mesh=replace(mesh, faces=mesh.faces[:0])))
 
 
 def _loaded(
@@ -182,9 +186,11 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
             vertices, faces = _cleaned(vertices, faces, options)
         with observer.waiting("colours") as report:
             photos = _photos(views, maps, scene.gaussians.means.device, report)
-            colors = vertex_colors(vertices, faces, photos, TRUNCATION * voxel)
+            colors = vertex_colors(vertices, faces, photos, _SAME_PLACE * voxel)
     normals = vertex_normals(vertices, faces)
-    mesh = Mesh(vertices, faces, normals, colors, scene.dataset.origin)
+    poses = torch.stack([view.camera.cam_from_world[:, :3] for view in views])
+    x, y, z = scene_up(poses.detach().double().cpu().numpy()).tolist()
+    mesh = Mesh(vertices, faces, normals, colors, scene.dataset.origin, (x, y, z))
     return Surface(mesh, len(views), voxel, far, found, closer)
 
 
@@ -205,9 +211,15 @@ def _depth_maps(
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
         far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
     maps = []
-    for i, camera in enumerate(cameras):
-        report(i, len(cameras), "photos")
-        maps.append(renderer.render(camera, far))
+    with ImageLoader(views) as loader:
+        for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+            report(i, len(cameras), "photos")
+            found = renderer.render(camera, far)
+            if view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE:
+                photo = reduced_photo(view, loader, camera.width, camera.height)
+                empty = None if photo.alpha is None else photo.alpha < _TRANSPARENT
+                found = found.corrected(empty, photo.mask)
+            maps.append(found)
     return maps, far
 
 
@@ -223,7 +235,7 @@ def _usual_depth(maps: Sequence[DepthMap]) -> float:
         if len(known):
             medians.append(float(known.median()))
     if not medians:
-        raise UserError("the photos show no surface; train longer")
+        raise UserError("the photos show no surface; train longer, or use a larger `far`")
     return float(np.median(medians))
 
 

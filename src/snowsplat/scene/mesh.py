@@ -18,6 +18,7 @@ class Mesh:
         faces: (F, 3) int32, rows of ``vertices``; (0, 3) for a cloud of points.
         normals: (V, 3) float32, of length 1, outward; 0 where unknown.
         colors: (V, 3) uint8 sRGB.
+        up: the direction upwards, of length 1.
     """
 
     vertices: np.ndarray
@@ -25,6 +26,20 @@ class Mesh:
     normals: np.ndarray
     colors: np.ndarray
     origin: Origin = HERE
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+
+
+def y_up(up: tuple[float, float, float]) -> np.ndarray:
+    """(3, 3) float64: the rotation after which ``up`` is +y; for −y, by 180° about x.
+
+    It is the smallest rotation after that by 180° about x.
+    """
+    flip = np.diag([1.0, -1.0, -1.0])
+    x, y, z = flip @ np.array(up)
+    if y < -1 + 1e-9:  # straight down: there is no smallest rotation
+        return np.diag([1.0, 1.0, 1.0])
+    turn = np.array([[0, -x, 0], [x, 0, z], [0, -z, 0]])  # the cross product with up × y
+    return np.asarray((np.eye(3) + turn + turn @ turn / (1 + y)) @ flip)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -67,7 +82,7 @@ def _parts(faces: np.ndarray, count: int) -> np.ndarray:
     Each vertex takes the smallest label of its triangles; then labels point to labels, which
     shortens all paths, so that the number of rounds is logarithmic in practice.
     """
-    label = np.arange(count)
+    label = np.arange(count, dtype=np.int32)
     while True:
         low = label[faces].min(1)
         new = label.copy()

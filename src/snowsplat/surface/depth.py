@@ -56,6 +56,20 @@ class DepthMap:
         """(H, W) float32, 0 to 1."""
         return self.weight.to(torch.float32) / 255.0
 
+    def corrected(self, empty: Tensor | None, usable: Tensor | None) -> DepthMap:
+        """The map with what is known from the photo, each (H, W) bool or None.
+
+        ``empty``: pixels that show no surface. ``usable``: False where nothing is known.
+        """
+        depth, weight = self.depth, self.weight
+        if empty is not None:
+            empty = empty.to(depth.device)
+            depth = torch.where(empty, math.inf, depth)
+            weight = torch.where(empty, 255, weight).to(torch.uint8)
+        if usable is not None:
+            depth = torch.where(usable.to(depth.device), depth, 0.0)
+        return DepthMap(self.camera, depth, weight)
+
 
 class SurfaceRenderer:
     """Renders depth maps of one set of Gaussians."""

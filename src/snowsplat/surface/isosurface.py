@@ -29,10 +29,12 @@ def zero_level(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float32 in the world frame, and triangles (F, 3) int32, of the surface.
 
-    Triangles are counter-clockwise from the side where the field is positive. Voxels whose weight is
-    below ``least_weight`` have no surface.
+    Triangles are counter-clockwise from the side where the field is positive. Voxels whose weight
+    is below ``least_weight`` have no surface.
     """
-    cells, places, edges, axes = [], [], [], []
+    # The keys of cells are those of `block_keys`, with coordinates in voxels.
+    cells, places = [], []
+    edges: list[list[np.ndarray]] = [[] for _ in range(6)]
     coordinates = block_coordinates(volume.keys)
     for start in range(0, len(coordinates), _CHUNK):
         own = coordinates[start : start + _CHUNK]
@@ -45,19 +47,21 @@ def zero_level(
             mixed &= _shifted(known, *corner)
         index = np.argwhere(mixed)
         base = SIDE * own[index[:, 0]]  # x, y, z
-        cells.append(base + index[:, :0:-1])
-        places.append(_crossings(field, index) + cells[-1])
+        corner = base + index[:, :0:-1]
+        cells.append(block_keys(corner))
+        places.append((_crossings(field, index) + corner).astype(np.float32))
         for axis in range(3):
             step = np.eye(3, dtype=int)[2 - axis]
             before, after = _shifted(negative, 0, 0, 0), _shifted(negative, *step)
             changes = (before != after) & _shifted(known, 0, 0, 0) & _shifted(known, *step)
-            index = np.argwhere(changes)
-            edges.append(SIDE * own[index[:, 0]] + index[:, :0:-1])
-            axes.append(np.stack([np.full(len(index), axis), before[changes]], 1))
+            for inward in (False, True):
+                index = np.argwhere(changes & (before == inward))
+                first = SIDE * own[index[:, 0]] + index[:, :0:-1]
+                edges[2 * axis + inward].append(block_keys(first))
     if not cells:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
     vertices = np.concatenate(places)
-    faces = _quads(np.concatenate(cells), np.concatenate(edges), np.concatenate(axes), vertices)
+    faces = _quads(np.concatenate(cells), [np.concatenate(each) for each in edges], vertices)
     return (volume.voxel * vertices).astype(np.float32), faces
 
 
@@ -65,7 +69,7 @@ def _with_borders(volume: Volume, own: np.ndarray, least_weight: float) -> np.nd
     """(b, 9, 9, 9) float32: the field of some blocks and the next voxel on each axis; NaN: none."""
     field = np.full((len(own), SIDE + 1, SIDE + 1, SIDE + 1), np.nan, np.float32)
     for dz, dy, dx in _CORNERS:
-        keys = block_keys(own + (dx, dy, dz))
+        keys = block_keys(own + np.array([dx, dy, dz]))
         row = np.searchsorted(volume.keys, keys).clip(max=len(volume.keys) - 1)
         there = volume.keys[row] == keys
         to = tuple(slice(SIDE, None) if d else slice(0, SIDE) for d in (dz, dy, dx))
@@ -95,31 +99,31 @@ def _crossings(field: np.ndarray, index: np.ndarray) -> np.ndarray:
     return np.asarray((points.sum(1) / crosses.sum(1)[:, None])[:, ::-1])
 
 
-def _quads(
-    cells: np.ndarray, edges: np.ndarray, axes: np.ndarray, vertices: np.ndarray
-) -> np.ndarray:
+def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> np.ndarray:
     """(F, 3) int32: two triangles for each edge whose four cells have a vertex.
 
     Args:
-        cells: (V, 3), x, y, z of the first corner of each cell, in voxels.
-        edges: (E, 3), the first voxel of each edge.
-        axes: (E, 2), its axis, and whether the field is negative there.
+        cells: (V,), the key of the first corner of each cell.
+        edges: six arrays of the keys of the first voxels of edges: along x where the field is
+            positive there, along x where it is negative, and so on.
     """
-    keys = block_keys(cells)  # not of blocks, but the range is the same
-    order = np.argsort(keys)
-    ordered = keys[order]
+    order = np.argsort(cells)
+    ordered = cells[order]
     triangles = [np.zeros((0, 3), np.int32)]
-    for axis in range(3):
-        chosen = axes[:, 0] == axis
-        first, negative = edges[chosen], axes[chosen, 1] == 1
-        b, c = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
-        around = [block_keys(first - d) for d in (0 * b, b, b + c, c)]
-        row = np.stack([np.searchsorted(ordered, k) for k in around], 1).clip(max=len(keys) - 1)
-        complete = (ordered[row] == np.stack(around, 1)).all(1)
-        quad = order[row[complete]].astype(np.int32)
+    steps = np.array([1 << 42, 1 << 21, 1])  # of a key, along x, y and z
+    for kind, first in enumerate(edges):
+        axis, inward = divmod(kind, 2)
+        b, c = steps[(axis + 1) % 3], steps[(axis + 2) % 3]
+        quad = np.zeros((len(first), 4), np.int32)
+        complete = np.ones(len(first), bool)
+        for corner, step in enumerate((0, b, b + c, c)):
+            row = np.searchsorted(ordered, first - step).clip(max=len(ordered) - 1)
+            complete &= ordered[row] == first - step
+            quad[:, corner] = order[row]
+        quad = quad[complete]
         # Counter-clockwise about the axis; the outside is where the field is positive.
-        flipped = ~negative[complete]
-        quad[flipped] = quad[flipped, ::-1]
+        if not inward:
+            quad = quad[:, ::-1]
         p = vertices[quad]
         across = ((p[:, 0] - p[:, 2]) ** 2).sum(1) <= ((p[:, 1] - p[:, 3]) ** 2).sum(1)
         quad = np.where(across[:, None], quad, np.roll(quad, -1, 1))

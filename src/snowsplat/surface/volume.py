@@ -1,8 +1,8 @@
 """Depth maps, fused into a truncated signed distance field in sparse blocks of voxels.
 
-Only blocks near a surface have memory. They are found first, from all depth maps, so that every view
-can say where a block is empty, whatever their order is (Curless and Levoy 1996; the blocks are those
-of Nießner et al. 2013).
+Only blocks near a surface have memory. They are found first, from all depth maps, so that every
+view can say where a block is empty, whatever their order is (Curless and Levoy 1996; the blocks are
+those of Nießner et al. 2013).
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _blocks_of(depth_map: DepthMap, voxel: float) -> np.ndarray:
     cells = []
     for offset in (-TRUNCATION, 0.0, TRUNCATION):
         points = (rays * (z + offset * voxel)[:, None]) @ pose[:, :3].T + pose[:, 3]
-        cells.append((points / side).floor().to(torch.int64).unique(dim=0))
+        cells.append((points / side).floor().to(torch.int64))
     cell = torch.cat(cells).cpu().numpy()
     return np.unique(block_keys(cell[(np.abs(cell) < _OFFSET).all(1)]))
 
