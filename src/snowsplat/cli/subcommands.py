@@ -31,7 +31,7 @@ SUBCOMMANDS = {
         ("watch", "OUT", "show the training in the browser"),
         ("convert", "SCENE [MORE …] FILE", "another format; crop, decimate, merge"),
         ("clean", "SCENE FILE", "the scene without floaters"),
-        ("mesh", "SCENE -o FILE.glb", "triangles, for Blender, games, printing"),
+        ("mesh", "SCENE -o FILE.glb", "triangles for Blender, games"),
         ("points", "SCENE -o FILE.laz", "a dense point cloud with normals"),
         ("publish", "SCENE -o FOLDER", "a web site, for any host"),
         ("benchmark", "FOLDER -o OUT", "all scenes of a folder, and a table"),
@@ -91,7 +91,6 @@ def overview() -> str:
 
 _OVERVIEW = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
 {subcommands}
-
 A dataset: photos with their camera poses. Help for each: snowsplat NAME --help
 Completion: add  eval "$(snowsplat --tyro-print-completion bash)"  to ~/.bashrc"""
 
