@@ -145,7 +145,7 @@ def _linear(color: np.ndarray) -> np.ndarray:
 
 def _unit(normals: np.ndarray) -> np.ndarray:
     """The normals; (0, 0, 1) where unknown, because glTF requires a direction."""
-    return np.where(normals.any(1, keepdims=True), normals, np.float32([0, 0, 1]))
+    return np.where(normals.any(1, keepdims=True), normals, np.array([0, 0, 1], np.float32))
 
 
 def _write_obj(path: Path, mesh: Mesh, comments: list[str]) -> None:

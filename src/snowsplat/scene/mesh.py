@@ -111,7 +111,7 @@ def filled_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     following: dict[int, list[int]] = {}
     for a, b in edges[single].tolist():
         following.setdefault(a, []).append(b)
-    loops = []
+    loops: list[np.ndarray] = []
     while following:
         start = next(iter(following))
         loop = [start]
@@ -125,13 +125,14 @@ def filled_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
                 break
     lengths = [_length(vertices[loop]) for loop in loops]
     limit = 0.5 * max(lengths, default=0.0) if len(loops) > 1 else np.inf
-    middles, fans = [], []
-    for loop, length in zip(loops, lengths, strict=True):
+    middles: list[np.ndarray] = []
+    fans: list[np.ndarray] = []
+    for border, length in zip(loops, lengths, strict=True):
         if length > limit:
             continue
-        middle = np.full(len(loop), count + len(middles))
-        middles.append(vertices[loop].mean(0))
-        fans.append(np.stack([np.roll(loop, -1), loop, middle], 1))
+        middle = np.full(len(border), count + len(middles))
+        middles.append(vertices[border].mean(0))
+        fans.append(np.stack([np.roll(border, -1), border, middle], 1))
     if not fans:
         return vertices, faces
     return (

@@ -74,11 +74,12 @@ def _with_borders(volume: Volume, own: np.ndarray, least_weight: float) -> np.nd
         there = volume.keys[row] == keys
         to = tuple(slice(SIDE, None) if d else slice(0, SIDE) for d in (dz, dy, dx))
         of = tuple(slice(0, 1) if d else slice(None) for d in (dz, dy, dx))
-        sums = volume.sums[row[there]][(slice(None), *of)].cpu().numpy()
+        source, target = (slice(None), *of), (there.nonzero()[0], *to)
+        sums = volume.sums[row[there]][source].cpu().numpy()
         weight = sums[..., 0]
         enough = weight >= least_weight
         values = np.where(enough, sums[..., 1] / np.where(enough, weight, 1), np.nan)
-        field[(there.nonzero()[0], *to)] = values
+        field[target] = values
     return field
 
 
