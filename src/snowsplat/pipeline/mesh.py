@@ -176,7 +176,8 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
             voxel, keys, closer = _voxel(maps, options)
             if not len(keys):
                 raise UserError(
-                    "no surface is shown by two photos; train longer, or use a larger `far` or `voxel`"
+                    "no surface is shown by two photos; train longer, or use a larger `far` or "
+                    "`voxel`"
                 )
             volume = fused(maps, voxel, keys, report)
         with observer.waiting("triangles"):
