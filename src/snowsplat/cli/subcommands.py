@@ -91,8 +91,7 @@ def overview() -> str:
 
 _OVERVIEW = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
 {subcommands}
-A dataset: photos with their camera poses. Help for each: snowsplat NAME --help
-Completion: add  eval "$(snowsplat --tyro-print-completion bash)"  to ~/.bashrc"""
+A dataset: photos with their camera poses. Help for each: snowsplat NAME --help"""
 
 
 # The experiments register themselves. Everything else works without that folder.
