@@ -732,6 +732,29 @@ def test_counts_match_the_reference(native: Variant) -> None:
     assert float((counts.double() != exact).double().mean()) <= allowed
 
 
+# The median
+
+
+def test_median_of_a_stack(variant: Variant) -> None:
+    """T in front of the layers is 1, 0.7, 0.42: the second one is at T = ½."""
+    colors = torch.tensor([[1.0, 10], [2, 20], [3, 30]]).double()
+    splats = leaf_splats(flat_stack([0.3, 0.4, 0.9], colors=colors), variant.dtype)
+    median, mean, alpha = variant.ops.rasterize_median(splats, 20, 18)
+    assert median.reshape(-1, 2).unique(dim=0).tolist() == [[2.0, 20.0]]
+    assert_close(mean[3, 4], torch.tensor([0.3 + 0.56 + 1.134, 19.94]), 1e-4)
+    assert_close(alpha, torch.full((18, 20), 1 - 0.7 * 0.6 * 0.1), 1e-4)
+
+
+def test_median_matches_the_reference(native: Variant) -> None:
+    splats = random_splats(3, 300, 45, 37)
+    exact = reference.rasterize_median(splats, 45, 37)
+    found = native.ops.rasterize_median(leaf_splats(splats, native.dtype), 45, 37)
+    same = torch.isclose(found[0].double(), exact[0], atol=1e-5).all(2)
+    assert float(same.double().mean()) > 0.99  # T next to 1/2 is rounded in float32
+    assert_close(found[1].double(), exact[1], 1e-4)
+    assert_close(found[2].double(), exact[2], 1e-4)
+
+
 # Additive blending
 
 

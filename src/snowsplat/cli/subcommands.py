@@ -31,6 +31,8 @@ SUBCOMMANDS = {
         ("watch", "OUT", "show the training in the browser"),
         ("convert", "SCENE [MORE …] FILE", "another format; crop, decimate, merge"),
         ("clean", "SCENE FILE", "the scene without floaters"),
+        ("mesh", "SCENE -o FILE.glb", "triangles for Blender, games"),
+        ("points", "SCENE -o FILE.laz", "a dense point cloud with normals"),
         ("publish", "SCENE -o FOLDER", "a web site, for any host"),
         ("benchmark", "FOLDER -o OUT", "all scenes of a folder, and a table"),
         ("blocks", "plan DATASET -o OUT", "a scene larger than the memory"),
@@ -54,7 +56,8 @@ def load_subcommand(name: str) -> Any:
 _WORDS = {
     "use convert (a file in another format) or publish (a web site)": "export save download",
     "use publish (a web site), or convert SCENE FILE.html": "share upload web site html embed",
-    "there are no meshes; convert writes Gaussians in other formats": "mesh obj",
+    "use mesh": "meshes meshing obj triangles surface tsdf blender print texture polygon",
+    "use points (a dense cloud), or mesh": "pointcloud cloud las laz pcd e57 dense",
     "use convert": "edit crop merge compress decimate transform resize rotate scale",
     "use view, or studio for all in the browser": "show open play viewer serve gui display",
     "use make": "reconstruct splat build create scan run process new start",
@@ -88,9 +91,7 @@ def overview() -> str:
 
 _OVERVIEW = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
 {subcommands}
-
-A dataset: photos with their camera poses. Help for each: snowsplat NAME --help
-Completion: add  eval "$(snowsplat --tyro-print-completion bash)"  to ~/.bashrc"""
+A dataset: photos with their camera poses. Help for each: snowsplat NAME --help"""
 
 
 # The experiments register themselves. Everything else works without that folder.

@@ -253,6 +253,9 @@ struct RasterizeForwardParams {
   SNOW_FIELDS(n, frame, channels, background, image, alpha)
 };
 
+// rasterize_median has the same parameters. The image has the channels of the last splat of each pixel
+// that is blended with T >= 1/2; 0 if there is none. The background is not used.
+
 // rasterize_count: the number of splats that are blended in each pixel.
 template <class T>
 struct RasterizeCountParams {
@@ -370,6 +373,27 @@ struct PointsInFrustaParams {
   T* counts;          // out, (n,) the number of views that contain the point
   T* rates;           // out, (n,) the largest focal / depth of these views, or 0
   SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
+};
+
+// ---- fuse_depth ---------------------------------------------------------------------------------
+
+// Adds a depth map to the sums of samples, which are in cubes of side³ samples, x first.
+template <class T>
+struct FuseDepthParams {
+  int64_t n;              // samples: side³ for each cube
+  int64_t side;           // at least 1
+  double spacing;         // of the samples, world units
+  const T* origins;       // (n / side³, 3) the first sample of each cube, world units
+  const T* to_image;      // (3, 4) K [R | t]
+  int64_t width, height;  // of the depth map in pixels, with a product below 2^31
+  const T* depth;         // (height, width) z; 0: unknown, infinity: there is no surface
+  const T* weight;        // (height, width)
+  int64_t channels;       // of `image`, 0 to 4
+  const T* image;         // (channels, height, width), or null
+  double truncation;      // world units
+  T* sums;                // in and out, (n, 2 + channels): Σ w, Σ w s, and Σ w c of the channels
+  SNOW_FIELDS(n, side, spacing, origins, to_image, width, height, depth, weight, channels, image,
+              truncation, sums)
 };
 
 // ---- detect_sift (CPU only) ---------------------------------------------------------------------

@@ -11,12 +11,13 @@ from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, device_name, resolve_device
 from snowsplat.ops.frusta import Frusta, points_in_frusta
+from snowsplat.ops.fusion import fuse_depth
 from snowsplat.ops.gaussian_parameters import GaussianParameters
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
 from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.projection import add_project_gradients, project
-from snowsplat.ops.rasterizer import count_blended, rasterize
+from snowsplat.ops.rasterizer import count_blended, rasterize, rasterize_median
 from snowsplat.ops.splats import SplatGradient, Splats2D
 from snowsplat.ops.statistic import accumulate_screen_statistics
 from snowsplat.ops.sweep import plane_sweep
@@ -38,6 +39,7 @@ __all__ = [
     "count_blended",
     "default_device",
     "device_name",
+    "fuse_depth",
     "get_num_threads",
     "neighbours",
     "photometric_loss",
@@ -46,6 +48,7 @@ __all__ = [
     "project",
     "project_activated",
     "rasterize",
+    "rasterize_median",
     "resolve_device",
     "set_num_threads",
     "ssim",

@@ -332,6 +332,23 @@ class PointsInFrustaParams(Params):
     rates: Tensor
 
 
+@dataclass(slots=True, kw_only=True)
+class FuseDepthParams(Params):
+    n: int
+    side: int
+    spacing: float
+    origins: Tensor
+    to_image: Tensor
+    width: int
+    height: int
+    depth: Tensor
+    weight: Tensor
+    channels: int
+    image: Tensor | None
+    truncation: float
+    sums: Tensor
+
+
 # --------------------------------------------------------------------------------------- sizes
 
 
@@ -362,6 +379,7 @@ ENTRIES: dict[str, type[Params]] = {
     "rasterize_block_bytes": SizeQueryParams,
     "rasterize_has_slots": SizeQueryParams,
     "rasterize_fwd": RasterizeForwardParams,
+    "rasterize_median": RasterizeForwardParams,
     "rasterize_count": RasterizeCountParams,
     "rasterize_bwd": RasterizeBackwardParams,
     "background_bwd": BackgroundBackwardParams,
@@ -370,4 +388,5 @@ ENTRIES: dict[str, type[Params]] = {
     "neighbours": NeighboursParams,
     "plane_sweep": PlaneSweepParams,
     "points_in_frusta": PointsInFrustaParams,
+    "fuse_depth": FuseDepthParams,
 }

@@ -85,6 +85,39 @@ def rasterize(
 
 
 @torch.no_grad()
+def rasterize_median(splats: Splats2D, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The colours of the splat at which the transmittance of each pixel falls below 1/2.
+
+    Returns the median (H, W, C), the mean Σ T α c (H, W, C) and alpha (H, W), as in `rasterize`. In
+    pixels with alpha < 1/2, the median is that of the last splat that is blended, or 0. With
+    depths as colours, the median is not between two surfaces, as the mean is at the edges of
+    objects. At most four channels.
+
+    Raises ValueError if shapes or dtypes do not match, or there are too many channels.
+    """
+    packed, channels = splats.packed.detach().contiguous(), splats.channels
+    check_float("rasterize_median", "splats", packed)
+    check_size("rasterize_median", width, height)
+    if channels > GROUP_CHANNELS:
+        raise ValueError(f"rasterize_median: at most {GROUP_CHANNELS} channels, got {channels}")
+    columns = _channel_groups(channels, False, packed.device)[0][1]
+    frame = _bin_splats(packed, width, height, columns, False, None)
+    planes = [packed.new_empty(channels, height, width) for _ in range(2)]
+    alpha = packed.new_empty(height, width)
+    for name, image in zip(("rasterize_median", "rasterize_fwd"), planes, strict=True):
+        params = RasterizeForwardParams(
+            n=frame.tiles,
+            frame=frame.params,
+            channels=channels,
+            background=packed.new_zeros(channels),
+            image=image,
+            alpha=alpha,
+        )
+        launch(variant(name, packed), params)
+    return planes[0].permute(1, 2, 0), planes[1].permute(1, 2, 0), alpha
+
+
+@torch.no_grad()
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
     """(H, W): the number of splats that `rasterize` composites into each pixel.
 

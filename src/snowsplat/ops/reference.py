@@ -7,12 +7,14 @@ kernels with these functions in float64. From top to bottom, this file describes
     project         3D Gaussians → 2D splats     x, Σ, W, J, Σ'      Kerbl et al. 2023, §4, eq. 4–6
     project_activated   the same, for scales, opacities and colours after their activations
     rasterize       2D splats → image            α, T, C             Kerbl et al. 2023, §6, eq. 2–3
+    rasterize_median   the splat with T = ½
     count_blended   the number of blended splats per pixel
     photometric_loss, ssim                       L1, D-SSIM          Kerbl et al. 2023, eq. 7;
                                                                      Wang et al. 2004
     neighbours      the initial size             Kerbl et al. 2023, §5.1
     accumulate_screen_statistics                 for density control Kerbl et al. 2023, §5.2
     points_in_frusta   which views show a point  focal / z           Yu et al. 2024, §4.1
+    fuse_depth      signed distances             Σ w s / Σ w        Curless and Levoy 1996
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
 
 `plane_sweep` is in `sweep_reference.py`.
@@ -372,6 +374,25 @@ def _adds_absolute_values(abs_grad: Tensor, rows: Tensor) -> Callable[[Tensor], 
     return add
 
 
+@torch.no_grad()
+def rasterize_median(splats: Splats2D, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The colours (H, W, C) of the last blended splat with T ≥ ½, their blend, and alpha."""
+    order = torch.argsort(splats.depths, stable=True)
+    means2d, conics, opacities, colors = (
+        values[order] for values in (splats.means2d, splats.conics, splats.opacities, splats.colors)
+    )
+    rows = []
+    for y in range(height):
+        pixels = _pixel_centres(0, y, width, 1).to(means2d)
+        alpha, T, _ = _blend_weights(pixels, means2d, conics, opacities)
+        chosen = (alpha > 0) & (T >= 0.5)
+        number = chosen * torch.arange(1, len(order) + 1)
+        last = torch.cat([number.new_zeros(width, 1), number], 1).amax(1)
+        rows.append(torch.cat([colors.new_zeros(1, splats.channels), colors])[last])
+    mean, alpha, _ = rasterize(splats, width, height)
+    return torch.stack(rows), mean, alpha
+
+
 def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
     """(H, W): the number of splats that `rasterize` blends into each pixel."""
     order = torch.argsort(splats.depths.detach(), stable=True)
@@ -505,6 +526,64 @@ def points_in_frusta(points: Tensor, frusta: Frusta) -> tuple[Tensor, Tensor]:
     rates = torch.where(inside, frusta.focal / depth, 0.0)
     nothing = rates.new_zeros(len(points), 1)
     return inside.sum(1).to(points.dtype), torch.cat([rates, nothing], 1).amax(1)
+
+
+# ------------------------------------------------------------------------------------ fuse_depth
+
+
+@torch.no_grad()
+def fuse_depth(
+    sums: Tensor,
+    origins: Tensor,
+    spacing: float,
+    to_image: Tensor,
+    depth: Tensor,
+    weight: Tensor,
+    truncation: float,
+    image: Tensor | None = None,
+) -> None:
+    """Adds (w, w s, w c) to the sums of samples in cubes, where s = min((d − z) / truncation, 1).
+
+    w is reduced linearly behind the surface. With an image, only samples with s < 1 count.
+    """
+    side, (height, width) = sums.shape[1], depth.shape
+    along = torch.arange(side, dtype=sums.dtype) * spacing
+    z, y, x = torch.meshgrid(along, along, along, indexing="ij")
+    points = (origins[:, None] + torch.stack([x, y, z], 3).reshape(-1, 3)).reshape(-1, 3)
+    at = points @ to_image[:, :3].T + to_image[:, 3]
+    z = at[:, 2]
+    size = at.new_tensor([width, height])
+    uv = at[:, :2] / z[:, None]
+    (rows,) = ((z > 0) & (uv >= 0).all(1) & (uv < size).all(1)).nonzero(as_tuple=True)
+    z, uv = z[rows], uv[rows]
+    column, row = uv.floor().long().unbind(1)
+    left, top = (uv - 0.5).floor().long().unbind(1)
+    inner = (left >= 0) & (top >= 0) & (left + 1 < width) & (top + 1 < height)
+    fx, fy = (uv - 0.5 - torch.stack([left, top], 1)).unbind(1)
+    left, top = left.clamp(0, max(0, width - 2)), top.clamp(0, max(0, height - 2))
+    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+
+    def corners(values: Tensor) -> Tensor:
+        return torch.stack(
+            [values[top, left], values[top, right], values[bottom, left], values[bottom, right]]
+        )
+
+    def interpolated(values: Tensor, where: Tensor) -> Tensor:
+        a, b, c, d = corners(values)
+        above, below = a + fx * (b - a), c + fx * (d - c)
+        return torch.where(where, above + fy * (below - above), values[row, column])
+
+    around = corners(depth)
+    smooth = inner & (around > 0).all(0) & (around.amax(0) - around.amin(0) < truncation)
+    known = (weight[row, column] > 0) & (depth[row, column] > 0)
+    known &= z - depth[row, column] < truncation
+    s = (interpolated(depth, smooth) - z) / truncation
+    known &= (s > -1) & ((s < 1) | (image is None))
+    s = s.clamp(max=1.0)
+    w = weight[row, column] * (1 + s).clamp(max=1.0)
+    parts = [w, w * s, *(w * interpolated(c, inner) for c in ([] if image is None else image))]
+    flat = sums.view(-1, sums.shape[-1])
+    flat[rows[known]] += torch.stack(parts, 1)[known]
 
 
 # ------------------------------------------------------------------ accumulate_screen_statistics

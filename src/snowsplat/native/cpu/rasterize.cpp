@@ -198,8 +198,9 @@ struct alignas(64) Slot {
   }
 };
 
-// kCount: the value of a pixel is the number of splats that are composited.
-enum class Blend { kFrontToBack, kAdditive, kCount };
+// kCount: the value of a pixel is the number of splats that are composited. kMedian: the values are
+// those of the splat at which the transmittance falls below 1/2.
+enum class Blend { kFrontToBack, kAdditive, kCount, kMedian };
 
 template <class V, int C, Blend kBlend, class T = typename V::Scalar>
 void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* background, T* image,
@@ -255,6 +256,7 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
           continue;
         }
         const V a = zero_unless(is_blended(power), capped_alpha(exp2_blend(power)));
+        const V front = transmittance;
         V weight = a * transmittance;
         const V next = transmittance - weight;
         // A lane is finished if this splat would reduce its transmittance below the minimum. The
@@ -270,7 +272,10 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
         }
         if constexpr (kBlend == Blend::kCount)
           color[0] += zero_unless(is_blended(power) & open, V(1.f));
-        else
+        else if constexpr (kBlend == Blend::kMedian) {
+          const auto chosen = is_blended(power) & open & (front >= V(0.5f));
+          for (int k = 0; k < C; k++) color[k] = select(chosen, V(r.color[k]), color[k]);
+        } else
           for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
       }
       block[b].transmittance = transmittance, block[b].rest = rest;
@@ -287,7 +292,8 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
 #pragma GCC unroll 4
     for (int k = 0; k < C; k++)
       if (k < channels)
-        (block[b].color[k] + rest * V(background[k])).store_first(image + k * plane + at, n);
+        (kBlend == Blend::kMedian ? block[b].color[k] : block[b].color[k] + rest * V(background[k]))
+            .store_first(image + k * plane + at, n);
     if (alpha) (V(1.f) - rest).store_first(alpha + at, n);
   }
 }
@@ -455,6 +461,15 @@ int64_t forward(const RasterizeForwardParams<T>& p) {
 }
 
 template <class V, class T = typename V::Scalar>
+int64_t median(const RasterizeForwardParams<T>& p) {
+  const Frame<V> f(p.frame);
+  for_tiles(0, p.n, [&](int64_t t) {
+    forward_tile<V, 4, Blend::kMedian, T>(f, t, int(p.channels), nullptr, p.image, p.alpha);
+  });
+  return 0;
+}
+
+template <class V, class T = typename V::Scalar>
 int64_t count(const RasterizeCountParams<T>& p) {
   const Frame<V> f(p.frame);
   const T nothing_behind = 0;
@@ -500,6 +515,8 @@ using namespace snow;
 
 SNOW_ENTRY(rasterize_fwd, RasterizeForwardParams<float>) { return forward<VecF>(p); }
 SNOW_ENTRY(rasterize_fwd_f64, RasterizeForwardParams<double>) { return forward<VecD>(p); }
+SNOW_ENTRY(rasterize_median, RasterizeForwardParams<float>) { return median<VecF>(p); }
+SNOW_ENTRY(rasterize_median_f64, RasterizeForwardParams<double>) { return median<VecD>(p); }
 SNOW_ENTRY(rasterize_count, RasterizeCountParams<float>) { return count<VecF>(p); }
 SNOW_ENTRY(rasterize_count_f64, RasterizeCountParams<double>) { return count<VecD>(p); }
 SNOW_ENTRY(rasterize_bwd, RasterizeBackwardParams<float>) { return backward<VecF>(p); }

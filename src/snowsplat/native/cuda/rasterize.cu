@@ -171,8 +171,9 @@ struct ForwardMemory {
   uint32_t ends[kWarps];
 };
 
-// kCount: the value of a pixel is the number of splats that are composited.
-enum class Blend { kFrontToBack, kAdditive, kCount };
+// kCount: the value of a pixel is the number of splats that are composited. kMedian: the values are
+// those of the splat at which the transmittance falls below 1/2.
+enum class Blend { kFrontToBack, kAdditive, kCount, kMedian };
 
 template <int C, Blend kBlend, class T>
 SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* background, T* image,
@@ -215,6 +216,7 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
       for (int j = 0; j < listed; j++) {
         const int i = memory.list[warp][j];
         const Four<T> opacity_color = memory.batch.opacity_color[i];
+        const T front = pixel.signed_transmittance;
         T uncapped, a, weight;
         const bool blended = pixel.template blend<kBlend == Blend::kAdditive>(
             memory.batch.mean_conic[i], opacity_color, uncapped, a, weight);
@@ -225,7 +227,12 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
           const T splat[kGroupChannels] = {opacity_color.z, opacity_color.w, color_23.x,
                                            color_23.y};
 #pragma unroll
-          for (int k = 0; k < C; k++) color[k] += weight * splat[k];
+          for (int k = 0; k < C; k++) {
+            if constexpr (kBlend == Blend::kMedian)
+              color[k] = blended && front >= T(0.5) ? splat[k] : color[k];
+            else
+              color[k] += weight * splat[k];
+          }
         }
       }
       warp_unfinished = __any_sync(kAllLanes, pixel.unfinished());
@@ -252,7 +259,9 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   for (int k = 0; k < C; k++)
     if (k < channels)
       image[k * position.pixel_count + position.index] =
-          kBlend == Blend::kCount ? color[k] : color[k] + transmittance * background[k];
+          kBlend == Blend::kCount || kBlend == Blend::kMedian
+              ? color[k]
+              : color[k] + transmittance * background[k];
   if (alpha) alpha[position.index] = T(1) - transmittance;
 }
 
@@ -584,25 +593,29 @@ using namespace snow;
 #endif
 #define SNOW_BACKWARD_BLOCKS 4
 
-#define SNOW_RASTERIZE_KERNELS(SUFFIX, T, FORWARD_BLOCKS, BACKWARD_BLOCKS)                     \
-  SNOW_KERNEL_OF(rasterize_fwd##SUFFIX, kBlock, FORWARD_BLOCKS, RasterizeForwardParams<T>) {   \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                  \
-    if (p.frame.additive)                                                                      \
-      forward_of_channels<Blend::kAdditive>(p, *memory);                                       \
-    else                                                                                       \
-      forward_of_channels<Blend::kFrontToBack>(p, *memory);                                    \
-  }                                                                                            \
-  SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {                      \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                  \
-    forward<1, Blend::kCount, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);             \
-  }                                                                                            \
-  SNOW_KERNEL_OF(rasterize_bwd##SUFFIX, kBlock, BACKWARD_BLOCKS, RasterizeBackwardParams<T>) { \
-    SNOW_SHARED(BackwardMemory<T>, memory, 1);                                                 \
-    if (p.frame.additive)                                                                      \
-      backward_of_channels<true>(p, *memory);                                                  \
-    else                                                                                       \
-      backward_of_channels<false>(p, *memory);                                                 \
-  }                                                                                            \
+#define SNOW_RASTERIZE_KERNELS(SUFFIX, T, FORWARD_BLOCKS, BACKWARD_BLOCKS)                       \
+  SNOW_KERNEL_OF(rasterize_fwd##SUFFIX, kBlock, FORWARD_BLOCKS, RasterizeForwardParams<T>) {     \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                    \
+    if (p.frame.additive)                                                                        \
+      forward_of_channels<Blend::kAdditive>(p, *memory);                                         \
+    else                                                                                         \
+      forward_of_channels<Blend::kFrontToBack>(p, *memory);                                      \
+  }                                                                                              \
+  SNOW_KERNEL(rasterize_median##SUFFIX, kBlock, RasterizeForwardParams<T>) {                     \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                    \
+    forward<4, Blend::kMedian, T>(p.frame, int(p.channels), nullptr, p.image, p.alpha, *memory); \
+  }                                                                                              \
+  SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {                        \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                    \
+    forward<1, Blend::kCount, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);               \
+  }                                                                                              \
+  SNOW_KERNEL_OF(rasterize_bwd##SUFFIX, kBlock, BACKWARD_BLOCKS, RasterizeBackwardParams<T>) {   \
+    SNOW_SHARED(BackwardMemory<T>, memory, 1);                                                   \
+    if (p.frame.additive)                                                                        \
+      backward_of_channels<true>(p, *memory);                                                    \
+    else                                                                                         \
+      backward_of_channels<false>(p, *memory);                                                   \
+  }                                                                                              \
   SNOW_KERNEL(background_bwd##SUFFIX, 128, BackgroundBackwardParams<T>) { background_row(p); }
 
 SNOW_RASTERIZE_KERNELS(, float, SNOW_FORWARD_BLOCKS, SNOW_BACKWARD_BLOCKS)

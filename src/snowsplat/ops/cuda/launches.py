@@ -17,6 +17,7 @@ from snowsplat.ops.cuda import (
     adam,
     driver,
     frusta,
+    fusion,
     nearest_neighbours,
     photometric,
     projection,
@@ -38,6 +39,7 @@ _PARTS = (
     nearest_neighbours,
     sweep,
     frusta,
+    fusion,
 )
 KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
 SEQUENCES: dict[str, Callable[..., int]] = {

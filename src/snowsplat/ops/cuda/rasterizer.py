@@ -17,6 +17,7 @@ from snowsplat.ops.params import (
 
 KERNELS: dict[str, Kernel] = {
     "rasterize_fwd": Kernel("rasterize", RasterizeForwardParams, threads=256, items=1),
+    "rasterize_median": Kernel("rasterize", RasterizeForwardParams, threads=256, items=1),
     "rasterize_count": Kernel("rasterize", RasterizeCountParams, threads=256, items=1),
     "rasterize_bwd": Kernel("rasterize", RasterizeBackwardParams, threads=256, items=1),
     "background_bwd": Kernel("rasterize", BackgroundBackwardParams, threads=128, items=1),

@@ -1,0 +1,136 @@
+"""Datasets of procedural scenes with exact poses, and true points on their surfaces."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.scenes.street import street
+from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
+
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
+from snowsplat.synthetic.lens import Lens
+from snowsplat.synthetic.photographer import depth_map, take_photos, walk
+from snowsplat.synthetic.scene import Scene
+from snowsplat.synthetic.still_life import still_life
+
+_POINT_ERROR = 0.004  # metres: of the points of the dataset, as in structure from motion
+_POINTS = 120  # of the dataset, per photo
+_UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Procedural:
+    """A scene, the cameras of its photos, and the part of it that a mesh should have.
+
+    Attributes:
+        reach: metres; surfaces that no photo shows from nearer do not count.
+    """
+
+    build: Callable[[], Scene]
+    poses: Sequence[Tensor]
+    reach: float
+    focal: float = 0.8  # times the width of a photo
+
+    def lens(self, width: int) -> Lens:
+        return Lens(width, 3 * width // 4, self.focal * width, (0.0, 0.0, 0.0, 0.0))
+
+
+def _outward(count: int) -> list[Tensor]:
+    """Cameras that walk around the table and look at the walls, the floor and the furniture."""
+    random = np.random.default_rng(count)
+    poses = []
+    for i in range(count):
+        angle = 2 * math.pi * i / count + random.normal(0, 0.02)
+        place = np.array([0.95 * math.cos(angle), 0.95 * math.sin(angle), 0.55 + 0.3 * (i % 2)])
+        gaze = angle + (0.5, -0.5, 0.0)[i % 3]
+        away = np.array([math.cos(gaze), math.sin(gaze), (-0.35, 0.05)[i % 2]])
+        poses.append(look_at(torch.from_numpy(place), torch.from_numpy(place + away), _UP))
+    return poses
+
+
+SCENES = {
+    "table": lambda: Procedural(still_life, walk(72, 0), 1.9, 0.85),
+    "room": lambda: Procedural(still_life, _outward(72), 4.5, 0.62),
+    "street": lambda: Procedural(lambda: street(9.6), walk_along(9.6, 96, 0), 9.0),
+}
+
+
+def write_dataset(folder: Path, scene: Procedural, width: int) -> Scene:
+    """Photos, poses and noisy points in the format of COLMAP; existing photos are kept."""
+    lens, built = scene.lens(width), scene.build()
+    truth = take_photos(folder / "images", lambda: built, lens, scene.poses)
+    random = np.random.default_rng(0)
+    xyz, rgb, images = [], [], []
+    for name, pose in truth.poses.items():
+        with Image.open(folder / "images" / name) as photo:
+            pixels = np.asarray(photo)
+        depth = depth_map(built, lens, pose)
+        rows = random.integers(0, lens.height, _POINTS)
+        columns = random.integers(0, lens.width, _POINTS)
+        seen = depth[rows, columns] < 2 * scene.reach
+        points = _points(lens, pose, depth, rows[seen], columns[seen])
+        xyz.append(points + random.normal(0, _POINT_ERROR, points.shape))
+        rgb.append(pixels[rows[seen], columns[seen]])
+        moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
+        quat = quat_from_rotation(moved[:, :3])
+        images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
+    camera = ColmapCamera("PINHOLE", lens.width, lens.height, lens.params[:4])
+    write_model(
+        folder / "sparse" / "0", {1: camera}, images, np.concatenate(xyz), np.concatenate(rgb)
+    )
+    return built
+
+
+def true_points(
+    built: Scene, scene: Procedural, width: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random points (P, 3) on the surfaces that photos show, and those that two photos show."""
+    lens = scene.lens(width)
+    depths = [depth_map(built, lens, pose) for pose in scene.poses]
+    random = np.random.default_rng(1)
+    found = []
+    for pose, depth in zip(scene.poses, depths, strict=True):
+        rows, columns = np.nonzero(depth < scene.reach)
+        chosen = random.choice(len(rows), min(len(rows), count // len(depths)), replace=False)
+        found.append(_points(lens, pose, depth, rows[chosen], columns[chosen]))
+    points = np.concatenate(found)
+    return points, points[_views(points, scene, lens, depths) >= 2]
+
+
+def _views(
+    points: np.ndarray, scene: Procedural, lens: Lens, depths: Sequence[np.ndarray]
+) -> np.ndarray:
+    """(P,): the number of photos that show each point, in the dataset's frame."""
+    own = points @ DATASET_FROM_SCENE[:, :3].numpy()  # the inverse rotation
+    count = np.zeros(len(points), int)
+    for pose, depth in zip(scene.poses, depths, strict=True):
+        camera = own @ pose[:, :3].numpy().T + pose[:, 3].numpy()
+        z = np.maximum(camera[:, 2], 1e-6)
+        x = (camera[:, 0] / z * lens.focal + lens.width / 2).astype(int)
+        y = (camera[:, 1] / z * lens.focal + lens.height / 2).astype(int)
+        inside = (camera[:, 2] > 0.05) & (x >= 0) & (y >= 0) & (x < lens.width) & (y < lens.height)
+        shown = depth[y.clip(0, lens.height - 1), x.clip(0, lens.width - 1)]
+        count += inside & (np.abs(shown / z - 1) < 0.02)
+    return count
+
+
+def _points(
+    lens: Lens, pose: Tensor, depth: np.ndarray, rows: np.ndarray, columns: np.ndarray
+) -> np.ndarray:
+    """(P, 3) float64: the surface at the centres of these pixels, in the dataset's frame."""
+    rays = lens.directions(np.stack([columns + 0.5, rows + 0.5]))
+    points = rays / rays[2] * depth[rows, columns]
+    world_from_cam = compose_rigid(DATASET_FROM_SCENE, invert_rigid(pose)).numpy()
+    return points.T @ world_from_cam[:, :3].T + world_from_cam[:, 3]

@@ -1,0 +1,291 @@
+"""`write_mesh` and `write_points`: the surfaces of a scene as triangles or as dense points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from snowsplat.data import ImageLoader, View
+from snowsplat.formats import mesh_files
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output.scene_source import TrainedScene
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.mesh import Mesh, compacted, filled_holes, largest_parts, vertex_normals
+from snowsplat.scene.orientation import scene_up
+from snowsplat.surface.colors import vertex_colors
+from snowsplat.surface.depth import DepthMap, SurfaceRenderer
+from snowsplat.surface.isosurface import zero_level
+from snowsplat.surface.volume import Report, fused, occupied_blocks
+from snowsplat.training.starts.photos import reduced_photo, usable_pixels
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import make_parent
+from snowsplat.util.process import single_threaded
+
+#: Memory: pixels of all depth maps, with 5 bytes each, and blocks of 512 voxels with 8 bytes each.
+_MOST_PIXELS, _MOST_BLOCKS = 120_000_000, 100_000
+#: The side of a voxel, in widths of a pixel at the usual depth.
+_VOXEL_PIXELS = 2.0
+#: Surfaces that are farther away than this multiple of the usual depth are cut.
+_REACH = 3.0
+#: Parts of a mesh with a smaller share of the triangles of the largest part are removed.
+_SMALLEST_PART = 0.01
+#: A photo shows a vertex if its depth differs by less than this number of voxels.
+_SAME_PLACE = 2.0
+_TRANSPARENT = 16  # of 255: a pixel of a photo with less alpha shows nothing
+_OPAQUE = (".jpg", ".jpeg")  # other photos can have transparent pixels
+_SAMPLE_VIEWS = 32  # that determine the usual depth
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """How surfaces become triangles.
+
+    Attributes:
+        voxel: side of a voxel in world units; default: 2 widths of a pixel, or more if the
+            voxels would not fit into memory.
+        far: surfaces whose depth is larger in a photo are not used, world units; default: three
+            times the median depth.
+        parts: connected parts with a smaller share of the triangles of the largest part are
+            removed.
+        triangles: at most about so many remain; default: all.
+        fill_holes: close holes with flat triangles.
+    """
+
+    voxel: float | None = None
+    far: float | None = None
+    parts: float = _SMALLEST_PART
+    triangles: int | None = None
+    fill_holes: bool = False
+
+    def __post_init__(self) -> None:
+        for name, least in (("voxel", 0.0), ("far", 0.0)):
+            value = getattr(self, name)
+            if value is not None and not least < value < math.inf:
+                raise UserError(f"`{name}` must be a positive number, not {value:g}")
+        if not 0.0 <= self.parts <= 1.0:
+            raise UserError(f"`parts` must be between 0 and 1, not {self.parts:g}")
+        if self.triangles is not None and self.triangles < 4:
+            raise UserError(f"`triangles` must be at least 4, not {self.triangles}")
+        if self.triangles is not None and find_spec("fast_simplification") is None:
+            raise UserError(
+                "`triangles` needs the package fast-simplification: pip install 'snowsplat[mesh]'"
+            )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh, and how it was made; lengths in world units."""
+
+    mesh: Mesh
+    photos: int
+    voxel: float
+    far: float
+    found: int  # triangles before parts were removed and the mesh was simplified
+    closer: bool  # whether memory has limited the voxels
+
+
+def write_mesh(
+    load: Callable[[], TrainedScene],
+    target: Path,
+    options: MeshOptions | None = None,
+    overwrite: bool = False,
+    observer: Observer = SILENT,
+) -> Surface:
+    """Write the surfaces of a scene as triangles with the colours of the photos.
+
+    The depth of each training photo is rendered and fused into a signed distance field.
+
+    Args:
+        load: loads the scene with its dataset, as `load_trained`; called after the other
+            arguments have been checked.
+        target: .ply, .glb or .obj; its folder is created if it does not exist.
+        overwrite: replace ``target``.
+        observer: gets the stages "reading", "depth", "fusion", "triangles" and "colours".
+
+    Raises:
+        UserError: ``target`` exists or has another suffix; a photo is damaged; there is no surface,
+            or a package for an option is missing.
+        OSError: ``target`` cannot be written.
+    """
+    _check(target, mesh_files.MESH_SUFFIXES, overwrite)
+    surface = _loaded(load, options, observer)
+    return _written(target, surface)
+
+
+def write_points(
+    load: Callable[[], TrainedScene],
+    target: Path,
+    options: MeshOptions | None = None,
+    overwrite: bool = False,
+    observer: Observer = SILENT,
+) -> Surface:
+    """Write a dense cloud of points on the surfaces, with normals and the colours of the photos.
+
+    The points are the vertices of `write_mesh`: about one for each voxel of the surface.
+
+    Args:
+        load: as in `write_mesh`.
+        target: .ply, .las or .laz; the last two need the packages laspy and lazrs.
+        overwrite, observer: as in `write_mesh`.
+
+    Raises: as `write_mesh`.
+    """
+    _check(target, mesh_files.POINTS_SUFFIXES, overwrite)
+    surface = _loaded(load, options, observer)
+    mesh = surface.mesh
+    return _written(target, replace(surface, mesh=replace(mesh, faces=mesh.faces[:0])))
+
+
+def _loaded(
+    load: Callable[[], TrainedScene], options: MeshOptions | None, observer: Observer
+) -> Surface:
+    with observer.waiting("reading"):
+        scene = load()
+    return surface_of(scene, options or MeshOptions(), observer)
+
+
+def _check(target: Path, suffixes: tuple[str, ...], overwrite: bool) -> None:
+    mesh_files.check_suffix(target, suffixes)
+    if target.exists() and not overwrite:
+        raise UserError(f"{target}: exists; use `overwrite` to replace it")
+    if target.is_dir():
+        raise UserError(f"{target}: a folder; use the name of a file")
+
+
+def _written(target: Path, surface: Surface) -> Surface:
+    make_parent(target)
+    comments = [f"snowsplat: voxels of {surface.voxel:.4g} from {surface.photos} photos"]
+    mesh_files.write_mesh(target, surface.mesh, comments)
+    return surface
+
+
+def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = SILENT) -> Surface:
+    """The surfaces of a scene; see `write_mesh`. Raises: UserError: there is no surface."""
+    views = scene.dataset.train or scene.dataset.test
+    with single_threaded():
+        with observer.waiting("depth") as report:
+            maps, far = _depth_maps(scene, views, options, report)
+        with observer.waiting("fusion") as report:
+            voxel, keys, closer = _voxel(maps, options)
+            if not len(keys):
+                raise UserError(
+                    "no surface is shown by two photos; train longer, or use a larger `far` or "
+                    "`voxel`"
+                )
+            volume = fused(maps, voxel, keys, report)
+        with observer.waiting("triangles"):
+            vertices, faces = zero_level(volume)
+            del volume
+            found = len(faces)
+            vertices, faces = _cleaned(vertices, faces, options)
+        with observer.waiting("colours") as report:
+            photos = _photos(views, maps, scene.gaussians.means.device, report)
+            colors = vertex_colors(vertices, faces, photos, _SAME_PLACE * voxel)
+    normals = vertex_normals(vertices, faces)
+    poses = torch.stack([view.camera.cam_from_world[:, :3] for view in views])
+    x, y, z = scene_up(poses.detach().double().cpu().numpy()).tolist()
+    mesh = Mesh(vertices, faces, normals, colors, scene.dataset.origin, (x, y, z))
+    return Surface(mesh, len(views), voxel, far, found, closer)
+
+
+def _depth_maps(
+    scene: TrainedScene, views: Sequence[View], options: MeshOptions, report: Report
+) -> tuple[list[DepthMap], float]:
+    """The depth map of each view, and the depth behind which there is no surface."""
+    device = scene.gaussians.means.device
+    renderer = SurfaceRenderer(scene.gaussians)
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    share = min(1.0, math.sqrt(_MOST_PIXELS / pixels))
+    cameras = []
+    for view in views:
+        size = (max(1, int(share * side)) for side in (view.camera.width, view.camera.height))
+        cameras.append(view.camera.scaled(*size).to(device))
+    far = options.far
+    if far is None:
+        sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
+        far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
+    maps = []
+    with ImageLoader(views) as loader:
+        for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+            report(i, len(cameras), "photos")
+            found = renderer.render(camera, far)
+            if view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE:
+                photo = reduced_photo(view, loader, camera.width, camera.height)
+                empty = None if photo.alpha is None else photo.alpha < _TRANSPARENT
+                found = found.corrected(empty, photo.mask)
+            maps.append(found)
+    return maps, far
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.scaled(max(1, camera.width // 4), max(1, camera.height // 4))
+
+
+def _usual_depth(maps: Sequence[DepthMap]) -> float:
+    """The median, over views, of the median depth. Raises UserError: no view shows a surface."""
+    medians = []
+    for each in maps:
+        known = each.depth[each.depth.isfinite() & (each.depth > 0)]
+        if len(known):
+            medians.append(float(known.median()))
+    if not medians:
+        raise UserError("the photos show no surface; train longer, or use a larger `far`")
+    return float(np.median(medians))
+
+
+def _voxel(maps: Sequence[DepthMap], options: MeshOptions) -> tuple[float, np.ndarray, bool]:
+    """The side of a voxel, the blocks near a surface, and whether memory has limited the former."""
+    voxel = options.voxel
+    if voxel is None:
+        focal = float(np.median([each.camera.fx for each in maps]))
+        voxel = _VOXEL_PIXELS * _usual_depth(maps) / focal
+    keys = occupied_blocks(maps, voxel)
+    limited = False
+    while len(keys) > _MOST_BLOCKS:
+        if options.voxel is not None:
+            raise UserError(
+                f"{len(keys):,} blocks of voxels of {voxel:g} do not fit into memory; use a larger "
+                "`voxel`, or a smaller `far`"
+            )
+        voxel *= 1.05 * math.sqrt(len(keys) / _MOST_BLOCKS)  # blocks are along surfaces
+        keys, limited = occupied_blocks(maps, voxel), True
+    return voxel, keys, limited
+
+
+def _cleaned(
+    vertices: np.ndarray, faces: np.ndarray, options: MeshOptions
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without small parts, with holes filled and simplified as the options say."""
+    faces = faces[largest_parts(faces, len(vertices), options.parts)]
+    vertices, faces, _ = compacted(vertices, faces)
+    if not len(faces):
+        raise UserError("no surface was found; train longer, or use a smaller `voxel`")
+    if options.fill_holes:
+        vertices, faces = filled_holes(vertices, faces)
+    if options.triangles is not None and options.triangles < len(faces):
+        import fast_simplification  # an optional package
+
+        vertices, faces = fast_simplification.simplify(
+            vertices, faces, target_count=options.triangles
+        )
+        vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
+    return vertices, faces
+
+
+def _photos(
+    views: Sequence[View], maps: Sequence[DepthMap], device: torch.device, report: Report
+) -> Iterator[tuple[DepthMap, Tensor, Tensor | None]]:
+    """The depth maps with their photos at the same size."""
+    with ImageLoader(views) as loader:
+        for i, (view, each) in enumerate(zip(views, maps, strict=True)):
+            report(i, len(views), "photos")
+            loader.prefetch(views[i : i + 4])
+            photo = reduced_photo(view, loader, each.camera.width, each.camera.height)
+            yield each, photo.planes[:3], usable_pixels(photo)

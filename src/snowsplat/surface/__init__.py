@@ -1,0 +1,1 @@
+"""Surfaces of a scene: depth maps, their fusion, triangles."""

@@ -1,0 +1,132 @@
+"""Triangles of the zero level of a signed distance field: surface nets (Gibson 1998).
+
+A cell has eight neighbouring voxels as its corners. Each cell in which the sign changes has one
+vertex, the mean of the points at which the edges of the cell cross the level. Each edge between two
+voxels at which the sign changes becomes a quad of the vertices of its four cells. The triangles are
+better shaped than those of marching cubes, and half as many; no library has them for sparse blocks.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from snowsplat.surface.volume import SIDE, Volume, block_coordinates, block_keys
+
+_CHUNK = 2048  # blocks at a time
+_CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # (8, 3): z, y, x
+#: The pairs of corners of the twelve edges of a cell.
+_EDGES = np.array(
+    [(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
+)
+#: Smallest sum of weights of a voxel: about that of one view from the front.
+_LEAST_WEIGHT = 0.5
+
+
+def zero_level(
+    volume: Volume, least_weight: float = _LEAST_WEIGHT
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float32 in the world frame, and triangles (F, 3) int32, of the surface.
+
+    Triangles are counter-clockwise from the side where the field is positive. Voxels whose weight
+    is below ``least_weight`` have no surface.
+    """
+    # The keys of cells are those of `block_keys`, with coordinates in voxels.
+    cells, places = [], []
+    edges: list[list[np.ndarray]] = [[] for _ in range(6)]
+    coordinates = block_coordinates(volume.keys)
+    for start in range(0, len(coordinates), _CHUNK):
+        own = coordinates[start : start + _CHUNK]
+        field = _with_borders(volume, own, least_weight)
+        with np.errstate(invalid="ignore"):
+            negative, known = field < 0, np.isfinite(field)
+        corners = [_shifted(negative, *corner) for corner in _CORNERS]
+        mixed = np.logical_or.reduce(corners) & ~np.logical_and.reduce(corners)
+        for corner in _CORNERS:
+            mixed &= _shifted(known, *corner)
+        index = np.argwhere(mixed)
+        base = SIDE * own[index[:, 0]]  # x, y, z
+        corner = base + index[:, :0:-1]
+        cells.append(block_keys(corner))
+        places.append((_crossings(field, index) + corner).astype(np.float32))
+        for axis in range(3):
+            step = np.eye(3, dtype=int)[2 - axis]
+            before, after = _shifted(negative, 0, 0, 0), _shifted(negative, *step)
+            changes = (before != after) & _shifted(known, 0, 0, 0) & _shifted(known, *step)
+            for inward in (False, True):
+                index = np.argwhere(changes & (before == inward))
+                first = SIDE * own[index[:, 0]] + index[:, :0:-1]
+                edges[2 * axis + inward].append(block_keys(first))
+    if not cells:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    vertices = np.concatenate(places)
+    faces = _quads(np.concatenate(cells), [np.concatenate(each) for each in edges], vertices)
+    return (volume.voxel * vertices).astype(np.float32), faces
+
+
+def _with_borders(volume: Volume, own: np.ndarray, least_weight: float) -> np.ndarray:
+    """(b, 9, 9, 9) float32: the field of some blocks and the next voxel on each axis; NaN: none."""
+    field = np.full((len(own), SIDE + 1, SIDE + 1, SIDE + 1), np.nan, np.float32)
+    for dz, dy, dx in _CORNERS:
+        keys = block_keys(own + np.array([dx, dy, dz]))
+        row = np.searchsorted(volume.keys, keys).clip(max=len(volume.keys) - 1)
+        there = volume.keys[row] == keys
+        to = tuple(slice(SIDE, None) if d else slice(0, SIDE) for d in (dz, dy, dx))
+        of = tuple(slice(0, 1) if d else slice(None) for d in (dz, dy, dx))
+        source, target = (slice(None), *of), (there.nonzero()[0], *to)
+        sums = volume.sums[row[there]][source].cpu().numpy()
+        weight = sums[..., 0]
+        enough = weight >= least_weight
+        values = np.where(enough, sums[..., 1] / np.where(enough, weight, 1), np.nan)
+        field[target] = values
+    return field
+
+
+def _shifted(values: np.ndarray, dz: int, dy: int, dx: int) -> np.ndarray:
+    """The values of the corner (dz, dy, dx) of each cell of (b, 9, 9, 9) samples: (b, 8, 8, 8)."""
+    return values[:, dz : dz + SIDE, dy : dy + SIDE, dx : dx + SIDE]
+
+
+def _crossings(field: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """(K, 3): the mean crossing of the edges of cells (K, 4), x, y, z in voxels from the corner."""
+    block, z, y, x = index.T
+    values = np.stack([field[block, z + dz, y + dy, x + dx] for dz, dy, dx in _CORNERS], 1)
+    a, b = values[:, _EDGES[:, 0]], values[:, _EDGES[:, 1]]
+    crosses = (a < 0) != (b < 0)
+    share = np.where(crosses, a / np.where(crosses, a - b, 1), 0)[..., None]
+    first, second = _CORNERS[_EDGES[:, 0]], _CORNERS[_EDGES[:, 1]]
+    points = np.where(crosses[..., None], first + share * (second - first), 0)
+    return np.asarray((points.sum(1) / crosses.sum(1)[:, None])[:, ::-1])
+
+
+def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> np.ndarray:
+    """(F, 3) int32: two triangles for each edge whose four cells have a vertex.
+
+    Args:
+        cells: (V,), the key of the first corner of each cell.
+        edges: six arrays of the keys of the first voxels of edges: along x where the field is
+            positive there, along x where it is negative, and so on.
+    """
+    order = np.argsort(cells)
+    ordered = cells[order]
+    triangles = [np.zeros((0, 3), np.int32)]
+    steps = np.array([1 << 42, 1 << 21, 1])  # of a key, along x, y and z
+    for kind, first in enumerate(edges):
+        axis, inward = divmod(kind, 2)
+        b, c = steps[(axis + 1) % 3], steps[(axis + 2) % 3]
+        quad = np.zeros((len(first), 4), np.int32)
+        complete = np.ones(len(first), bool)
+        for corner, step in enumerate((0, b, b + c, c)):
+            row = np.searchsorted(ordered, first - step).clip(max=len(ordered) - 1)
+            complete &= ordered[row] == first - step
+            quad[:, corner] = order[row]
+        quad = quad[complete]
+        # Counter-clockwise about the axis; the outside is where the field is positive.
+        if not inward:
+            quad = quad[:, ::-1]
+        p = vertices[quad]
+        across = ((p[:, 0] - p[:, 2]) ** 2).sum(1) <= ((p[:, 1] - p[:, 3]) ** 2).sum(1)
+        quad = np.where(across[:, None], quad, np.roll(quad, -1, 1))
+        triangles += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
+    return np.concatenate(triangles)
