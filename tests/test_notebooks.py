@@ -1,7 +1,7 @@
 """The notebooks run from top to bottom, show pictures, and print what their text says.
 
-With each change, all of them run in this process, the lessons at a small scale; one runs in a
-kernel of Jupyter. At night, all lessons run in a kernel at their full scale.
+With each change, all of them run in this process, the lessons at a small scale. At night, the
+lessons run in a kernel of Jupyter at their full scale.
 """
 
 import ast
@@ -22,7 +22,8 @@ import pytest
 import torch
 
 from snowsplat.pipeline.quality import PRESETS
-from snowsplat.synthetic import light, write_synthetic_photos
+from snowsplat.synthetic import light, photographer
+from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -85,7 +86,12 @@ CHECKS: dict[str, Callable[[str], None]] = {
 SMALL: dict[str, dict[str, str]] = {
     "01_render": {"count=1500": "count=60"},
     "02_train": {"192, 144": "64, 48", "iterations=700": "iterations=20", "frames=48": "frames=3"},
-    "03_fit_a_picture": {"steps=300": "steps=101", "stages[300]": "stages[101]", "(1000": "(100"},
+    "03_fit_a_picture": {
+        "steps=200": "steps=11",
+        "steps=300": "steps=101",
+        "stages[300]": "stages[101]",
+        "gaussians=1000": "gaussians=100",
+    },
     "04_your_own_loss": {"steps=300": "steps=3", "iterations=400": "iterations=90"},
     "05_camera_poses": {"160, 120": "64, 48", "iterations=400": "iterations=20", ", 60)": ", 3)"},
     "06_your_own_photos": {'"normal"': '"draft"'},
@@ -276,14 +282,7 @@ def test_a_wrong_answer_fails_with_a_hint(name, right, wrong, hint, here):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, marks=[pytest.mark.sfm] if path.stem == "06_your_own_photos" else [])
-        for path in NOTEBOOKS
-    ],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_at_a_small_scale(path, here, monkeypatch):
     display = pytest.importorskip("IPython.display", reason="needs ipykernel")
     shown_later = types.SimpleNamespace(update=lambda image: None)
@@ -291,9 +290,10 @@ def test_runs_at_a_small_scale(path, here, monkeypatch):
     # Light at fewer points: building the still life takes most of the time.
     monkeypatch.setattr(light, "_SPACING", 0.1)
     monkeypatch.setattr(light, "_MOST_POINTS", 12)
+    monkeypatch.setattr(photographer, "RAYS", 1)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=30))
-    if path.stem == "06_your_own_photos":
-        write_synthetic_photos("photos", n_views=14, width=320, height=240)
+    if path.stem == "06_your_own_photos":  # with poses: other tests are about finding them
+        write_toy_dataset(Path("photos"), n_views=12, width=112, height=84, n_points=600)
     text = "".join(cell["source"] for cell in cells(path))
     assert all(old in text for old in SMALL[path.stem])
 
@@ -313,17 +313,12 @@ def test_runs_at_a_small_scale(path, here, monkeypatch):
         assert len({*map(id, pictures), *map(id, pages)}) >= 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(
     importlib.util.find_spec("nbclient") is None or importlib.util.find_spec("ipykernel") is None,
     reason="needs nbclient and ipykernel (make dev installs them)",
 )
-@pytest.mark.parametrize(
-    "path",
-    # The longer ones run at night. The last one needs photos.
-    [NOTEBOOKS[0], *(pytest.param(path, marks=pytest.mark.nightly) for path in NOTEBOOKS[1:-1])],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.parametrize("path", NOTEBOOKS[:-1], ids=lambda path: path.stem)
 def test_runs_from_top_to_bottom(path, tmp_path):
     import nbformat
     from nbclient import NotebookClient
