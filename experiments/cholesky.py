@@ -42,7 +42,7 @@ NEAR = 0.2
 RATES = (0.003, 0.01, 0.03, 0.1, 0.3)
 # The first seed tries all rates. The others try those that are not much worse with it.
 SEEDS = (5, 0, 1, 2, 3)
-MUCH = 1.0  # dB; several times the spread between seeds
+MUCH = 0.25  # dB; several times the spread between seeds
 
 
 @dataclass(frozen=True)
@@ -192,13 +192,13 @@ def train(dataset: Dataset, name: str, rate: float, seed: int, count: int, steps
         view = dataset.train[order.pop()]
         target = train_images.get(view, DOWNSCALE).rgb
         loss = ops.photometric_loss(image(view.camera.downscaled(DOWNSCALE)), target)
-        if not loss.isfinite():
-            return Result(name, rate, seed, -math.inf, math.inf)  # the training has diverged
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
 
+    if not all(bool(parameter.isfinite().all()) for parameter in learned):
+        return Result(name, rate, seed, -math.inf, math.inf)  # the training has diverged
     with torch.no_grad():
         values = []
         for view in dataset.test:
@@ -211,18 +211,17 @@ def train(dataset: Dataset, name: str, rate: float, seed: int, count: int, steps
 
 
 def chosen(results: list[Result]) -> list[Result]:
-    """For each seed, the result with the rate that is best for the mean of all other seeds.
+    """The results with the rate whose mean PSNR is best: one for each seed.
 
-    So no result chooses its own rate. Rates that only the first seed has tried are not chosen.
+    Rates that only the first seed has tried, or that diverge for a seed, are not chosen.
     """
-    seeds = {result.seed for result in results}
     rates = {result.rate for result in results if result.seed != results[0].seed}
 
-    def mean(rate: float, without: int) -> float:
-        return statistics.mean(r.psnr for r in results if r.rate == rate and r.seed != without)
+    def mean(rate: float) -> float:
+        return statistics.mean(result.psnr for result in results if result.rate == rate)
 
-    best = {seed: max(rates, key=lambda rate: mean(rate, seed)) for seed in seeds}
-    return [result for result in results if result.rate == best[result.seed]]
+    best = max(rates, key=mean)
+    return [result for result in results if result.rate == best]
 
 
 def main() -> None:
@@ -251,10 +250,10 @@ def main() -> None:
             if seed == SEEDS[0]:
                 best = max(result.psnr for result in own)
                 rates = [result.rate for result in own if result.psnr > best - MUCH]
-        psnr = [result.psnr for result in chosen(own)]
-        used = ", ".join(f"{rate:g}" for rate in sorted({result.rate for result in chosen(own)}))
+        selected = chosen(own)
+        psnr = [result.psnr for result in selected]
         mean, spread = statistics.mean(psnr), statistics.stdev(psnr)
-        print(f"{name}: rate {used}, {mean:.2f} ± {spread:.2f} dB\n")
+        print(f"{name}: rate {selected[0].rate:g}, {mean:.2f} ± {spread:.2f} dB\n")
         results += own
     rows = [vars(result) for result in results]
     for row in rows:  # JSON has no infinity: null if the training has diverged
