@@ -40,7 +40,7 @@ from snowsplat.training.settings.recipes import recipe
 DOWNSCALE = 4
 NEAR = 0.2
 RATES = (0.003, 0.01, 0.03, 0.1, 0.3)
-# The first seed tries all rates. The others try those that are not much worse with it.
+# The first seed tries all rates. A rate that is much worse than the best is not tried again.
 SEEDS = (5, 0, 1, 2, 3)
 MUCH = 0.25  # dB; several times the spread between seeds
 
@@ -211,11 +211,8 @@ def train(dataset: Dataset, name: str, rate: float, seed: int, count: int, steps
 
 
 def chosen(results: list[Result]) -> list[Result]:
-    """The results with the rate whose mean PSNR is best: one for each seed.
-
-    Rates that only the first seed has tried, or that diverge for a seed, are not chosen.
-    """
-    rates = {result.rate for result in results if result.seed != results[0].seed}
+    """The results with the best rate, one for each seed. Only rates of the last seed are chosen."""
+    rates = {result.rate for result in results if result.seed == results[-1].seed}
 
     def mean(rate: float) -> float:
         return statistics.mean(result.psnr for result in results if result.rate == rate)
@@ -247,9 +244,9 @@ def main() -> None:
                     flush=True,
                 )
                 own.append(result)
-            if seed == SEEDS[0]:
-                best = max(result.psnr for result in own)
-                rates = [result.rate for result in own if result.psnr > best - MUCH]
+            of_seed = own[-len(rates) :]
+            best = max(result.psnr for result in of_seed)
+            rates = [result.rate for result in of_seed if result.psnr > best - MUCH]
         selected = chosen(own)
         psnr = [result.psnr for result in selected]
         mean, spread = statistics.mean(psnr), statistics.stdev(psnr)

@@ -147,13 +147,14 @@ def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
     assert torch.allclose(found.packed[rows], expected.packed, atol=1e-12)
 
 
-def test_a_rate_that_diverges_or_was_tried_once_is_not_chosen(experiment):
+def test_the_rate_with_the_best_mean_is_chosen(experiment):
     def row(rate: float, seed: int, psnr: float) -> object:
         return experiment.Result("R S", rate, seed, psnr, 2.0)
 
     results = [row(0.01, 0, 20), row(0.03, 0, 21), row(0.1, 0, 30), row(0.3, 0, 40)]
     results += [row(0.01, 1, 20), row(0.03, 1, 20), row(0.1, 1, -math.inf)]
-    assert experiment.chosen(results) == [results[1], results[5]]
+    results += [row(0.01, 2, 20.5), row(0.03, 2, 20)]
+    assert experiment.chosen(results) == [results[1], results[5], results[8]]
 
 
 def test_the_table_of_the_experiment(experiment):
