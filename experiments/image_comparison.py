@@ -1,4 +1,4 @@
-"""Compares ways to approximate a photo: Gaussians, soft shapes, a SIREN, JPEG, and `primitive`.
+"""Compares Gaussians with JPEG files of the same size, and with the program `primitive`.
 
     python experiments/image_comparison.py PHOTO -o OUT
     python experiments/image_comparison.py PHOTO PHOTO -o OUT --size 512 \\
@@ -30,8 +30,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
-from shapes2d import fit_shapes
-from siren import fit_siren
 from torch import Tensor
 
 from snowsplat.evaluation.metrics import compare
@@ -40,7 +38,7 @@ from snowsplat.extras.image.fit import FitOptions, Fitter
 from snowsplat.extras.image.fit_image import load_photo
 from snowsplat.extras.image.model import Blending
 
-METHODS = ("front-to-back", "additive", "rectangles", "triangles", "siren", "jpeg", "primitive")
+METHODS = ("front-to-back", "additive", "jpeg", "primitive")
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Row:
     width: int
     height: int
     method: str
-    count: int  # Gaussians, shapes, or weights of a network; 0 for JPEG
+    count: int  # Gaussians or ellipses; 0 for JPEG
     steps: int
     seconds: float
     cpu_seconds: float  # of all threads
@@ -83,15 +81,6 @@ def gaussians(photo: Tensor, blending: Blending, count: int, steps: int) -> Resu
     data = encode(fitter.gaussians)
     image = fitter.gaussians.render()
     return Result(image, count, steps, len(data), decode(data).render())
-
-
-def shapes(photo: Tensor, kind: str, count: int, steps: int) -> Result:
-    return Result(fit_shapes(photo, count, kind, steps, seed=0).image, count, steps)
-
-
-def network(photo: Tensor, steps: int) -> Result:
-    fit = fit_siren(photo, steps, seed=0)
-    return Result(fit.image, fit.parameters, steps)
 
 
 def jpeg(photo: Tensor, most_bytes: int) -> Result | None:
@@ -196,10 +185,6 @@ def run_method(
     """The result of a method. `file_bytes` is the largest size of a JPEG file."""
     if method in ("front-to-back", "additive"):
         return gaussians(photo, method, count, args.steps)
-    if method in ("rectangles", "triangles"):
-        return shapes(photo, method, count, args.shape_steps)
-    if method == "siren":
-        return network(photo, args.siren_steps)
     if method == "jpeg":
         return jpeg(photo, file_bytes)
     return primitive(args.primitive, photo, count)
@@ -213,10 +198,10 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="output folder")
     parser.add_argument("--size", type=int, default=256, help="pixels along the longer side")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
-    parser.add_argument("--counts", nargs="+", type=int, default=[1000], help="Gaussians or shapes")
+    parser.add_argument(
+        "--counts", nargs="+", type=int, default=[1000], help="Gaussians or ellipses"
+    )
     parser.add_argument("--steps", type=int, default=3000, help="of the Gaussians")
-    parser.add_argument("--shape-steps", type=int, default=600, help="of rectangles and triangles")
-    parser.add_argument("--siren-steps", type=int, default=1500)
     parser.add_argument("--primitive", default="primitive", help="the program of that name")
     args = parser.parse_args()
     methods = [method for method in METHODS if method in args.methods]

@@ -1,84 +1,102 @@
-"""Rectangles and triangles with soft edges, fitted to an image by gradient descent in PyTorch.
+"""Gaussians, rectangles and triangles, fitted to an image by gradient descent in PyTorch.
 
-The image is background + Σ w c, as for additive Gaussians. The weight w of a shape is the product
-of one logistic function per edge, w = Π σ(d / s): d is the distance of the pixel from the edge in
-pixels, positive inside, and s is the softness of the shape, which is learnt. Liu et al. 2019 (Soft
+The image is background + Σ w c, for all three. The weight w of a Gaussian is exp(−½ r²), where r is
+the distance from its centre in standard deviations. The weight of the others is the product of one
+logistic function per edge, w = Π σ(d / s): d is the distance of the pixel from the edge in pixels,
+positive inside, and s is the softness of the shape, which is learnt. Liu et al. 2019 (Soft
 Rasterizer, arXiv:1904.01786) use the logistic function of a distance in the same way.
 
-A pixel is composited only with the shapes near its tile. The lists of these shapes are renewed
-every `_RENEWED` steps.
+Positions, sizes and rates are chosen in the same way for all three, and the same code renders them:
+only the primitives differ. A pixel is composited only with the shapes near its tile. The lists of
+these shapes are renewed every `_RENEWED` steps.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+Kind = Literal["gaussians", "rectangles", "triangles"]
+#: Numbers of a primitive: geometry, softness (not of Gaussians), colour.
+NUMBERS: dict[Kind, int] = {"gaussians": 5 + 3, "rectangles": 5 + 1 + 3, "triangles": 6 + 1 + 3}
 #: Steps after which the lists of the shapes of each tile are renewed.
 _RENEWED = 20
-_TILE = 16  # pixels
-# A shape reaches this many times its softness beyond its edges: σ(−5) = 0.007.
-_REACH = 5.0
+_TILE = 8  # pixels
+# A shape reaches this many times its softness beyond its edges: σ(−5) = 0.007. A Gaussian reaches
+# this many standard deviations: exp(−½ 3.2²) = 0.006.
+_REACH, _DEVIATIONS = 5.0, 3.2
+# Learning rates of the first step, for Adam.
+_PIXELS, _LOGS, _COLORS, _BACKGROUND = 0.3, 0.05, 0.01, 0.003
 
 
 @dataclass
 class ShapeFit:
-    """The result of `fit_shapes`: the image (H, W, 3), and the seconds that the fit took."""
+    """The result of `fit_shapes`: the image (H, W, 3)."""
 
     image: Tensor
-    seconds: float
     parameters: int
 
 
-def fit_shapes(target: Tensor, count: int, kind: str, steps: int, seed: int) -> ShapeFit:
+def fit_shapes(
+    target: Tensor, count: int, kind: Kind, steps: int, seed: int, rate: float = 1.0
+) -> ShapeFit:
     """Fit `count` shapes to target (H, W, 3) in 0..1 with Adam, for the mean squared error.
 
-    kind: "rectangles" (centre, half width, half height, angle) or "triangles" (three corners).
+    Gaussians have a centre, two log standard deviations and an angle; rectangles a centre, two log
+    half sides and an angle; triangles three corners. `rate` is a factor of all learning rates.
     """
     generator = torch.Generator().manual_seed(seed)
     height, width = target.shape[:2]
-    geometry = _initial(target, count, kind, generator)
-    softness = torch.full((count,), math.log(0.7))
-    rows = (geometry[:, :2].clamp(0, 1e9)).long()
+    pixels_part, logs_part = _initial(target, count, kind, generator)
+    softness = torch.full((0 if kind == "gaussians" else count,), math.log(0.7))
+    rows = pixels_part[:, :2].clamp(min=0).long()
     at = target[rows[:, 1].clamp(max=height - 1), rows[:, 0].clamp(max=width - 1)]
     background = target.mean((0, 1))
     colors = 0.5 * (at - background)
-    leaves = [geometry, softness, colors, background]
+    rates = (_PIXELS, _LOGS, _LOGS, _COLORS, _BACKGROUND)
+    leaves = [pixels_part, logs_part, softness, colors, background]
     for leaf in leaves:
         leaf.requires_grad_()
-    rates = (0.3, 0.02, 0.01, 0.003)
     optimizer = torch.optim.Adam(
-        [{"params": [leaf], "lr": rate} for leaf, rate in zip(leaves, rates, strict=True)]
+        [{"params": [leaf], "lr": rate * lr} for leaf, lr in zip(leaves, rates, strict=True)]
     )
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.02 ** (1 / steps))
     pixels, inside = _tile_pixels(width, height)
     wanted = _to_tiles(target)
-    start = time.perf_counter()
-    lists, used = None, None
+
+    def rendered(lists: Tensor, used: Tensor) -> Tensor:
+        forms = _forms(torch.cat([pixels_part, logs_part], dim=1), softness, kind)
+        return _render_tiles(forms, kind, colors, background, pixels, lists, used)
+
+    def lists() -> tuple[Tensor, Tensor]:
+        geometry = torch.cat([pixels_part, logs_part], dim=1)
+        return _shapes_of_tiles(geometry, softness, kind, width, height)
+
+    near = lists()
     for step in range(steps):
         if step % _RENEWED == 0:
-            lists, used = _shapes_of_tiles(geometry, softness, kind, width, height)
-        image = _render_tiles(geometry, softness, colors, background, kind, pixels, lists, used)
-        loss = ((image - wanted).square() * inside[..., None]).sum() / inside.sum() / 3
+            near = lists()
+        loss = ((rendered(*near) - wanted).square() * inside[..., None]).sum() / inside.sum() / 3
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-    seconds = time.perf_counter() - start
     with torch.no_grad():
-        lists, used = _shapes_of_tiles(geometry, softness, kind, width, height)
-        image = _render_tiles(geometry, softness, colors, background, kind, pixels, lists, used)
-    return ShapeFit(
-        _from_tiles(image, width, height), seconds, sum(leaf.numel() for leaf in leaves)
-    )
+        image = _from_tiles(rendered(*lists()), width, height)
+    return ShapeFit(image, sum(leaf.numel() for leaf in leaves))
 
 
-def _initial(target: Tensor, count: int, kind: str, generator: torch.Generator) -> Tensor:
-    """(N, 5) or (N, 6): small shapes, more of them where the gradient of the image is large."""
+def _initial(
+    target: Tensor, count: int, kind: Kind, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Small shapes, more of them where the gradient of the image is large.
+
+    Returns the numbers in pixels, (N, 2) or (N, 6), and log sizes and angle, (N, 3) or (N, 0).
+    """
     height, width = target.shape[:2]
     slope = torch.zeros(height, width)
     slope[:, :-1] += (target[:, 1:] - target[:, :-1]).norm(dim=2)
@@ -88,51 +106,61 @@ def _initial(target: Tensor, count: int, kind: str, generator: torch.Generator) 
     centres = torch.stack([index % width, index // width], dim=1) + 0.5
     size = (1 / (count * density.flatten()[index]).sqrt()).clamp(1.5, 40)
     angle = 2 * math.pi * torch.rand(count, generator=generator)
-    if kind == "rectangles":
-        half = 0.6 * size
-        return torch.stack([*centres.T, half.log(), half.log(), angle], dim=1)
+    if kind != "triangles":
+        log_size = (0.6 * size).log()
+        return centres, torch.stack([log_size, log_size, angle], dim=1)
     corners = [
         centres + size[:, None] * torch.stack([(angle + turn).cos(), (angle + turn).sin()], dim=1)
         for turn in (0.0, 2 * math.pi / 3, 4 * math.pi / 3)
     ]
-    return torch.cat(corners, dim=1)
+    return torch.cat(corners, dim=1), torch.zeros(count, 0)
 
 
-def _edges(geometry: Tensor, kind: str) -> Tensor:
-    """(N, E, 3): a, b, c of each edge; a x + b y + c is the distance inside the edge, in pixels."""
-    if kind == "rectangles":
-        x, y, log_u, log_v, angle = geometry.unbind(1)
-        cos, sin = angle.cos(), angle.sin()
-        edges = []
-        for nx, ny, half in ((cos, sin, log_u.exp()), (-sin, cos, log_v.exp())):
-            along = nx * x + ny * y
-            edges.append(torch.stack([nx, ny, half - along], dim=1))
-            edges.append(torch.stack([-nx, -ny, half + along], dim=1))
-        return torch.stack(edges, dim=1)
-    corners = geometry.view(-1, 3, 2)
-    following = corners.roll(-1, dims=1)
-    side = following - corners
-    normal = torch.stack([-side[..., 1], side[..., 0]], dim=2)
-    normal = normal / normal.norm(dim=2, keepdim=True).clamp(min=1e-6)
-    # The normals point inside, whichever way round the corners are.
-    third = corners.roll(1, dims=1)
-    sign = (normal * (third - corners)).sum(2, keepdim=True).sign()
-    normal = normal * sign
-    return torch.cat([normal, -(normal * corners).sum(2, keepdim=True)], dim=2)
+def _forms(geometry: Tensor, softness: Tensor, kind: Kind) -> Tensor:
+    """(N, E, 3): a, b, c of each linear form a x + b y + c of the position, without a unit.
+
+    Of a Gaussian: the position along its two axes, in standard deviations. Of the others: for each
+    edge, the distance inside it, in units of the softness.
+    """
+    if kind == "triangles":
+        corners = geometry.view(-1, 3, 2)
+        side = corners.roll(-1, dims=1) - corners
+        normal = torch.stack([-side[..., 1], side[..., 0]], dim=2)
+        normal = normal / normal.norm(dim=2, keepdim=True).clamp(min=1e-6)
+        # The normals point inside, whichever way round the corners are.
+        third = corners.roll(1, dims=1)
+        normal = normal * (normal * (third - corners)).sum(2, keepdim=True).sign()
+        edges = torch.cat([normal, -(normal * corners).sum(2, keepdim=True)], dim=2)
+        return edges / softness.exp()[:, None, None]
+    x, y, log_u, log_v, angle = geometry.unbind(1)
+    cos, sin = angle.cos(), angle.sin()
+    forms = []
+    for nx, ny, size in ((cos, sin, log_u.exp()), (-sin, cos, log_v.exp())):
+        along = nx * x + ny * y
+        if kind == "gaussians":
+            forms.append(torch.stack([nx / size, ny / size, -along / size], dim=1))
+        else:
+            forms.append(torch.stack([nx, ny, size - along], dim=1))
+            forms.append(torch.stack([-nx, -ny, size + along], dim=1))
+    stacked = torch.stack(forms, dim=1)
+    return stacked if kind == "gaussians" else stacked / softness.exp()[:, None, None]
 
 
 @torch.no_grad()
 def _shapes_of_tiles(
-    geometry: Tensor, softness: Tensor, kind: str, width: int, height: int
+    geometry: Tensor, softness: Tensor, kind: Kind, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
     """(T, K) rows of the shapes near each tile, padded with 0, and (T, K) 1 where it is not."""
-    if kind == "rectangles":
-        centres, radii = geometry[:, :2], geometry[:, 2:4].exp().norm(dim=1)
-    else:
+    if kind == "triangles":
         corners = geometry.view(-1, 3, 2)
         centres = corners.mean(1)
         radii = (corners - centres[:, None]).norm(dim=2).amax(1)
-    reach = radii + _REACH * softness.exp() + 2.0  # pixels; 2: for the steps until the next lists
+    else:
+        centres, sizes = geometry[:, :2], geometry[:, 2:4].exp()
+        radii = _DEVIATIONS * sizes.amax(1) if kind == "gaussians" else sizes.norm(dim=1)
+    reach = radii + 2.0  # pixels, for the steps until the next lists
+    if kind != "gaussians":
+        reach = reach + _REACH * softness.exp()
     lists = []
     for top in range(0, height, _TILE):
         for left in range(0, width, _TILE):
@@ -144,21 +172,26 @@ def _shapes_of_tiles(
 
 
 def _render_tiles(
-    geometry: Tensor,
-    softness: Tensor,
+    forms: Tensor,
+    kind: Kind,
     colors: Tensor,
     background: Tensor,
-    kind: str,
     pixels: Tensor,
     lists: Tensor,
     used: Tensor,
 ) -> Tensor:
     """(T, P, 3): the pixels of each tile."""
-    edges = (_edges(geometry, kind) / softness.exp()[:, None, None])[lists]  # (T, K, E, 3)
+    values = [
+        torch.baddbmm(form[:, None, :, 2], pixels, form[:, :, :2].transpose(1, 2))  # (T, P, K)
+        for form in forms[lists].unbind(2)
+    ]
     weight = used[:, None, :]
-    for edge in edges.unbind(2):
-        distance = torch.baddbmm(edge[:, None, :, 2], pixels, edge[:, :, :2].transpose(1, 2))
-        weight = weight * torch.sigmoid(distance)  # (T, P, K)
+    if kind == "gaussians":
+        u, v = values
+        weight = weight * (-0.5 * (u * u + v * v)).exp()
+    else:
+        for value in values:
+            weight = weight * torch.sigmoid(value)
     return background + torch.bmm(weight, colors[lists])
 
 

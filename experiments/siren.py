@@ -8,21 +8,20 @@ with ω₀ = 30.
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 _OMEGA = 30.0
+_LAYERS = 3
 
 
 @dataclass
 class SirenFit:
-    """The result of `fit_siren`: the image (H, W, 3), the seconds, and the number of weights."""
+    """The result of `fit_siren`: the image (H, W, 3), and the number of weights."""
 
     image: Tensor
-    seconds: float
     parameters: int
 
 
@@ -47,8 +46,16 @@ def siren(hidden: int, layers: int) -> nn.Module:
     return nn.Sequential(*sines, last)
 
 
-def fit_siren(target: Tensor, steps: int, seed: int, hidden: int = 64, layers: int = 3) -> SirenFit:
-    """Fit a SIREN to target (H, W, 3) in 0..1 with Adam, on all pixels, for the squared error."""
+def hidden_size(parameters: int) -> int:
+    """The size of the hidden layers whose 2h² + 8h + 3 weights come closest to `parameters`."""
+    return max(1, round(math.sqrt(4 + (parameters - 3) / 2) - 2))
+
+
+def fit_siren(target: Tensor, hidden: int, steps: int, seed: int, rate: float = 1.0) -> SirenFit:
+    """Fit a SIREN to target (H, W, 3) in 0..1 with Adam, on all pixels, for the squared error.
+
+    It has three sine layers of `hidden` units. `rate` is a factor of the learning rate.
+    """
     torch.manual_seed(seed)
     height, width = target.shape[:2]
     y, x = torch.meshgrid(
@@ -56,19 +63,16 @@ def fit_siren(target: Tensor, steps: int, seed: int, hidden: int = 64, layers: i
     )
     positions = torch.stack([x, y], dim=2).reshape(-1, 2)
     wanted = target.reshape(-1, 3) * 2 - 1
-    network = siren(hidden, layers)
-    optimizer = torch.optim.Adam(network.parameters(), lr=2e-3)
+    network = siren(hidden, _LAYERS)
+    optimizer = torch.optim.Adam(network.parameters(), lr=rate * 2e-3)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.02 ** (1 / steps))
-    start = time.perf_counter()
     for _ in range(steps):
         loss = (network(positions) - wanted).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-    seconds = time.perf_counter() - start
     with torch.no_grad():
         image = (network(positions) + 1) / 2
-    return SirenFit(
-        image.reshape(height, width, 3), seconds, sum(p.numel() for p in network.parameters())
-    )
+    weights = sum(p.numel() for p in network.parameters())
+    return SirenFit(image.reshape(height, width, 3), weights)

@@ -147,7 +147,17 @@ def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
     assert torch.allclose(found.packed[rows], expected.packed, atol=1e-12)
 
 
-def test_the_table_of_the_experiment():
+def test_the_rate_with_the_best_mean_is_chosen(experiment):
+    def row(rate: float, seed: int, psnr: float) -> object:
+        return experiment.Result("R S", rate, seed, psnr, 2.0)
+
+    results = [row(0.01, 0, 20), row(0.03, 0, 21), row(0.1, 0, 30), row(0.3, 0, 40)]
+    results += [row(0.01, 1, 20), row(0.03, 1, 20), row(0.1, 1, -math.inf)]
+    results += [row(0.01, 2, 20.5), row(0.03, 2, 20)]
+    assert experiment.chosen(results) == [results[1], results[5], results[8]]
+
+
+def test_the_table_of_the_experiment(experiment):
     """The table of the page has the values of experiments/cholesky.json."""
     rows = json.loads((ROOT / "experiments" / "cholesky.json").read_text("utf-8"))
     page = (ROOT / "docs" / "learn" / "covariance.md").read_text("utf-8")
@@ -160,16 +170,15 @@ def test_the_table_of_the_experiment():
     assert len(table) == 3
     first: list[float] = []
     for shape, rate, mean, deviation, difference, difference_deviation, ratio in table:
-        own = [row for row in rows if row["shape"] == shape]
-        selecting = [row for row in own if row["seed"] == 5]  # the seed that selects the rate
-        best = max(selecting, key=lambda row: row["psnr"] or 0)
-        assert best["rate"] == float(rate)
-        runs = sorted((r for r in own if r["seed"] < 5), key=lambda r: r["seed"])
-        psnr = [run["psnr"] for run in runs]
+        own = [row | {"psnr": row["psnr"] or -math.inf} for row in rows if row["shape"] == shape]
+        runs = experiment.chosen([experiment.Result(**row) for row in own])
+        assert {run.rate for run in runs} == {float(rate)}
+        runs.sort(key=lambda run: run.seed)
+        psnr = [run.psnr for run in runs]
         assert len(psnr) == 5
         assert statistics.mean(psnr) == pytest.approx(float(mean), abs=6e-3)
         assert statistics.stdev(psnr) == pytest.approx(float(deviation), abs=6e-3)
-        assert statistics.mean(r["axis_ratio"] for r in runs) == pytest.approx(
+        assert statistics.mean(run.axis_ratio for run in runs) == pytest.approx(
             float(ratio), abs=0.06
         )
         first = first or psnr
