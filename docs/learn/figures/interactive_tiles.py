@@ -24,7 +24,8 @@ def splats(gaussians: Gaussians) -> list[list[float]]:
     """x, y, conic (3), opacity, depth, red, green, blue of each splat, in the order of the file."""
     found = project(gaussians, scene.camera(WIDTH))
     corner = torch.tensor(CORNER, dtype=torch.float32)
-    near = ((found.means2d > corner - 40) & (found.means2d < corner + torch.tensor(SIZE) + 40)).all(1)
+    high = corner + torch.tensor(SIZE)
+    near = ((found.means2d > corner - 40) & (found.means2d < high + 40)).all(1)
     rows = near.nonzero()[:, 0]
     front = rows[torch.argsort(found.depths[rows], stable=True)]
     alpha, T, _ = reference._blend_weights(

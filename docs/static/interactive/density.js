@@ -4,7 +4,7 @@
   const { add, slider, button, plot, path, ellipse, t, load, figure } = interactive;
   figure("density", async ({ element, controls, panels, status }) => {
     await Promise.all(["gaussians2d.js", "fitting2d.js"].map(load));
-    const SIZE = 64, STEPS = 60, START = 5, SMALL = 4; // SMALL: pixels, the limit of a clone
+    const SIZE = 64, STEPS = 100, START = 5, SMALL = 7; // SMALL: pixels, the limit of a clone
     const inside = v => Math.min(1, Math.max(0, v + 0.5)); // a soft edge of one pixel
     const target = new Float64Array(3 * SIZE * SIZE);
     for (let j = 0, p = 0; j < SIZE; j++) for (let i = 0; i < SIZE; i++, p += 3) {
@@ -15,11 +15,11 @@
         target[p + k] = 0.93 + share * ((warm ? [0.85, 0.35, 0.1][k] : c) - 0.93);
       });
     }
-    let fit, stage, threshold = 0.05, before = 0, marks = [];
+    let fit, stage, threshold = 0.15, before = 0, marks = [];
     const next = button(controls, "next", "", () => { advance(); draw(); });
     button(controls, "reset", t("Back to start", "恢复初始状态"), reset);
     slider(controls, "threshold", t("threshold of the gradient", "梯度阈值"),
-      [0.01, 0.3, 0.01, threshold], value => { threshold = value; if (stage === "judged") judge(); draw(); });
+      [0.05, 1, 0.01, threshold], value => { threshold = value; if (stage === "judged") judge(); draw(); });
     const canvases = [t("picture", "图片"), t("image of the Gaussians", "高斯的图像")].map(name => {
       const box = add(panels, "div", { class: "sphere" });
       const canvas = add(box, "canvas", { width: SIZE, height: SIZE, class: "tile", role: "img",
@@ -40,7 +40,7 @@
       fit.render();
       draw(t("The start: five Gaussians at random places.", "起点：五个位置随机的高斯。"));
     }
-    const slope = i => fit.slopes[i] / Math.max(1, fit.steps - before) / SIZE;
+    const slope = i => fit.slopes[i] / Math.max(1, fit.steps - before); // the mean over the steps
     function judge() {
       marks = Array.from({ length: fit.count }, (_, i) => (fit.transparent(i) ? "prune"
         : slope(i) < threshold ? "keep" : fit.large(i, SMALL) ? "split" : "clone"));

@@ -2,7 +2,7 @@
 (() => {
   "use strict";
   const { add, choice, button, t, load, figure } = interactive;
-  const LONGEST = 320, STEPS = 1000;
+  const LONGEST = 320, STEPS = 1500;
 
   function work() { // the worker; its messages: { step, count, psnr, pixels, rows, born, counts }
     const ROUNDS = 10, FIRST_SHARE = 0.15, GROWTH = 0.4, FRAME = 100; // ms between messages
@@ -123,7 +123,8 @@
       }
       element.dataset.step = latest.step;
       element.dataset.psnr = latest.psnr.toFixed(2);
-      status.textContent = t(
+      status.textContent = (latest.step ? "" : t("Run it, or drop a picture of yours here. ",
+        "点“运行”，或者把你自己的图片拖到这里。")) + t(
         `Step ${latest.step} of ${STEPS}: ${latest.count} Gaussians, PSNR ${latest.psnr.toFixed(2)} dB. ` +
         `Cloned ${counts.cloned}, split ${counts.split}, pruned ${counts.pruned}` +
         (view === "ellipses" ? "; green: cloned last, orange: split last." : "."),

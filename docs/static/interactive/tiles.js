@@ -101,8 +101,7 @@
         const [p, q] = [u, v].map(e => Math.sqrt(e * s.reach)), cos = Math.cos(angle), sin = Math.sin(angle);
         const outline = ellipse([s.x, s.y], [[cos * p, -sin * q], [sin * p, cos * q]]);
         svg += path(outline.map(([x, y]) => [X(x), Y(y)]), "", `style="stroke:${shown.has(s)
-          ? "#ffa355" : "white"};stroke-width:${shown.has(s) ? 1.5 : 0.5};stroke-opacity:${
-          shown.has(s) ? 1 : 0.5}"`);
+          ? "#ffa355" : "white"};stroke-width:${shown.has(s) ? 1.2 : 0.5};stroke-opacity:0.6"`);
       }
       panel.draw(svg, [{ name: "tile", label: t("Tile", "图块"), text: String(tile), colour: "blue",
         at: [(column + 0.5) * TILE, (row + 0.5) * TILE],
