@@ -321,7 +321,7 @@ def test_live_fit_of_a_dropped_picture(page, tmp_path):
 def test_live_fit_reaches_the_quality_of_the_subcommand(page):
     """Within 1 dB with 1000 Gaussians; `snowsplat image` has 3000 steps."""
     text = (DOCS / "static" / "interactive" / "picture-data.js").read_text(encoding="utf-8")
-    encoded = "".join(re.findall('"([A-Za-z0-9+/=]+)"', text))
+    encoded = "".join(re.findall('^  "(.*)"', text, re.MULTILINE))
     picture = Image.open(io.BytesIO(base64.b64decode(encoded))).convert("RGB")
     target = torch.from_numpy(np.asarray(picture).copy()).float() / 255
     fitter = Fitter(target, FitOptions(gaussians=1000))

@@ -51,7 +51,7 @@
       words = "";
       if (stage === "changed") {
         const start = fit.mse;
-        for (let i = 0; i < STEPS; i++) fit.step(0.5, 6);
+        for (let i = 0; i < STEPS; i++) fit.step(0.25, 12);
         fit.render();
         words = t(`PSNR ${(-10 * Math.log10(start)).toFixed(1)} → ${(-10 * Math.log10(fit.mse)).toFixed(1)} dB.`,
           `PSNR 从 ${(-10 * Math.log10(start)).toFixed(1)} dB 变为 ${(-10 * Math.log10(fit.mse)).toFixed(1)} dB。`);

@@ -23,7 +23,7 @@
         if (round >= ROUNDS || fit.steps < (round + 1) * GROWTH * steps / ROUNDS) continue;
         round++;
         const wanted = first + Math.round((most - first) * round / ROUNDS);
-        const now = fit.densify(fit.worst(wanted - fit.count), 0.6 * spacing, true);
+        const now = fit.densify(fit.worst(wanted - fit.count), 0.8 * spacing, true);
         for (const kind of Object.keys(now)) counts[kind] += now[kind];
       }
       report();
