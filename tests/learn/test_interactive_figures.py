@@ -299,7 +299,7 @@ def test_live_fit_of_a_dropped_picture(page, tmp_path):
         page.call("Input.dispatchDragEvent", type=kind, x=left, y=top, data=dropped)
     page.wait_for(part("fit", "canvas") + ".width === 64")
     page.wait_for(part("fit", ".status") + ".textContent.includes('Step 0 ')")
-    put(page, "fit", "most", 200)
+    put(page, "fit", "most", 1000)  # enough that it is not finished at the pause
     put(page, "fit", "view", "ellipses")
     press(page, "fit", "run")
     step = "Number(document.querySelector('[data-figure=fit]').dataset.step)"
@@ -316,7 +316,7 @@ def test_live_fit_of_a_dropped_picture(page, tmp_path):
     page.wait_for(part("fit", ".status") + ".textContent.includes('not a picture')")
     before = page.evaluate(step)
     press(page, "fit", "run")
-    page.wait_for(f"{step} > {before}")
+    page.wait_for(f"{step} !== {before}")
     press(page, "fit", "restart")
     page.wait_for(f"{step} === 0")
 
