@@ -43,7 +43,10 @@ html_theme = "furo"
 html_title = f"snowsplat {release}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_js_files = [("basin.js", {"defer": "defer"})]
+html_js_files = [
+    ("basin.js", {"defer": "defer"}),
+    ("interactive/interactive.js", {"defer": "defer"}),
+]
 html_show_copyright = False
 html_show_sphinx = False
 html_copy_source = False

@@ -4,28 +4,32 @@
   "use strict";
   const root = document.getElementById("basin");
   if (!root) return;
+  const chinese = document.documentElement.lang.startsWith("zh");
+  const say = (english, chineseText) => (chinese ? chineseText : english);
   const STEPS = 800, RANGE = 10, FOUND = 0.01, BLUR = 4, NOISE = 0.05;
   const RATES = { descent: 0.3, adam: 0.05 };
   const TARGETS = { one: [[0, 1, 1]], two: [[-2, 0.7, 1], [3, 1, 0.7]] }; // mean, σ, amplitude
 
   root.innerHTML = `
     <div class="controls">
-      <label>Target <select name="target"><option value="one">one Gaussian</option>
-        <option value="two">two Gaussians</option></select></label>
-      <label>Gaussians <select name="count"><option>1</option><option>2</option>
+      <label>${say("Target", "目标")} <select name="target">
+        <option value="one">${say("one Gaussian", "一个高斯")}</option>
+        <option value="two">${say("two Gaussians", "两个高斯")}</option></select></label>
+      <label>${say("Gaussians", "高斯数")} <select name="count"><option>1</option><option>2</option>
         <option>3</option></select></label>
-      <label>Optimiser <select name="optimiser"><option value="descent">gradient descent</option>
+      <label>${say("Optimiser", "优化器")} <select name="optimiser">
+        <option value="descent">${say("gradient descent", "梯度下降")}</option>
         <option value="adam">Adam</option></select></label>
-      <label><input type="checkbox" name="blur"> blur first</label>
-      <label><input type="checkbox" name="noise"> noise</label>
-      <span><button type="button" name="run">Run</button>
-      <button type="button" name="back">Back to start</button></span>
+      <label><input type="checkbox" name="blur"> ${say("blur first", "先模糊")}</label>
+      <label><input type="checkbox" name="noise"> ${say("noise", "噪声")}</label>
+      <span><button type="button" name="run"></button>
+      <button type="button" name="back">${say("Back to start", "回到起点")}</button></span>
     </div>
-    <svg class="signal" role="group" aria-label="Target, model and the basin"></svg>
+    <svg class="signal" role="group" aria-label="${say("Target, model and the basin", "目标、模型和吸引域")}"></svg>
     <p class="status" role="status"></p>
     <div class="panels"><svg class="loss" width="330" height="170" viewBox="0 0 330 170" role="img"
-      aria-label="Relative error by step"></svg><svg class="pull" width="330" height="170"
-      viewBox="0 0 330 170" role="img" aria-label="Gradient by position"></svg></div>`;
+      aria-label="${say("Relative error by step", "各步的相对误差")}"></svg><svg class="pull" width="330" height="170"
+      viewBox="0 0 330 170" role="img" aria-label="${say("Gradient by position", "各位置的梯度")}"></svg></div>`;
   const part = name => root.querySelector(name);
   const field = name => part(`[name=${name}]`);
   const [signal, lossPanel, pullPanel] = [".signal", ".loss", ".pull"].map(part);
@@ -141,7 +145,8 @@
       svg += `<rect x="${(8 + i * cell).toFixed(1)}" y="222" width="${(cell + 0.3).toFixed(1)}"
         height="${found ? 10 : 3}" class="f-${found ? "green" : "soft"}"/>`;
     });
-    svg += text(8, 214, "start positions; green: the target would be found");
+    svg += text(8, 214, say("start positions; green: the target would be found",
+      "起始位置；绿色：能找到目标"));
     for (let u = -RANGE; u <= RANGE; u += 5)
       svg += text(x(u), 247, signed(u),
         `text-anchor="${u === -RANGE ? "start" : u === RANGE ? "end" : "middle"}"`);
@@ -149,12 +154,14 @@
       svg += curve(line(x, y, -RANGE, RANGE, 200, u => value([g], u)), "blue",
         'stroke-opacity="0.4"');
     svg += curve(line(x, y, -RANGE, RANGE, 200, u => value(fit.p, u)), "blue");
-    svg += text(8, 14, "grey: target, blue: model; ● position, ◆ width");
+    svg += text(8, 14, say("grey: target, blue: model; ● position, ◆ width",
+      "灰色：目标，蓝色：模型；● 位置，◆ 宽度"));
     fit.p.forEach((g, i) => {
       const s = Math.exp(g.l), px = x(g.m), py = y(g.a), qx = x(g.m + s), qy = y(g.a * 0.607);
-      const label = fit.p.length > 1 ? ` of Gaussian ${i + 1}` : "";
+      const label = fit.p.length > 1 ? say(` of Gaussian ${i + 1}`, `（高斯 ${i + 1}）`) : "";
+      const names = { width: say("width", "宽度"), position: say("position", "位置") };
       const handle = (name, now, cx, cy, shape) => `<g class="handle" tabindex="0" role="slider"
-        data-handle="${name}${i}" aria-label="${name}${label}" aria-valuenow="${now.toFixed(2)}"
+        data-handle="${name}${i}" aria-label="${names[name]}${label}" aria-valuenow="${now.toFixed(2)}"
         aria-valuemin="${name === "width" ? 0.1 : -RANGE}" aria-valuemax="${RANGE}">
         <circle cx="${cx}" cy="${cy}" r="20" fill="transparent"/>${shape}</g>`;
       if (Math.abs(g.m) < RANGE + 1) // a diverged Gaussian has no handles
@@ -169,7 +176,7 @@
 
   function drawLoss() {
     const x = i => 50 + i / STEPS * 270, y = e => 22 + -Math.log10(Math.max(e, 1e-4)) / 4 * 110;
-    let svg = text(2, 12, "relative error") + text(320, 166, "steps", 'text-anchor="end"');
+    let svg = text(2, 12, say("relative error", "相对误差")) + text(320, 166, say("steps", "步数"), 'text-anchor="end"');
     [1, 0.1, 0.01, 0.001, 0.0001].forEach(e => {
       svg += curve(`M50 ${y(e)}H320`, "line", "", 1) +
         text(44, y(e) + 4, e, 'text-anchor="end"');
@@ -186,7 +193,7 @@
     const samples = Array.from({ length: 201 }, (_, i) => pull(-RANGE + i / 200 * 2 * RANGE));
     const top = Math.max(...samples.map(Math.abs)) || 1;
     const x = u => 58 + (u + RANGE) / (2 * RANGE) * 262, y = f => 77 - f / top * 52;
-    let svg = text(2, 12, "−∂L/∂μ by position μ: the pull") + curve("M58 77H320", "line", "", 1);
+    let svg = text(2, 12, say("−∂L/∂μ by position μ: the pull", "−∂L/∂μ 随位置 μ 的变化：拉力")) + curve("M58 77H320", "line", "", 1);
     [top, 0, -top].forEach(v => {
       svg += text(52, y(v) + 4, signed((v < 0 ? "-" : "") + number(Math.abs(v))),
         'text-anchor="end"');
@@ -203,10 +210,12 @@
     const error = relativeError(fit.p), done = fit.step >= STEPS, g = fit.p[active];
     const pull = Math.abs(gradient(g, fit.p, targets(blurAt(fit))).m);
     root.dataset.result = !done ? "" : error < FOUND ? "found" : "not found";
-    const words = !done ? "" : error < FOUND ? " The target is found." : " The target is not found.";
-    part(".status").textContent = `Step ${fit.step}: relative error ${number(Math.max(error, 1e-12))}` +
-      `, |∂L/∂μ| = ${number(pull)}.${words}`;
-    field("run").textContent = running ? "Pause" : "Run";
+    const words = !done ? "" : error < FOUND ? say(" The target is found.", "找到了目标。")
+      : say(" The target is not found.", "没有找到目标。");
+    const shown = number(Math.max(error, 1e-12));
+    part(".status").textContent = say(`Step ${fit.step}: relative error ${shown}, |∂L/∂μ| = ${number(pull)}.`,
+      `第 ${fit.step} 步：相对误差 ${shown}，|∂L/∂μ| = ${number(pull)}。`) + words;
+    field("run").textContent = running ? say("Pause", "暂停") : say("Run", "运行");
   }
   const draw = () => { drawSignal(); drawLoss(); drawPull(); status(); };
 

@@ -8,6 +8,7 @@ import gaussian
 import gradients
 import history
 import initialisation
+import interactive_tiles
 import ply
 import projection
 import rasterizer
@@ -29,6 +30,7 @@ for module in (
     initialisation,
     density_control,
     ply,
+    interactive_tiles,
     history,
 ):
     print(module.__name__, flush=True)
