@@ -143,7 +143,7 @@ const TEXTS = {
     edit_note_title: ["Title", "标题"],
     edit_note_text: ["Text", "文字"],
     edit_note_untitled: ["An annotation has no title", "有标注没有标题"],
-    edit_hides: ["Also remove what the sliders of Clean up hide", "同时删除“Clean up”滑块所隐藏的部分"],
+    edit_hides: ["Also remove what the sliders of Clean up hide", "同时删除“清理”滑块所隐藏的部分"],
     edit_mode: ["How to select", "选择方式"],
     edit_replace: ["New", "新选择"],
     edit_add: ["Add", "添加"],
