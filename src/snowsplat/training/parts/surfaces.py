@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import pad
 
 from snowsplat import ops
 from snowsplat.ops.capacity import Capacity
@@ -152,6 +152,8 @@ def consistency(
     depth = torch.where(shown, distances[0], -1.0) / torch.where(shown, along, -1.0)
     from_depth = normals_of_depth(depth, camera)
     with torch.no_grad():
-        around = max_pool2d((~shown).to(depth)[None], 3, 1, 1)[0] == 0
+        # All nine pixels around have a depth. At the border of the image, the normals are 0.
+        rows = shown[:, :-2] & shown[:, 1:-1] & shown[:, 2:]
+        around = pad(rows[:-2] & rows[1:-1] & rows[2:], (1, 1, 1, 1))
         weight = around * -((from_depth * rays).sum(0) / lengths).clamp(max=0.0)
     return (weight * (alpha.detach() - (normals * from_depth).sum(0))).mean()
