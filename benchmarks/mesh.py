@@ -1,7 +1,7 @@
 """Meshes of procedural scenes with known surfaces: accuracy, completeness, F-score.
 
     python benchmarks/mesh.py --out OUT                       dataset, training, mesh, measures
-    python benchmarks/mesh.py --out OUT --scenes table --also mean poisson
+    python benchmarks/mesh.py --out OUT --scenes table --methods mean poisson --surfaces
 
 The photos are ray traced; poses are exact, points have errors of some millimetres. A point of the
 mesh is accurate if a true surface is within 0.5% of the extent, the longest side of the box of the
@@ -153,6 +153,10 @@ def made(method: str, scene: TrainedScene) -> tuple[np.ndarray, np.ndarray]:
     return ours()
 
 
+def output_of(name: str, options: argparse.Namespace) -> Path:
+    return Path(options.out / f"out_{name}{'_surfaces' if options.surfaces else ''}")
+
+
 def measured(name: str, scene: Procedural, options: argparse.Namespace) -> None:
     truth_file = options.out / f"{name}_truth.npz"
     if not truth_file.exists():
@@ -160,7 +164,7 @@ def measured(name: str, scene: Procedural, options: argparse.Namespace) -> None:
         np.savez_compressed(truth_file, one=found[0], two=found[1])
     with np.load(truth_file) as stored:
         truth = stored["one"], stored["two"]
-    trained = load_trained(options.out / f"out_{name}")
+    trained = load_trained(output_of(name, options))
     for method in options.methods:
         before = time.process_time()
         mesh = made(method, trained)
@@ -180,16 +184,18 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", default=["median", "mean", "reference", "poisson"])
     parser.add_argument("--width", type=int, default=480, help="of the photos, pixels")
     parser.add_argument("--iterations", type=int, default=1500)
+    parser.add_argument("--surfaces", action="store_true", help="train flat Gaussians")
     parser.add_argument("--points", type=int, default=500_000, help="true points, drawn")
     options = parser.parse_args()
     print("| scene | method | F | accuracy | completeness | error, mm | triangles | CPU s |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     for name in options.scenes:
         scene = SCENES[name]()
-        if not (options.out / f"out_{name}").exists():
+        output = output_of(name, options)
+        if not output.exists():
             write_dataset(options.out / name, scene, options.width)
-            trained = options.out / f"out_{name}"
-            train(options.out / name, trained, TrainOptions(iterations=options.iterations))
+            settings = {"iterations": options.iterations, "surfaces": options.surfaces}
+            train(options.out / name, output, TrainOptions(settings=settings))
         measured(name, scene, options)
 
 
