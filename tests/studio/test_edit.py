@@ -150,6 +150,8 @@ def test_undo_returns_the_same_bytes():
     random = np.random.default_rng(0)
     count = 77
     found = [random.integers(0, 2, count).tolist() for _ in range(3)]
+    half = [0.5**0.5, 0.0, 0.5**0.5, 0.0]  # 90° about y
+    floor, eye = [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 2.0]], [-1.0, 3.0, 0.5]
     calls = [
         ["select", found[0], "replace"],
         ["select", found[1], "add"],
@@ -161,6 +163,11 @@ def test_undo_returns_the_same_bytes():
         *[["redo"]] * 6,
         ["undo"],
         ["select", found[0], "remove"],  # the same as before: the future is another one
+        ["redo"],
+        ["turnBy", half],
+        ["turnBy", half],
+        ["undo"],
+        ["undo"],
         ["redo"],
     ]
     centers = random.normal(size=(count, 3))
@@ -176,6 +183,8 @@ def test_undo_returns_the_same_bytes():
         "width": 8,
         "height": 6,
         "box": box,
+        "floor": floor,
+        "eye": eye,
     }
     script = Path(__file__).parents[1] / "node" / "selection.mjs"
     answer = json.loads(
@@ -195,7 +204,15 @@ def test_undo_returns_the_same_bytes():
     # The last call changed nothing: it is no step. So the sixth undo has nothing left.
     assert states[6:12] == [*states[3::-1], [0] * count, [0] * count]
     assert states[12:18] == [*states[:5], states[4]]
-    assert states[18:] == [states[3], states[3], states[4]]
+    assert states[18:21] == [states[3], states[3], states[4]]
+    assert states[21:] == 5 * [states[4]]
+    straight, once, twice = answer["turns"][20:23]
+    assert (straight, once) == ([1, 0, 0, 0], half)
+    assert np.allclose(twice, [0, 0, 1, 0])
+    assert answer["turns"][23:] == [once, straight, once]  # the same bits
+    level = np.array(answer["level"])
+    assert np.ptp(level[:, 1]) < 1e-12
+    assert level[0, 1] < eye[1]  # the eye is above
     bits = np.frombuffer(base64.b64decode(answer["deleted"]), np.uint8)
     assert np.unpackbits(bits, bitorder="little")[:count].tolist() == deleted.tolist()
     clip = np.float32(centers) @ matrix[:, :3].T + matrix[:, 3]
@@ -238,6 +255,16 @@ def test_lasso_delete_undo_delete_save(studio, finished):
         for kind in ("rawKeyDown", "keyUp"):
             page.call("Input.dispatchKeyEvent", type=kind, key="Delete", code="Delete")
         assert counts(page) == f"0 selected, {selected} deleted"
+        # A turn is seen, and undone exactly.
+        pose = (
+            "JSON.stringify([...sse.viewer.app.root.findByName('gsplat').getWorldTransform().data])"
+        )
+        straight = page.evaluate(pose)
+        press(page, "Level and turn")
+        press(page, "+90°")
+        assert page.evaluate(pose) != straight
+        press(page, "Undo")
+        assert page.evaluate(pose) == straight
         press(page, "Start with this view")
         page.evaluate("window.old = true")
         press(page, "Save")
