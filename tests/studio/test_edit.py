@@ -45,6 +45,7 @@ def edit_of(removed: np.ndarray, **more) -> dict:
     return {"count": len(removed), "removed": base64.b64encode(bits).decode(), **more}
 
 
+@pytest.mark.usefixtures("in_process")
 def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     address = f"scenes/{finished.name}"
     original = (finished.made / "box.ply").read_bytes()
@@ -66,6 +67,7 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert studio.ask(f"{address}/edit", "DELETE")[0] == 400
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_scene_is_renamed_and_removed(studio, finished):
     address = f"scenes/{finished.name}"
     assert studio.ask("scenes")[1][0]["picture"]
@@ -80,6 +82,7 @@ def test_a_scene_is_renamed_and_removed(studio, finished):
     assert studio.ask("scenes") == (200, [])
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
     file = of_the_command_line(studio.library.folder / "tour")
     write_json(file.parents[2] / "metrics.json", {"split": "test", "psnr": 27.5})
@@ -106,6 +109,7 @@ def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
     assert file.is_file()
 
 
+@pytest.mark.usefixtures("in_process")
 def test_hostile_changes(studio, finished):
     address = f"scenes/{finished.name}/edit"
     nothing = np.zeros(N, bool)
