@@ -49,6 +49,8 @@ def edit_of(removed: np.ndarray, **more) -> dict:
 def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     address = f"scenes/{finished.name}"
     original = (finished.made / "box.ply").read_bytes()
+    plan = {"keys": [[0.0, 0, -9, 0, 0, 0, 40, 1.5], [1.0, 0, -9, 0, 0, 0, 40, 1.5]]}
+    write_json(finished.plan, plan)
     changes = edit_of(np.arange(N) < 20, title=" Half\n a box ", scale=2.0)
     assert studio.ask(f"{address}/edit", "POST", changes) == (200, {"file": "box_edited.ply"})
     about = studio.ask(address)[1]
@@ -59,6 +61,8 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert studio.ask(f"{address}/exports/ply", "POST", {})[0] == 200
     assert len(read_gaussians(finished.exports / "Half a box.ply")) == N - 20
     assert (finished.made / "box.ply").read_bytes() == original
+    keys = json.loads(finished.plan.read_text())["keys"]
+    assert np.allclose(keys[1][:3], [2, 0, -18])  # of the larger scene
     assert studio.ask(f"{address}/edit", "DELETE") == (200, {"file": "box.ply"})
     about = studio.ask(address)[1]
     assert (about["edited"], about["state"]["result"]["gaussians"]) == (0, N)

@@ -263,7 +263,10 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
     """
     file = _finished(scene)
     # A film that was planned is that of the scene as it is then.
-    before = page_frames(file) if is_file(scene.plan) else None
+    plan = None
+    with suppress(OSError, ValueError):  # there is none
+        plan = _plan(scene)
+    before = page_frames(file) if plan else []
     if undo:
         file = undo_edits(file)
     else:
@@ -275,8 +278,8 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
             raise UserError(f"{error}. Open the page anew, then edit it") from None
         if changes.title:
             scene.change(title=safe_title(changes.title))
-    if before:
-        plan = moved_film(_plan(scene), before, page_frames(file))
+    if plan:
+        plan = moved_film(plan, before, page_frames(file))
         write_json(scene.plan, asdict(plan))
         if is_file(scene.keys):
             write_keys(file, plan, scene.keys)
