@@ -12,8 +12,10 @@ import torch
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
+from snowsplat.pipeline.film import moved_film, page_frames
 from snowsplat.pipeline.output.edit_record import Note, PageEdit, read_record, shown_file
 from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.view import viewed_scene
@@ -23,7 +25,6 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
-from snowsplat.viewer.web.scene import viewing_frame
 
 N = 203  # no multiple of 8
 
@@ -132,9 +133,7 @@ def test_annotations_stay_at_their_places(scene, tmp_path):
 
 
 def page_scale(scene: Path) -> float:
-    source = load_viewable(scene)
-    change = viewing_frame(source.gaussians, source.cameras)[0]
-    return 1.0 if change is None else change.scale
+    return load_viewable(scene).frame().scale
 
 
 def settings_of(site: Path) -> dict:
@@ -173,6 +172,50 @@ def test_scale_view_and_title(scene, tmp_path):
     assert [each.name for each in scene.parent.glob("tour*")] == ["tour.ply"]
 
 
+def test_a_person_turns_the_scene(scene, tmp_path):
+    """The page shows it as it was turned, although the cameras say otherwise; so does a film."""
+    site, (original, before) = tmp_path / "site", (scene.read_bytes(), read_sog_places(tmp_path))
+    note = Note("A", "", VIEW)
+    turn = [0.5**0.5, 0.0, 0.0, 0.5**0.5]  # 90° about z of the viewer: x becomes y
+    plan = PageFilm([VIEW, [*VIEW[:2], -5.0, *VIEW[3:]]])
+    frames = page_frames(scene)
+    target = edit(
+        scene, site, PageEdit(N, bits(np.arange(N) < 0), start=VIEW, notes=(note,), turn=turn)
+    )
+    publish(target, site, overwrite=True)
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    ratio = page_scale(target) / page_scale(scene)
+    expected = ratio * before @ quarter.T
+    assert match(read_sog_places(tmp_path), expected) < 0.01
+    (shown,) = settings_of(site)["annotations"]
+    place = ratio * quarter @ np.array(VIEW[3:6])
+    assert np.allclose(shown["position"], place, atol=1e-6)
+    film = moved_film(plan, frames, page_frames(target))
+    assert np.allclose(film.keys[0][:3], ratio * quarter @ VIEW[:3], atol=1e-6)
+    # The cameras turn with the scene: they see the same.
+    seen, first = load_viewable(target), load_viewable(scene)
+    for camera, other in zip(seen.cameras, first.cameras, strict=True):
+        pixels, others = camera.project(seen.gaussians.means), other.project(first.gaussians.means)
+        assert torch.allclose(pixels[0], others[0], atol=1e-2)
+    # A second turn adds up; the original has the same bytes.
+    back = [turn[0], 0.0, 0.0, -turn[3]]
+    edit(target, site, PageEdit(N, bits(np.arange(N) < 0), turn=back))
+    publish(target, site, overwrite=True)
+    assert match(read_sog_places(tmp_path), page_scale(target) / page_scale(scene) * before) < 0.01
+    assert undo_edits(target).read_bytes() == original
+
+
+def read_sog_places(folder: Path) -> np.ndarray:
+    """(N, 3) the centres in the viewer."""
+    return read_sog(folder / "site" / "scene.sog").means * [-1.0, -1.0, 1.0]
+
+
+def match(places: np.ndarray, expected: np.ndarray) -> float:
+    """The largest distance to the nearest other place, relative to the size."""
+    distances = np.linalg.norm(places[:, None] - expected, axis=2)
+    return float(distances.min(1).max() / np.ptp(expected))
+
+
 def test_the_page_is_that_of_the_scene(scene, tmp_path):
     site = tmp_path / "site"
     moved = read_gaussians(scene)
@@ -200,6 +243,8 @@ def test_the_page_is_that_of_the_scene(scene, tmp_path):
         ({"scale": 1e300}, "times as large"),
         ({"start": [0.0] * 8}, "view"),
         ({"start": [1.0]}, "view"),
+        ({"turn": [0.0] * 4}, "rotation"),
+        ({"turn": [1.0]}, "rotation"),
     ],
 )
 def test_impossible_changes(wrong, why):

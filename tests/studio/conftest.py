@@ -1,9 +1,11 @@
 """A library, and a studio that serves it."""
 
 import http.client
+import io
 import json
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,10 @@ import torch
 from snowsplat.formats import write_gaussians
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.studio import job
+from snowsplat.studio import job, worker
 from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library
+from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.server import WebServer
 
 from ..browser import Page
@@ -93,6 +96,22 @@ def studio(library) -> Iterator[Studio]:
     app = studio_app(library, lambda: ["http://192.168.1.7:80/token/"])
     with WebServer(app, headers=policy) as server:
         yield Studio(library, server)
+
+
+@pytest.fixture
+def in_process(monkeypatch) -> None:
+    """Short tasks of the worker run in this process: a new one needs seconds to import torch."""
+
+    def work(*words: str | Path) -> dict[str, Any]:
+        printed = io.StringIO()
+        with redirect_stdout(printed):
+            worker.main([str(word) for word in words])
+        answer = json.loads(printed.getvalue().splitlines()[-1])
+        if "error" in answer:
+            raise UserError(answer["error"])
+        return answer
+
+    monkeypatch.setattr(job, "work", work)
 
 
 @pytest.fixture

@@ -45,9 +45,12 @@ def edit_of(removed: np.ndarray, **more) -> dict:
     return {"count": len(removed), "removed": base64.b64encode(bits).decode(), **more}
 
 
+@pytest.mark.usefixtures("in_process")
 def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     address = f"scenes/{finished.name}"
     original = (finished.made / "box.ply").read_bytes()
+    plan = {"keys": [[0.0, 0, -9, 0, 0, 0, 40, 1.5], [1.0, 0, -9, 0, 0, 0, 40, 1.5]]}
+    write_json(finished.plan, plan)
     changes = edit_of(np.arange(N) < 20, title=" Half\n a box ", scale=2.0)
     assert studio.ask(f"{address}/edit", "POST", changes) == (200, {"file": "box_edited.ply"})
     about = studio.ask(address)[1]
@@ -58,6 +61,8 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert studio.ask(f"{address}/exports/ply", "POST", {})[0] == 200
     assert len(read_gaussians(finished.exports / "Half a box.ply")) == N - 20
     assert (finished.made / "box.ply").read_bytes() == original
+    keys = json.loads(finished.plan.read_text())["keys"]
+    assert np.allclose(keys[1][:3], [2, 0, -18])  # of the larger scene
     assert studio.ask(f"{address}/edit", "DELETE") == (200, {"file": "box.ply"})
     about = studio.ask(address)[1]
     assert (about["edited"], about["state"]["result"]["gaussians"]) == (0, N)
@@ -66,6 +71,7 @@ def test_an_edit_is_stored_shown_and_taken_back(studio, finished):
     assert studio.ask(f"{address}/edit", "DELETE")[0] == 400
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_scene_is_renamed_and_removed(studio, finished):
     address = f"scenes/{finished.name}"
     assert studio.ask("scenes")[1][0]["picture"]
@@ -80,6 +86,7 @@ def test_a_scene_is_renamed_and_removed(studio, finished):
     assert studio.ask("scenes") == (200, [])
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
     file = of_the_command_line(studio.library.folder / "tour")
     write_json(file.parents[2] / "metrics.json", {"split": "test", "psnr": 27.5})
@@ -106,6 +113,7 @@ def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
     assert file.is_file()
 
 
+@pytest.mark.usefixtures("in_process")
 def test_hostile_changes(studio, finished):
     address = f"scenes/{finished.name}/edit"
     nothing = np.zeros(N, bool)
@@ -150,6 +158,8 @@ def test_undo_returns_the_same_bytes():
     random = np.random.default_rng(0)
     count = 77
     found = [random.integers(0, 2, count).tolist() for _ in range(3)]
+    half = [0.5**0.5, 0.0, 0.5**0.5, 0.0]  # 90° about y
+    floor, eye = [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 2.0]], [-1.0, 3.0, 0.5]
     calls = [
         ["select", found[0], "replace"],
         ["select", found[1], "add"],
@@ -161,6 +171,11 @@ def test_undo_returns_the_same_bytes():
         *[["redo"]] * 6,
         ["undo"],
         ["select", found[0], "remove"],  # the same as before: the future is another one
+        ["redo"],
+        ["turnBy", half],
+        ["turnBy", half],
+        ["undo"],
+        ["undo"],
         ["redo"],
     ]
     centers = random.normal(size=(count, 3))
@@ -176,6 +191,8 @@ def test_undo_returns_the_same_bytes():
         "width": 8,
         "height": 6,
         "box": box,
+        "floor": floor,
+        "eye": eye,
     }
     script = Path(__file__).parents[1] / "node" / "selection.mjs"
     answer = json.loads(
@@ -195,7 +212,15 @@ def test_undo_returns_the_same_bytes():
     # The last call changed nothing: it is no step. So the sixth undo has nothing left.
     assert states[6:12] == [*states[3::-1], [0] * count, [0] * count]
     assert states[12:18] == [*states[:5], states[4]]
-    assert states[18:] == [states[3], states[3], states[4]]
+    assert states[18:21] == [states[3], states[3], states[4]]
+    assert states[21:] == 5 * [states[4]]
+    straight, once, twice = answer["turns"][20:23]
+    assert (straight, once) == ([1, 0, 0, 0], half)
+    assert np.allclose(twice, [0, 0, 1, 0])
+    assert answer["turns"][23:] == [once, straight, once]  # the same bits
+    level = np.array(answer["level"])
+    assert np.ptp(level[:, 1]) < 1e-12
+    assert level[0, 1] < eye[1]  # the eye is above
     bits = np.frombuffer(base64.b64decode(answer["deleted"]), np.uint8)
     assert np.unpackbits(bits, bitorder="little")[:count].tolist() == deleted.tolist()
     clip = np.float32(centers) @ matrix[:, :3].T + matrix[:, 3]
@@ -238,6 +263,16 @@ def test_lasso_delete_undo_delete_save(studio, finished):
         for kind in ("rawKeyDown", "keyUp"):
             page.call("Input.dispatchKeyEvent", type=kind, key="Delete", code="Delete")
         assert counts(page) == f"0 selected, {selected} deleted"
+        # A turn is seen, and undone exactly.
+        pose = (
+            "JSON.stringify([...sse.viewer.app.root.findByName('gsplat').getWorldTransform().data])"
+        )
+        straight = page.evaluate(pose)
+        press(page, "Level and turn")
+        press(page, "+90°")
+        assert page.evaluate(pose) != straight
+        press(page, "Undo")
+        assert page.evaluate(pose) == straight
         press(page, "Start with this view")
         page.evaluate("window.old = true")
         press(page, "Save")

@@ -34,7 +34,6 @@ from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import make_parent
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, made_on
-from snowsplat.viewer.web.scene import ready
 
 logger = logging.getLogger(__name__)
 
@@ -264,5 +263,4 @@ def _decimation(
 def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
     """Write an HTML page, with the cameras and the background of its training if they are known."""
     shown, about = viewable(source, scene), Description(target.stem, made=made_on(source))
-    page = ready(shown.gaussians, shown.cameras, shown.background, shown.start)
-    write_html(target, page, about)
+    write_html(target, shown.ready(), about)

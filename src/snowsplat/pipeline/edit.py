@@ -19,15 +19,14 @@ from snowsplat.pipeline.output.edit_record import (
     record_file,
     write_record,
 )
-from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.pipeline.output.scene_source import load_viewable, moved_origin
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
-from snowsplat.viewer.web.panel import numbers_of, view_of_page
+from snowsplat.viewer.web.panel import numbers_of, rotation_of_page, view_of_page
 from snowsplat.viewer.web.publication import SCENE
-from snowsplat.viewer.web.scene import viewing_frame
 
 # SOG stores positions in steps. They differ from those of the scene by at most half of one, and
 # float32 numbers by this share.
@@ -55,8 +54,8 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     """
     scene = Path(scene)
     source = load_viewable(scene)
-    change = viewing_frame(source.gaussians, source.cameras)[0]
-    moved = source.gaussians if change is None else transform(source.gaussians, change)
+    frame = source.frame()
+    moved = transform(source.gaussians, frame)
     rows = _rows_of_page(scene, moved, Path(site))
     if len(rows) != changes.count:
         raise OtherScene(f"the page has {changes.count} Gaussians, the scene has {len(rows)}")
@@ -68,24 +67,30 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     if removed.all():
         raise UserError("nothing would be left of the scene; keep some of it")
     kept = source.gaussians.select(torch.from_numpy(~removed))
-    larger = replace(Similarity.identity(), scale=changes.scale)
+    before = read_record(scene) or EditRecord(scene.name, 0)
+    change, turn = replace(Similarity.identity(), scale=changes.scale), before.turn
+    if changes.turn is not None:
+        # The world of the edited scene is upright as its page.
+        rotation = rotation_of_page(changes.turn) @ frame.rotation
+        change = replace(change, rotation=rotation)
+        quat, already = quat_from_rotation(rotation), turn or [1.0, 0.0, 0.0, 0.0]
+        turn = quat_product(quat, torch.tensor(already, dtype=torch.float64)).tolist()
+    if changes.scale != 1 or changes.turn is not None:
+        kept = replace(transform(kept, change), origin=moved_origin(kept.origin, change))
     if changes.scale != 1:
-        x, y, z = kept.origin
-        moved_to = changes.scale * x, changes.scale * y, changes.scale * z
         # The page asks for the true distance in metres, so a unit is a metre now.
-        kept = replace(transform(kept, larger), origin=moved_to, metres_per_unit=1.0)
-    back = Similarity.identity() if change is None else change.inverse()
+        kept = replace(kept, metres_per_unit=1.0)
+    back = frame.inverse()
 
     def in_scene(view: list[float]) -> list[float]:
-        return numbers_of(view_of_page(view).transformed(back).transformed(larger))
+        return numbers_of(view_of_page(view).transformed(back).transformed(change))
 
-    start = None if source.start is None else numbers_of(source.start.transformed(larger))
-    notes = [replace(n, view=numbers_of(v.transformed(larger))) for n, v in source.notes]
+    start = None if source.start is None else numbers_of(source.start.transformed(change))
+    notes = [replace(n, view=numbers_of(v.transformed(change))) for n, v in source.notes]
     if changes.start is not None:
         start = in_scene(changes.start)
     if changes.notes is not None:
         notes = [replace(note, view=in_scene(note.view)) for note in changes.notes]
-    before = read_record(scene) or EditRecord(scene.name, 0)
     record = replace(
         before,
         removed=before.removed + int(removed.sum()),
@@ -93,6 +98,7 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         title=changes.title or before.title,
         start=start,
         notes=tuple(notes),
+        turn=turn,
     )
     target = edited_file(scene)
     with atomic_path(target) as temporary:

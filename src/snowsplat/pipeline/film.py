@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,14 +12,14 @@ from torch import Tensor
 from snowsplat import trajectory
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.output.edit_record import read_record
 from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.pipeline.output.scene_source import change_of, load_viewable
 from snowsplat.pipeline.videos import VideoOptions, render_video
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.geometry import Similarity
-from snowsplat.viewer.web.panel import view_of_page
-from snowsplat.viewer.web.scene import viewing_frame
+from snowsplat.viewer.web.panel import view_numbers, view_of_page
 
 _PREVIEW = 10.0  # cameras per second
 _MOST = 600  # cameras of a preview
@@ -46,11 +47,40 @@ def film(
         UserError: the scene is missing or damaged, or all keys are the same.
         KeyboardInterrupt: Ctrl-C; an earlier film is kept.
     """
-    cameras, _, _ = _keys(Path(scene), plan)
-    write_cameras(Path(keys), ((str(i), camera) for i, camera in enumerate(cameras)))
+    write_keys(scene, plan, keys)
     options = VideoOptions(path=str(keys), seconds=plan.seconds, size=plan.size, ease=plan.ease)
     (file,) = render_video(scene, options, target=target, compute=compute, observer=observer)
     return file
+
+
+def write_keys(scene: Path | str, plan: PageFilm, keys: Path | str) -> None:
+    """Write the keys of a film as a camera list in the world of the scene; see `film`."""
+    cameras, _, _ = _keys(Path(scene), plan)
+    write_cameras(Path(keys), ((str(i), camera) for i, camera in enumerate(cameras)))
+
+
+def page_frames(scene: Path | str) -> list[Similarity]:
+    """The transforms, one after the other, from the world of a scene as it was made, before all
+    edits, to the frame of its page.
+
+    Raises: UserError: the scene is missing or damaged.
+    """
+    record = read_record(Path(scene))
+    edits = [] if record is None else [change_of(record)]
+    return [*edits, load_viewable(scene).frame()]
+
+
+def moved_film(plan: PageFilm, before: list[Similarity], after: list[Similarity]) -> PageFilm:
+    """The plan with its keys at the same places of a scene whose page has another frame; see
+    `page_frames`."""
+    changes = [*(change.inverse() for change in reversed(before)), *after]
+    keys = []
+    for key in plan.keys:
+        view = view_of_page(key)
+        for change in changes:
+            view = view.transformed(change)
+        keys.append([*view_numbers(view, view.aspect), view.aspect])
+    return replace(plan, keys=keys)
 
 
 def film_preview(scene: Path | str, plan: PageFilm) -> list[list[float]]:
@@ -65,19 +95,15 @@ def film_preview(scene: Path | str, plan: PageFilm) -> list[list[float]]:
     distance = trajectory.viewing_distance(cameras, means)
     count = max(2, min(_MOST, round(plan.seconds * _PREVIEW)))
     path = trajectory.key_path(cameras, count, distance, ease=plan.ease)
-    if change is not None:
-        path = [camera.transformed(change) for camera in path]
-    return [_in_page(camera) for camera in path]
+    return [_in_page(camera.transformed(change)) for camera in path]
 
 
-def _keys(scene: Path, plan: PageFilm) -> tuple[Sequence[Camera], Tensor, Similarity | None]:
+def _keys(scene: Path, plan: PageFilm) -> tuple[Sequence[Camera], Tensor, Similarity]:
     """The key cameras in the world of the scene, its means (N, 3), and the change to the page."""
     source = load_viewable(scene)
-    change = viewing_frame(source.gaussians, source.cameras)[0]
-    cameras = [view_of_page(key).camera(*plan.pixels()) for key in plan.keys]
-    if change is not None:
-        back = change.inverse()
-        cameras = [camera.transformed(back) for camera in cameras]
+    change = source.frame()
+    back = change.inverse()
+    cameras = [view_of_page(key).camera(*plan.pixels()).transformed(back) for key in plan.keys]
     closed = cameras[:1] if plan.loop else []
     return [*cameras, *closed], source.gaussians.means, change
 

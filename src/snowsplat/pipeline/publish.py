@@ -97,11 +97,10 @@ def publish(
         place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
         observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
-    what = source.gaussians, source.cameras, source.background, about, url
     large = len(source.gaussians) > _LARGE
     write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):
-        write_site(folder, *what, write, source.start, source.annotations())
+        write_site(folder, source.ready(), about, url, write)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     return PublishResult(folder, len(source.gaussians), size)
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from snowsplat.pipeline.output.edit_record import read_record
 from snowsplat.pipeline.output.scene_paths import folder_around
+from snowsplat.pipeline.output.scene_source import change_of
 from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.length import metres_of
 from snowsplat.util.errors import SettingError
 from snowsplat.util.safe_json import quoted
@@ -75,15 +77,15 @@ def _point(text: str) -> np.ndarray | None:
 
 
 def _positions(scene: Path) -> dict[str, np.ndarray]:
-    """The positions (3,) of the photos of the training of ``scene``, at the scale of this file."""
+    """The positions (3,) of the photos of the training of ``scene``, in the world of this file."""
     record = read_record(scene)
     original = scene.with_name(Path(record.scene).name) if record else scene
     file = folder_around(original).path / "cameras.json"
     if not file.is_file():
         return {}
     names, cameras = read_cameras(file)
-    scale = record.scale if record else 1.0
-    positions = (scale * camera.position.numpy() for camera in cameras)
+    change = change_of(record) if record else Similarity.identity()
+    positions = (change.apply(camera.position).numpy() for camera in cameras)
     return dict(zip(names, positions, strict=True))
 
 

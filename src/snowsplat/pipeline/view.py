@@ -19,7 +19,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.served_file import Served
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import PAGE, is_site, site_files
-from snowsplat.viewer.web.scene import site
+from snowsplat.viewer.web.scene import ready, site
 
 #: Larger scenes are shown in levels of detail. The viewer never draws more Gaussians at a time.
 _LARGE = 4_000_000
@@ -59,17 +59,16 @@ def viewed_scene(
         coarse = read_lod(index, len(counts) - 1).to_gaussians()
         _check(index, coarse)
         about = Description(title, made=made_on(index))
-        page = site(about, coarse, [], (0.0, 0.0, 0.0), lambda _: index, counts[0])
+        page = site(about, ready(coarse, [], turn=False), lambda _: index, counts[0])
         yield ViewedScene(index, counts[0], *page)
         return
     with observer.waiting("reading"):
         scene = load_viewable(path, iteration)
     _check(scene.file, scene.gaussians)
     about = Description(title, made=made_on(scene.file))
-    what = about, scene.gaussians, scene.cameras, scene.background
     if len(scene.gaussians) <= _LARGE:
         with observer.waiting("preparing"):
-            page = site(*what, start=scene.start, notes=scene.annotations())
+            page = site(about, scene.ready())
         yield ViewedScene(scene.file, len(scene.gaussians), *page)
         return
     with TemporaryDirectory(prefix="snowsplat-levels-") as folder:
@@ -81,7 +80,7 @@ def viewed_scene(
             return target
 
         with observer.waiting("preparing"):
-            page = site(*what, levels, start=scene.start, notes=scene.annotations())
+            page = site(about, scene.ready(), levels)
         yield ViewedScene(scene.file, len(scene.gaussians), *page)
 
 

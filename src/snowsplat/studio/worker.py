@@ -22,6 +22,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from snowsplat.pipeline.cameras_from_above import cameras_from_above
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
-from snowsplat.pipeline.film import film, film_preview
+from snowsplat.pipeline.film import film, film_preview, moved_film, page_frames, write_keys
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
@@ -50,9 +51,9 @@ from snowsplat.studio.hand_on import export_file
 from snowsplat.studio.library import TASKS, Scene, safe_title
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path, write_text
+from snowsplat.util.files import atomic_path, write_json, write_text
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.safe_json import from_json, printable, read_json
+from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.util.stages import Outcome
 
 _PAUSE = 1.0  # seconds between two files of the state
@@ -261,6 +262,11 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
     Raises: UserError: the scene is not finished, or the page does not show it.
     """
     file = _finished(scene)
+    # A film that was planned is that of the scene as it is then.
+    plan = None
+    with suppress(OSError, ValueError):  # there is none
+        plan = _plan(scene)
+    before = page_frames(file) if plan else []
     if undo:
         file = undo_edits(file)
     else:
@@ -272,6 +278,11 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
             raise UserError(f"{error}. Open the page anew, then edit it") from None
         if changes.title:
             scene.change(title=safe_title(changes.title))
+    if plan:
+        plan = moved_film(plan, before, page_frames(file))
+        write_json(scene.plan, asdict(plan))
+        if is_file(scene.keys):
+            write_keys(file, plan, scene.keys)
     return show_scene(scene)
 
 

@@ -59,9 +59,12 @@ class EditRecord:
         start: the initial view in the world of the edited scene: position, target, field of view in
             degrees, aspect (`InitialView`); None: not chosen.
         notes: annotations, whose views are in the world of the edited scene.
+        turn: a person has turned the scene upright, −y is up: the rotation from the world of the
+            other scene, about its origin, as a quaternion wxyz. None: not turned by a person.
 
     Raises:
-        ValueError: the scale is not positive, the view is none, or there are too many annotations.
+        ValueError: the scale is not positive, the view or the rotation is none, or there are too
+            many annotations.
     """
 
     scene: str
@@ -70,8 +73,11 @@ class EditRecord:
     title: str = ""
     start: list[float] | None = None
     notes: tuple[Note, ...] = ()
+    turn: list[float] | None = None
 
     def __post_init__(self) -> None:
+        if self.turn is not None and not is_rotation(self.turn):
+            raise ValueError("the rotation is none")
         if not 0 < self.scale < math.inf:
             raise ValueError(f"the scale {self.scale} is not positive")
         if self.start is not None and not is_view(self.start):
@@ -96,6 +102,8 @@ class PageEdit:
             measure, in the frame of the page; the largest distance from it and the largest size
             (standard deviation of the longest axis) that they show. None: they do not count.
         notes: all annotations, whose views are in the frame of the page; None: as they are.
+        turn: the rotation by which a person turns the scene in the viewer, whose y axis points up,
+            as a quaternion wxyz. Views and places are those before it. None: not turned.
 
     Raises:
         ValueError: the number of bits, the scale, a view or a limit is not possible.
@@ -108,10 +116,11 @@ class PageEdit:
     start: list[float] | None = None
     hidden: tuple[float, float, float, float, float] | None = None
     notes: tuple[Note, ...] | None = None
+    turn: list[float] | None = None
 
     def __post_init__(self) -> None:
         # This checks these values.
-        EditRecord("", 0, self.scale, self.title, self.start, self.notes or ())
+        EditRecord("", 0, self.scale, self.title, self.start, self.notes or (), self.turn)
         if self.hidden is not None and not min(self.hidden[3:]) > 0:
             raise ValueError("the sliders hide everything")
         if not 1e-9 < self.scale < 1e9:
@@ -133,6 +142,11 @@ def is_view(numbers: list[float]) -> bool:
         return False
     *points, fov, aspect = numbers
     return points[:3] != points[3:] and 0 < fov < 180 and aspect > 0
+
+
+def is_rotation(numbers: list[float]) -> bool:
+    """Whether these are a unit quaternion."""
+    return len(numbers) == 4 and math.isclose(math.hypot(*numbers), 1.0, rel_tol=1e-6)
 
 
 def edited_file(scene: Path) -> Path:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
+import torch
 
 from snowsplat.data import Dataset
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.output.edit_record import Note, read_record
+from snowsplat.pipeline.output.edit_record import EditRecord, Note, read_record
 from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.output.scene_paths import (
     existing_folder,
@@ -25,9 +25,11 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.geometry import Similarity
+from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
+from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
+from snowsplat.viewer.web.scene import ReadyScene, ready, viewing_frame
 from snowsplat.viewer.web.viewer_page import Annotation
 
 Color = tuple[float, float, float]
@@ -132,10 +134,18 @@ class ViewableScene:
     background: Color
     start: InitialView | None = None  # the initial view; None: not chosen
     notes: Sequence[tuple[Note, InitialView]] = ()  # annotations, and the views that show them
+    turned: bool = False  # a person has turned it upright: −y is up
 
-    def annotations(self) -> list[Annotation]:
-        """The annotations for a page."""
-        return [Annotation(note.title, note.text, view) for note, view in self.notes]
+    def ready(self) -> ReadyScene:
+        """The scene for a page."""
+        notes = [Annotation(note.title, note.text, view) for note, view in self.notes]
+        what = self.gaussians, self.cameras, self.background, self.start, notes
+        return ready(*what, turn=not self.turned)
+
+    def frame(self) -> Similarity:
+        """The transform to the frame of its page."""
+        change, _ = viewing_frame(self.gaussians, self.cameras, turn=not self.turned)
+        return change or Similarity.identity()
 
 
 def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
@@ -169,7 +179,7 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
 def viewable(file: Path, gaussians: Gaussians) -> ViewableScene:
     """The scene of a file, with the cameras and the background of its training if it is known.
 
-    An edited scene has the cameras of the other scene, at its scale.
+    An edited scene has the cameras of the other scene, at its scale, turned with it.
     """
     record = read_record(file)
     if record is None:
@@ -178,13 +188,28 @@ def viewable(file: Path, gaussians: Gaussians) -> ViewableScene:
         return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
     folder = folder_around(file.with_name(Path(record.scene).name))
     origin = folder.origin()
-    at_scale = None if origin is None else (np.array(origin) * record.scale).tolist()
-    gaussians = seen_from_dataset(gaussians, at_scale and tuple(at_scale))
-    larger = replace(Similarity.identity(), scale=record.scale)
-    cameras = [camera.transformed(larger) for camera in cameras_of(folder)]
+    change = change_of(record)
+    gaussians = seen_from_dataset(gaussians, origin and moved_origin(origin, change))
+    cameras = [camera.transformed(change) for camera in cameras_of(folder)]
     start = None if record.start is None else _view(record.start)
     notes = [(note, _view(note.view)) for note in record.notes]
-    return ViewableScene(file, gaussians, cameras, background_of(folder), start, notes)
+    turned = record.turn is not None
+    return ViewableScene(file, gaussians, cameras, background_of(folder), start, notes, turned)
+
+
+def change_of(record: EditRecord) -> Similarity:
+    """The transform from the world of the scene that was edited to that of the edited scene."""
+    same = Similarity.identity()
+    if record.turn is None:
+        return replace(same, scale=record.scale)
+    quat = torch.tensor(record.turn, dtype=torch.float64)
+    return replace(same, scale=record.scale, rotation=rotation_from_quat(quat))
+
+
+def moved_origin(origin: Origin, change: Similarity) -> Origin:
+    """The place of an origin in the new world of ``change``."""
+    x, y, z = change.apply(torch.tensor(origin, dtype=torch.float64)).tolist()
+    return x, y, z
 
 
 def _view(numbers: Sequence[float]) -> InitialView:

@@ -4,9 +4,11 @@
 import { ask, make, Refused } from "./page.js";
 import { bounds, DELETED, outside, project, SELECTED, Selection, times, within } from "./selection.js";
 import { say } from "./text.js";
+import { about, inverse, levelling, product, turned, UNTURNED } from "./turning.js";
 
 const BRUSH = 24; // its radius at first, in CSS pixels
 const AXES = ["x", "y", "z"];
+const FINE = 15; // degrees to both sides of a slider
 const MOST_NOTES = 25; // the limit of the viewer
 // The engine copies the Gaussians into a buffer before it draws them; this code changes the copies.
 const STREAM = "snowState";
@@ -62,7 +64,9 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     /** @type {number[] | null} */
     let start = null;
     /** @type {number[][]} */
-    let measured = []; // at most two points of the world of the page
+    let measured = []; // at most two points
+    /** @type {number[][]} */
+    let floor = []; // at most two points
     /** @type {number[][]} */
     let stroke = []; // points of the window, CSS pixels
     /** @type {{title: string, text: string, view: number[]}[]} */
@@ -74,12 +78,28 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     const [low, high] = bounds(centers);
     const box = [[...low], [...high]];
 
+    // The scene turns about its middle, as the sliders of the page measure from there. Points that are
+    // kept are those of the world before the scene is turned.
+    const middle = scene.subject.slice(0, 3);
+    const placed = (/** @type {number[]} */ point) => turned(selection.turn, point, middle);
+    const unplaced = (/** @type {number[]} */ point) => turned(inverse(selection.turn), point, middle);
+    const isTurned = () => Math.abs(selection.turn[0]) < 1 - 1e-12;
+    /** Shows the scene as it is turned, and further. */
+    function place(/** @type {number[]} */ further) {
+        const turn = product(further, selection.turn);
+        const [w, x, y, z] = product(turn, [0, 0, 0, 1]); // the viewer has turned it by 180°
+        entity.setLocalRotation(x, y, z, w);
+        entity.setLocalPosition(...turned(turn, [0, 0, 0], middle));
+        viewer.app.renderNextFrame = true;
+    }
+
     // The picture
 
     const { resource } = app.assets.get(entity.gsplat.asset);
     let shown = selection.state;
     function show() {
         const { gsplat } = entity;
+        place(UNTURNED);
         if (shown !== selection.state) {
             resource.format.addExtraStreams([{ name: STREAM, format: R8U, storage: OF_INSTANCE }]);
             const texture = gsplat.getInstanceTexture(STREAM);
@@ -101,7 +121,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     const hidden = () => (hides.checked ? hiding.limits() : null);
     const haveNotesChanged = () => JSON.stringify(notes) !== notesBefore;
     const isChanged = () =>
-        Boolean(start || scale !== 1 || title.value.trim() !== scene.title || selection.count(DELETED) || hidden() || haveNotesChanged());
+        Boolean(start || scale !== 1 || isTurned() || title.value.trim() !== scene.title || selection.count(DELETED) || hidden() || haveNotesChanged());
     const change = (/** @type {(event?: any) => void} */ run) => (/** @type {any} */ event = undefined) => {
         run(event);
         show();
@@ -141,11 +161,13 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
             drawing.fillStyle = drawing.strokeStyle = "#ffb45466";
             trace(drawing);
         }
-        if (tool === "note") notes.forEach(({ view }, i) => mark(view.slice(3, 6), String(i + 1)));
+        if (tool === "note") notes.forEach(({ view }, i) => mark(placed(view.slice(3, 6)), String(i + 1)));
+        if (tool === "level") floor.forEach((point, i) => mark(placed(point), String(i + 1)));
         if (tool === "box") lines(model(), edges(), width, height);
         if (tool === "measure") {
-            lines(world(), measured.length === 2 ? [measured] : [], width, height);
-            for (const point of measured) mark(point, "");
+            const points = measured.map(placed);
+            lines(world(), points.length === 2 ? [points] : [], width, height);
+            for (const point of points) mark(point, "");
         }
     }
 
@@ -208,7 +230,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     async function surface(/** @type {number} */ x, /** @type {number} */ y) {
         const found = await picker?.pickSurface(x / canvas.clientWidth, y / canvas.clientHeight);
         tell(found ? "" : say("edit_no_surface"));
-        return found ? [found.position.x, found.position.y, found.position.z] : null;
+        return found ? unplaced([found.position.x, found.position.y, found.position.z]) : null;
     }
 
     async function measure(/** @type {number} */ x, /** @type {number} */ y) {
@@ -221,10 +243,24 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     async function annotate(/** @type {number} */ x, /** @type {number} */ y) {
         const point = await surface(x, y);
         if (!point || notes.length >= MOST_NOTES) return;
-        const [u, v, w, , , , fov] = presentView();
-        notes.push({ title: say("edit_note_new", notes.length + 1), text: "", view: [u, v, w, ...point, fov, scene.aspect] });
+        const view = presentView();
+        notes.push({ title: say("edit_note_new", notes.length + 1), text: "", view: [...unplaced(view.slice(0, 3)), ...point, view[6], scene.aspect] });
         listNotes();
         show();
+    }
+
+    /** The third point of a floor makes it level. */
+    async function level(/** @type {number} */ x, /** @type {number} */ y) {
+        const point = await surface(x, y);
+        if (!point) return;
+        floor.push(point);
+        if (floor.length < 3) return draw();
+        const turn = levelling(floor.map(placed), presentView().slice(0, 3));
+        floor = [];
+        if (turn) selection.turnBy(turn);
+        else tell(say("edit_on_a_line"));
+        show();
+        draw();
     }
 
     function listNotes() {
@@ -263,6 +299,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         event.preventDefault();
         if (tool === "measure") measure(event.offsetX, event.offsetY);
         else if (tool === "note") annotate(event.offsetX, event.offsetY);
+        else if (tool === "level") level(event.offsetX, event.offsetY);
         else {
             overlay.setPointerCapture(event.pointerId);
             stroke = [[event.offsetX, event.offsetY]];
@@ -293,7 +330,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         const mark = (/** @type {string} */ chosen) => buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
         return { buttons, mark };
     };
-    const tools = choices(["rectangle", "lasso", "brush", "box", "measure", "note"], name => choose(tool === name ? "" : name));
+    const tools = choices(["rectangle", "lasso", "brush", "box", "measure", "note", "level"], name => choose(tool === name ? "" : name));
     const modes = choices(["replace", "add", "remove"], name => modes.mark((mode = name)));
     function choose(/** @type {string} */ name) {
         tool = name;
@@ -305,6 +342,8 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         forBox.hidden = name !== "box";
         forMeasure.hidden = name !== "measure";
         forNotes.hidden = name !== "note";
+        forLevel.hidden = name !== "level";
+        floor = [];
     }
 
     const radius = /** @type {HTMLInputElement} */ (make("input", { type: "range", min: 4, max: 120, value: BRUSH }));
@@ -336,6 +375,22 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     const forMeasure = make("div.snow-buttons", {}, measure_, truth, rescale, size);
     const noteList = make("div");
     const forNotes = make("div", {}, make("p", {}, say("edit_note_how")), noteList);
+    const turns = AXES.map((axis, k) => {
+        const by = (/** @type {number} */ degrees) =>
+            make("button", { type: "button", "aria-label": say("edit_turn", axis, degrees), click: change(() => selection.turnBy(about(k, degrees))) }, `${degrees > 0 ? "+" : "−"}90°`);
+        const fine = /** @type {HTMLInputElement} */ (
+            make("input", {
+                type: "range", min: -FINE, max: FINE, step: "any", value: 0, "aria-label": say("edit_turn_fine", axis),
+                input: () => place(about(k, Number(fine.value))),
+                change: change(() => {
+                    if (Number(fine.value)) selection.turnBy(about(k, Number(fine.value)));
+                    fine.value = "0";
+                }),
+            })
+        );
+        return make("div.snow-turn", {}, make("b", {}, axis), by(-90), fine, by(90));
+    });
+    const forLevel = make("div", {}, make("p", {}, say("edit_level_how")), ...turns);
     const hides = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: change(() => {}) }));
     const remove = button("edit_delete", change(() => selection.delete()));
     const undo = button("edit_undo", change(() => selection.undo()));
@@ -343,7 +398,8 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     const counts = make("p", { role: "status" });
     const title = /** @type {HTMLInputElement} */ (make("input", { type: "text", maxlength: 80, value: scene.title, "aria-label": say("title_label"), input: change(() => {}) }));
     const view = button("edit_start", change(() => {
-        start = [...presentView(), scene.aspect];
+        const seen = presentView();
+        start = [...unplaced(seen.slice(0, 3)), ...unplaced(seen.slice(3, 6)), seen[6], scene.aspect];
         tell(say("edit_start_set"));
     }));
     const told = make("p", { role: "status" });
@@ -377,6 +433,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
             start,
             hidden: hidden(),
             notes: haveNotesChanged() ? notes : null,
+            turn: isTurned() ? selection.turn : null,
         });
     });
     const back = button("edit_back", () => {
@@ -397,6 +454,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         forBox,
         forMeasure,
         forNotes,
+        forLevel,
         make("label.snow-check", {}, hides, say("edit_hides")),
         row(remove, undo, redo),
         counts,

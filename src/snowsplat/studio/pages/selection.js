@@ -1,5 +1,7 @@
-// Which Gaussians are selected or deleted: a byte per Gaussian, and what undoes a change. Matrices
-// are column by column, as the engine has them.
+// Which Gaussians are selected or deleted: a byte per Gaussian; how the scene is turned, a quaternion
+// wxyz; and what undoes a change. Matrices are column by column, as the engine has them.
+
+import { product, UNTURNED } from "./turning.js";
 
 export const SELECTED = 1;
 export const DELETED = 2;
@@ -84,20 +86,29 @@ export class Selection {
     constructor(count) {
         /** @type {Uint8Array} */
         this.state = new Uint8Array(count);
-        /** @type {Uint8Array[]} */
+        this.turn = UNTURNED;
+        /** @type {[Uint8Array, number[]][]} */
         this.past = [];
-        /** @type {Uint8Array[]} */
+        /** @type {[Uint8Array, number[]][]} */
         this.future = [];
     }
 
     /** Changes the state; a change of nothing is no step. */
     #change(/** @type {(byte: number, i: number) => number} */ changed) {
         const next = this.state.map(changed);
-        if (next.every((byte, i) => byte === this.state[i])) return;
-        this.past.push(this.state);
+        if (!next.every((byte, i) => byte === this.state[i])) this.#step(next, this.turn);
+    }
+
+    #step(/** @type {Uint8Array} */ state, /** @type {number[]} */ turn) {
+        this.past.push([this.state, this.turn]);
         if (this.past.length > STEPS) this.past.shift();
         this.future.length = 0;
-        this.state = next;
+        [this.state, this.turn] = [state, turn];
+    }
+
+    /** Turns the scene further. */
+    turnBy(/** @type {number[]} */ quaternion) {
+        this.#step(this.state, product(quaternion, this.turn));
     }
 
     /**
@@ -129,11 +140,11 @@ export class Selection {
         this.#go(this.future, this.past);
     }
 
-    #go(/** @type {Uint8Array[]} */ from, /** @type {Uint8Array[]} */ to) {
+    #go(/** @type {[Uint8Array, number[]][]} */ from, /** @type {[Uint8Array, number[]][]} */ to) {
         const next = from.pop();
         if (!next) return;
-        to.push(this.state);
-        this.state = next;
+        to.push([this.state, this.turn]);
+        [this.state, this.turn] = next;
     }
 
     /** @param {number} value SELECTED or DELETED */

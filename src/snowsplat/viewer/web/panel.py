@@ -13,6 +13,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.viewer.web.hiding import Hiding
 from snowsplat.viewer.web.stops import Stops
@@ -53,6 +57,13 @@ def view_of_page(numbers: Sequence[float]) -> InitialView:
     """The view of such numbers, and its aspect; the inverse of `view_numbers`."""
     x, y, z, u, v, w, fov, aspect = numbers
     return InitialView((-x, -y, z), (-u, -v, w), fov, aspect)
+
+
+def rotation_of_page(quat: Sequence[float]) -> Tensor:
+    """(3, 3) float64: the rotation of a quaternion wxyz of the viewer, in the frame of the page;
+    see `view_numbers`."""
+    w, x, y, z = quat
+    return rotation_from_quat(torch.tensor([w, -x, -y, z], dtype=torch.float64))
 
 
 def numbers_of(view: InitialView) -> list[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -14,15 +14,13 @@ from snowsplat.formats import GaussianArrays
 from snowsplat.formats.lod import INDEX
 from snowsplat.formats.lod_writer import remove_lod
 from snowsplat.formats.sog import write_sog
-from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.initial_view import InitialView
 from snowsplat.scene.render import render
 from snowsplat.util.files import atomic_path, write_text
 from snowsplat.viewer.http.served_file import Served, served
 from snowsplat.viewer.web.panel import Description
-from snowsplat.viewer.web.scene import PICTURES, ReadyScene, ready
-from snowsplat.viewer.web.viewer_page import Annotation, asset, content_policy, page
+from snowsplat.viewer.web.scene import PICTURES, ReadyScene
+from snowsplat.viewer.web.viewer_page import asset, content_policy, page
 
 PAGE, SCENE, POSTER = "index.html", "scene.sog", "poster.jpg"
 #: The size that services recommend for the picture of a link (Open Graph).
@@ -38,31 +36,22 @@ def write_one_file(folder: Path, gaussians: Gaussians) -> str:
 
 def write_site(
     folder: Path,
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    background: Sequence[float],
+    scene: ReadyScene,
     about: Description,
     url: str = "",
     write_scene: Callable[[Path, Gaussians], str] = write_one_file,
-    start: InitialView | None = None,
-    notes: Sequence[Annotation] = (),
 ) -> None:
     """Write the page, its viewer, the scene and a picture into a folder.
 
     Args:
         folder: it must exist. Files of an earlier site are replaced.
-        cameras: the cameras of the photos; see `scene.ready`.
-        background: red, green, blue in 0..1.
         url: the address of the folder on the web, which ends in "/"; "" if it is not known yet.
             Services that show a preview of a link need it to find the picture.
         write_scene: writes the scene into the folder, and returns the name of the file to load.
-        start: the initial view; None: see `scene.ready`.
-        notes: annotations, whose views are in the world of the scene.
 
     Raises:
         OSError: a file cannot be written.
     """
-    scene = ready(gaussians, cameras, background, start, notes)
     content = write_scene(folder, scene.gaussians)
     if content == INDEX:
         scene = scene.complete()
@@ -75,12 +64,13 @@ def write_site(
         write_text(folder / name, asset(name))
     write_text(folder / "viewer-licence.txt", asset("LICENSE"))
     bootstrap = scene.bootstrap(about, f"./{PICTURES}")
+    facts = about.facts(len(scene.gaussians))
     bootstrap |= {"contentUrl": f"./{content}", "posterUrl": f"./{POSTER}"}
     tags = _tags(
         {
             "og:type": "website",
             "og:title": about.title,
-            "og:description": f"A scene in 3D: {about.facts(len(gaussians))}. Made with snowsplat.",
+            "og:description": f"A scene in 3D: {facts}. Made with snowsplat.",
             "og:image": url + POSTER,
             "og:image:width": str(POSTER_SIZE[0]),
             "og:image:height": str(POSTER_SIZE[1]),

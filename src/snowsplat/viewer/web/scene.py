@@ -50,24 +50,18 @@ _TOO_FAR = 30.0  # the same for an overview: a house in metres is walked through
 
 def site(
     about: Description,
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    background: Sequence[float],
+    scene: ReadyScene,
     levels: Callable[[Gaussians], Path] | None = None,
     count: int | None = None,
-    start: InitialView | None = None,
-    notes: Sequence[Annotation] = (),
 ) -> tuple[dict[str, Served], dict[str, str]]:
     """The files of a page that shows a scene, by name, and the HTTP headers for them.
 
-    The initial view is ``start``, or the first of ``cameras``, or an overview of the scene.
-
     ``levels`` returns the index (`lod-meta.json`) of levels of detail of a scene, which the page
-    loads instead of the complete scene. ``count``: the number of Gaussians, if ``gaussians`` is
-    only a coarse level. Then the levels stay as they are, and the page only scales them.
+    loads instead of the complete scene. ``count``: the number of Gaussians, if ``scene`` is only a
+    coarse level, `ready` without a turn. Then the levels stay as they are, and the page only scales
+    them.
     """
     in_place = count is not None
-    scene = ready(gaussians, cameras, background, start, notes, turn=not in_place)
     if levels is not None:
         scene = scene.complete()
     content = _content(scene.gaussians, levels)
@@ -156,7 +150,8 @@ def ready(
 ) -> ReadyScene:
     """The scene in a frame that suits the viewer, and views in that frame.
 
-    ``start``: the initial view; None: that of the first camera. ``turn``: see `viewing_frame`.
+    ``start``: the initial view; None: that of the first camera, or an overview. ``turn``: see
+    `viewing_frame`.
     """
     change, depth = viewing_frame(gaussians, cameras, turn=turn)
     metres = gaussians.metres_per_unit
@@ -186,12 +181,13 @@ def viewing_frame(
     In the viewer −y is up, and navigation has a fixed speed. If the cameras imply another up
     direction, or distances very different from `VIEWING_DISTANCE`, the scene is rotated and scaled.
     Without cameras, the surfaces may imply another up direction, and the distance is that of
-    the `overview`. Without ``turn`` (only without cameras), the scene is only scaled.
+    the `overview`. Without ``turn``, the scene is only scaled: a person has turned it upright, or
+    its files stay as they are.
     """
     if cameras:
         depth = _depth_ahead(gaussians, cameras[0])
         rotations = torch.stack([camera.cam_from_world[:, :3] for camera in cameras])
-        return _change(scene_up(rotations.numpy()), depth), depth
+        return _change(scene_up(rotations.numpy()) if turn else _UP, depth), depth
     up = up_of_surfaces(*_surfaces(gaussians)) if turn else None
     view = overview(gaussians)
     depth = math.dist(view.position, view.target)
