@@ -37,12 +37,6 @@ _OF_FOLDERS = {
     "viewer": "slow",
 }
 _QUICK = {"cli/test_main.py"}
-try:
-    from pxr import UsdVol
-
-    _USD = hasattr(UsdVol, "ParticleField3DGaussianSplat")
-except ImportError:
-    _USD = False
 _OF_FIXTURES = {"recorder": "build", "start": "slow"}
 
 
@@ -83,9 +77,11 @@ def pytest_sessionstart() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     from .browser import chromium
+    from .usd import USD
 
     given = item.callspec.params.values() if hasattr(item, "callspec") else ()
-    if any(each == ".usd" or getattr(each, "name", None) == "USD" for each in given) and not _USD:
+    names = {each if isinstance(each, str) else getattr(each, "name", None) for each in given}
+    if names & {".usd", "USD"} and not USD:
         pytest.skip("needs usd-core 26.3 or newer (pip install 'snowsplat[usd]')")
 
     if item.get_closest_marker("browser") and chromium() is None:

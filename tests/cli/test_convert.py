@@ -19,7 +19,9 @@ from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.simplify import simplify
 
-WRITTEN = [f.suffixes[0] for f in FORMATS if f.write]
+from ..usd import USD
+
+WRITTEN = [f.suffixes[0] for f in FORMATS if f.write and (USD or f.name != "USD")]
 READ_BACK = [f for f in FORMATS if f.write and f.read]
 
 

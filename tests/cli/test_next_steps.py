@@ -32,11 +32,10 @@ def test_commands_are_quoted():
 def test_words_that_are_no_subcommand(refused, scene, monkeypatch):
     assert "use convert (a file in another format) or publish" in refused("export")
     assert "publish" in refused("share")
-    assert "there are no meshes" in refused("Mesh")
+    assert "use points (a dense cloud), or mesh" in refused("pointcloud")
     assert f"snowsplat make {scene}; or: snowsplat info {scene}" in refused(scene)
     for hint, words in _WORDS.items():
-        named = re.match(r"use (\w+)|there are no meshes; (\w+)", hint)
-        assert (named[1] or named[2]) in SUBCOMMANDS
+        assert re.match(r"use (\w+)", hint)[1] in SUBCOMMANDS
         assert not set(words.split()) & set(SUBCOMMANDS)
 
 

@@ -310,6 +310,7 @@ def test_live_fit_of_a_dropped_picture(page, tmp_path):
     assert float(data(page, "fit", "psnr")) > 25
     # A file that is no picture is refused, and the fit goes on.
     (tmp_path / "no.png").write_text("no picture")
+    left, top = place(page, "fit", "canvas")  # the text above may have become longer
     dropped["files"] = [str(tmp_path / "no.png")]
     for kind in ("dragEnter", "dragOver", "drop"):
         page.call("Input.dispatchDragEvent", type=kind, x=left, y=top, data=dropped)

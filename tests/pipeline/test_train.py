@@ -217,7 +217,7 @@ def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
     assert result.left_out == ()
     assert not any("not explained" in note for note in recorder.notes)
     assert "left_out" not in json.loads((tmp_path / "metrics.json").read_text())
-    assert "does not explain" not in result.report.read_text()
+    assert "<h2>Photos that the scene does not explain" not in result.report.read_text()
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_a_training_that_ends_early_says_so_also_when_resumed(dataset, tmp_path,
 
     longer = resume(tmp_path / "out", TrainOptions(settings={"iterations": 205}))
     assert (longer.step, longer.ended_early) == (205, None)
-    assert "became worse" not in longer.report.read_text()
+    assert "<p>The training stopped" not in longer.report.read_text()
 
 
 def test_a_time_budget_does_not_lengthen_a_training_that_ends_early(dataset, tmp_path, monkeypatch):

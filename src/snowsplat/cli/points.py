@@ -11,7 +11,7 @@ from snowsplat.cli.surface_flags import SurfaceFlags
 
 @dataclass
 class Points(SurfaceFlags):
-    """Write a dense cloud of points on the surfaces, with normals and the colours of the photos.
+    """Write a dense cloud of points on the surfaces, with normals.
 
     Examples:
       snowsplat points out/garden -o garden.ply
@@ -19,8 +19,9 @@ class Points(SurfaceFlags):
       snowsplat points garden.spz --dataset garden -o garden.ply
 
     Notes:
-      There is about one point for each voxel of the surface. The suffix of FILE selects
-      the format: .ply, or .las and .laz, which need: pip install 'snowsplat[mesh]'
+      There is about one point for each voxel of the surface. The suffix of FILE
+      selects the format: .ply, or .las and .laz, which need a package:
+      pip install 'snowsplat[mesh]'
     """
 
     def run(self) -> int:

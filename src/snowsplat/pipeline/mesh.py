@@ -32,6 +32,8 @@ from snowsplat.util.process import single_threaded
 _MOST_PIXELS, _MOST_BLOCKS = 120_000_000, 100_000
 #: The side of a voxel, in widths of a pixel at the usual depth.
 _VOXEL_PIXELS = 2.0
+#: The smallest side: no two photos agree where the surface is more exactly.
+_SMALLEST_VOXEL = 0.2
 #: Surfaces that are farther away than this multiple of the usual depth are cut.
 _REACH = 3.0
 #: Parts of a mesh with a smaller share of the triangles of the largest part are removed.
@@ -240,12 +242,20 @@ def _usual_depth(maps: Sequence[DepthMap]) -> float:
     return float(np.median(medians))
 
 
+def _focal(maps: Sequence[DepthMap]) -> float:
+    return float(np.median([each.camera.fx for each in maps]))
+
+
 def _voxel(maps: Sequence[DepthMap], options: MeshOptions) -> tuple[float, np.ndarray, bool]:
     """The side of a voxel, the blocks near a surface, and whether memory has limited the former."""
     voxel = options.voxel
     if voxel is None:
-        focal = float(np.median([each.camera.fx for each in maps]))
-        voxel = _VOXEL_PIXELS * _usual_depth(maps) / focal
+        voxel = _VOXEL_PIXELS * _usual_depth(maps) / _focal(maps)
+    elif voxel < _SMALLEST_VOXEL * (pixel := _usual_depth(maps) / _focal(maps)):
+        raise UserError(
+            f"`voxel` is smaller than a fifth of a pixel of the photos; use at least "
+            f"{_SMALLEST_VOXEL * pixel:.3g}"
+        )
     keys = occupied_blocks(maps, voxel)
     limited = False
     while len(keys) > _MOST_BLOCKS:
@@ -266,7 +276,7 @@ def _cleaned(
     faces = faces[largest_parts(faces, len(vertices), options.parts)]
     vertices, faces, _ = compacted(vertices, faces)
     if not len(faces):
-        raise UserError("no surface was found; train longer, or use a smaller `voxel`")
+        raise UserError("no surface was found; train longer, or use another `voxel`")
     if options.fill_holes:
         vertices, faces = filled_holes(vertices, faces)
     if options.triangles is not None and options.triangles < len(faces):

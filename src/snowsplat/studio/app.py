@@ -404,6 +404,7 @@ class _Studio:
         except UnknownScene:
             page = None
         if page is None:
+            await socket.accept()  # a refusal would be an error in the console
             await socket.close()
         else:
             await relay_socket(socket, page)

@@ -38,11 +38,11 @@ async def relay_socket(browser: WebSocket, url: str) -> None:
     A message is read when the one before it is sent, so that neither can flood the other.
     """
     address = f"{url.replace('http', 'ws', 1)}live"
+    await browser.accept()
     try:
         async with connect(
             address, max_size=None, compression=None, proxy=None, open_timeout=_SECONDS
         ) as page:
-            await browser.accept()
             ways = [
                 asyncio.ensure_future(way) for way in (_to(page, browser), _from(page, browser))
             ]
