@@ -45,7 +45,7 @@
 
   figure("fit", async ({ element, controls, panels, status }) => {
     await Promise.all(["gaussians2d.js", "fitting2d.js", "picture-data.js"].map(load));
-    let worker = null, picture = null, latest = null, running = false, view = "image";
+    let worker = null, picture = null, latest = null, running = false, view = "image", problem = "";
     const pick = add(add(controls, "label", {}, `${t("Picture", "图片")} `), "input",
       { type: "file", accept: "image/*", name: "picture" });
     const most = choice(controls, "most", t("Gaussians", "高斯数"),
@@ -57,6 +57,7 @@
     const run = button(buttons, "run", "", () => {
       if (latest?.step === STEPS) return restart(), run.click();
       running = !running;
+      problem = "";
       label();
       worker.postMessage({ paused: !running });
     });
@@ -72,8 +73,9 @@
       try {
         bitmap = await createImageBitmap(source);
       } catch {
-        status.textContent = t("This file is not a picture that the browser can read; choose a JPEG, PNG or WebP file.",
+        problem = t("This file is not a picture that the browser can read; choose a JPEG, PNG or WebP file.",
           "浏览器无法读取这个文件；请选择 JPEG、PNG 或 WebP 图片。");
+        status.textContent = problem;
         return;
       }
       const scale = Math.min(1, LONGEST / Math.max(bitmap.width, bitmap.height));
@@ -89,6 +91,7 @@
     function restart() {
       worker?.terminate();
       running = false;
+      problem = "";
       label();
       const source = URL.createObjectURL(new Blob([`${gaussians2d}\n${fitting2d}\n(${work})();`]));
       worker = new Worker(source);
@@ -123,7 +126,7 @@
       }
       element.dataset.step = latest.step;
       element.dataset.psnr = latest.psnr.toFixed(2);
-      status.textContent = (latest.step ? "" : t("Run it, or drop a picture of yours here. ",
+      status.textContent = problem || (latest.step ? "" : t("Run it, or drop a picture of yours here. ",
         "点“运行”，或者把你自己的图片拖到这里。")) + t(
         `Step ${latest.step} of ${STEPS}: ${latest.count} Gaussians, PSNR ${latest.psnr.toFixed(2)} dB. ` +
         `Cloned ${counts.cloned}, split ${counts.split}, pruned ${counts.pruned}` +
