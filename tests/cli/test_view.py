@@ -69,22 +69,27 @@ def test_a_real_browser_at_the_printed_address(start, out):
 
 @pytest.fixture
 def served(run, monkeypatch):
-    """Run `view` until it waits: its result, the opened addresses, the arguments of the site."""
+    """Run `view` until it waits: its result, the opened addresses, the scene and its title."""
     from snowsplat.pipeline import view as viewing
+    from snowsplat.pipeline.output.scene_source import ViewableScene
+
+    site, ready = viewing.site, ViewableScene.ready
 
     def served(*arguments: object, environment: Sequence[str] = ()):
         for name in ("SSH_CONNECTION", "SSH_TTY", "DISPLAY", "WAYLAND_DISPLAY"):
             monkeypatch.delenv(name, raising=False)
         for name in environment:
             monkeypatch.setenv(name, ":0")
-        opened, sites, done = [], [], threading.Event()
-        site = viewing.site
+        opened, shown, done = [], [], threading.Event()
         monkeypatch.setattr(webbrowser, "open", lambda url: (opened.append(url), done.set()))
-        monkeypatch.setattr(viewing, "site", lambda *a, **k: (sites.append(a), site(*a, **k))[1])
+        monkeypatch.setattr(viewing, "site", lambda *a, **k: (shown.append(a[0]), site(*a, **k))[1])
+        monkeypatch.setattr(
+            ViewableScene, "ready", lambda self: (shown.append(self), ready(self))[1]
+        )
         monkeypatch.setattr(view, "wait", lambda: done.wait(0.3))
         result = run("view", *arguments)
         assert result.code == 0, result.err
-        return result, opened, sites[0]
+        return result, opened, shown[:2]
 
     return served
 
@@ -122,31 +127,33 @@ def test_with_a_public_host_it_prints_the_address_for_other_computers(served, ou
 
 
 def test_which_scene_and_which_cameras(served, out, tmp_path):
-    _, _, (about, gaussians, cameras, background) = served(out, "--iteration", 30)
+    _, _, (scene_30, about) = served(out, "--iteration", 30)
     assert about.title == "out"
     assert about.made is not None
     thirty = read_gaussians(out / "point_cloud/iteration_30/point_cloud.ply")
-    assert gaussians.means.equal(thirty.means)
-    assert len(cameras) == 9
-    assert background == (0.0, 0.0, 0.0)
-    assert len(served(scene(out))[2][2]) == 9  # the output folder is found from the scene file
+    assert scene_30.gaussians.means.equal(thirty.means)
+    assert len(scene_30.cameras) == 9
+    assert scene_30.background == (0.0, 0.0, 0.0)
+    assert (
+        len(served(scene(out))[2][0].cameras) == 9
+    )  # the output folder is found from the scene file
     shutil.copy(scene(out), tmp_path / "garden.ply")
-    assert served(tmp_path / "garden.ply")[2][2] == []
+    assert served(tmp_path / "garden.ply")[2][0].cameras == []
     # The output of `snowsplat make`: OUT/garden.ply is a copy of the scene in OUT/scene.
     shutil.copytree(out, tmp_path / "scene")
-    assert len(served(tmp_path / "garden.ply")[2][2]) == 9
-    assert len(served(tmp_path)[2][2]) == 9
+    assert len(served(tmp_path / "garden.ply")[2][0].cameras) == 9
+    assert len(served(tmp_path)[2][0].cameras) == 9
     shutil.copy(out / "point_cloud/iteration_30/point_cloud.ply", tmp_path / "other.ply")
-    assert served(tmp_path / "other.ply")[2][2] == []
+    assert served(tmp_path / "other.ply")[2][0].cameras == []
 
 
 def test_scenes_of_other_formats(served, out, tmp_path):
     gaussians = read_gaussians(scene(out))
     for name in ("scene.splat", "scene.spz", "scene.compressed.ply"):
         write_gaussians(tmp_path / name, gaussians)
-        result, _, (_, shown, _, _) = served(tmp_path / name)
+        result, _, (shown, _) = served(tmp_path / name)
         assert f"{tmp_path / name}: {len(gaussians):,} Gaussians" in result.out
-        assert len(shown) == len(gaussians)
+        assert len(shown.gaussians) == len(gaussians)
 
 
 @pytest.mark.parametrize("levels", [False, True])

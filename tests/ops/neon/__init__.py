@@ -17,6 +17,7 @@ import os
 import shutil
 import struct
 import subprocess
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ _SYSTEM = Path("/usr/aarch64-linux-gnu")  # of Debian's cross compiler
 _HERE = Path(__file__).parent
 _ROOT = _HERE.parents[2]
 _BUILD = _ROOT / "build" / "neon"
+_ONE_CALL = threading.Lock()  # tests call from several threads
 
 
 def launch(name: str, params: Params) -> int:
@@ -47,20 +49,21 @@ def launch(name: str, params: Params) -> int:
     text = name.encode()
     numbers = [layout.hash, native_library.library()[1].get_num_threads(), layout.size // 8]
     sizes = [number for block in blocks for number in (block.size, block.start % 64)]
-    process = _server()
-    assert process.stdin is not None
-    assert process.stdout is not None
-    process.stdin.write(_packed(len(text)) + text + _packed(*numbers) + words.raw)
-    process.stdin.write(_packed(len(blocks), *sizes, len(pointers) // 3, *pointers))
-    for block in blocks:
-        process.stdin.write(ctypes.string_at(block.start, block.size))
-    process.stdin.flush()
-    reply = process.stdout.read(8)
-    if len(reply) < 8:
-        _server.cache_clear()  # the next call starts another one
-        raise AssertionError(f"{name}: the program in the emulator has ended")
-    for block in blocks:
-        ctypes.memmove(block.start, process.stdout.read(block.size), block.size)
+    with _ONE_CALL:
+        process = _server()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(_packed(len(text)) + text + _packed(*numbers) + words.raw)
+        process.stdin.write(_packed(len(blocks), *sizes, len(pointers) // 3, *pointers))
+        for block in blocks:
+            process.stdin.write(ctypes.string_at(block.start, block.size))
+        process.stdin.flush()
+        reply = process.stdout.read(8)
+        if len(reply) < 8:
+            _server.cache_clear()  # the next call starts another one
+            raise AssertionError(f"{name}: the program in the emulator has ended")
+        for block in blocks:
+            ctypes.memmove(block.start, process.stdout.read(block.size), block.size)
     return int(struct.unpack("<q", reply)[0])
 
 

@@ -99,7 +99,7 @@ def test_values_that_are_not_finite():
 
 def test_the_picture_of_a_link_shows_what_the_page_shows(tmp_path):
     scene = cloud()
-    write_site(tmp_path, scene, (), (0.0, 0.0, 0.0), Description("cloud"))
+    write_site(tmp_path, ready(scene, ()), Description("cloud"))
     with Image.open(tmp_path / POSTER) as poster:
         corner = np.asarray(poster)[:200, :200]
     assert corner.max() < 20

@@ -133,7 +133,9 @@ def test_empty_space_in_front_of_the_camera(trained):
 
 
 def test_the_page_and_its_policy(trained):
-    files, headers = site(Description("<b>&"), trained.gaussians, trained.cameras, (1.0, 1.0, 1.0))
+    files, headers = site(
+        Description("<b>&"), ready(trained.gaussians, trained.cameras, (1.0, 1.0, 1.0))
+    )
     assert sorted(files) == ["", "index.css", "index.js", "scene.compressed.ply", "stops.webp"]
     page = files[""].content.decode()
     assert "<title>&lt;b&gt;&amp; - snowsplat</title>" in page
@@ -154,7 +156,7 @@ def test_the_page_and_its_policy(trained):
 def test_a_real_browser_shows_our_render(trained, tmp_path):
     gaussians, start, *_ = ready(trained.gaussians, trained.cameras)
     ours = picture(gaussians, camera_of(start))
-    files, headers = site(Description("scene"), trained.gaussians, trained.cameras, (0.0, 0.0, 0.0))
+    files, headers = site(Description("scene"), ready(trained.gaussians, trained.cameras))
     with (
         WebServer(static_app(files), headers=headers) as server,
         Browser(WIDTH, HEIGHT, frames=5.0) as browser,
@@ -185,7 +187,7 @@ def test_a_real_browser_shows_levels_of_detail(trained, tmp_path):
         return tmp_path / INDEX
 
     about = Description("scene")
-    files, headers = site(about, trained.gaussians, trained.cameras, (0.0, 0.0, 0.0), levels)
+    files, headers = site(about, ready(trained.gaussians, trained.cameras), levels)
     assert "scene.compressed.ply" not in files
     with (
         WebServer(static_app(files), headers=headers) as server,
@@ -215,7 +217,7 @@ def test_a_real_browser_shows_an_antialiased_scene(trained, tmp_path):
     shown_scene, start, *_ = ready(small, trained.cameras)
     ours = picture(shown_scene, camera_of(start))
     unfiltered = dataclasses.replace(shown_scene, antialiased=False)
-    files, headers = site(Description("scene"), small, trained.cameras, (0.0, 0.0, 0.0))
+    files, headers = site(Description("scene"), ready(small, trained.cameras))
     with (
         WebServer(static_app(files), headers=headers) as server,
         Browser(WIDTH, HEIGHT, frames=5.0) as browser,
