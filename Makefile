@@ -150,7 +150,7 @@ pytest: native $(ENVIRONMENT)
 pytest-best:
 	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
-nightly: native $(ENVIRONMENT)
+nightly: native $(ENVIRONMENT) pytest-isas
 	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator, which takes five times as long as the processor: with the
@@ -168,14 +168,17 @@ neon: native $(ENVIRONMENT)
 
 # Prints everything if a test fails, otherwise only the numbers of tests.
 pytest-repeated:
-	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized neon JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
+	@if nice -n 5 $(MAKE) --no-print-directory pytest-isas sanitized neon LOWER='[-2:-1]' JOBS=$$(($(JOBS) / 2)) >$(REPEATED) 2>&1; \
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
 ISA_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_sift.py \
     tests/training/test_pose_refinement.py tests/training/test_step_runner.py -k 'not ($(SAME))'
+# All lower instruction sets. Each change is tested with the next lower one, and with NEON, whose kernels
+# have the source of the baseline.
+LOWER = [:-1]
 pytest-isas:
-	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()[:-1])') && \
+	@isas=$$($(PYTHON) -c 'from snowsplat.ops import native; print(*native.available_isas()$(LOWER))') && \
 	    for isa in $$isas; do \
 	        echo "SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)'" $(ISA_TESTS); \
 	        SNOWSPLAT_ISA=$$isa $(PYTEST) -m '$(ISA)' $(ISA_TESTS) || exit 1; \
