@@ -17,6 +17,7 @@ import fcntl
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -312,3 +313,16 @@ def _pipe() -> tuple[int, int]:
 
 def _error_text(details: dict[str, Any]) -> str:
     return str(details.get("exception", {}).get("description", details.get("text")))
+
+
+def chinese_labels(report: Path) -> list[str]:
+    """The headings and labels of a report in a browser in Chinese; none is left in English."""
+    shown = "[...document.querySelectorAll('h2, th, .card, summary')]"
+    with Browser() as browser:
+        page = browser.open(report.as_uri(), language="zh-CN")
+        labels: list[str] = page.evaluate(f"{shown}.map(e => e.lastChild?.data ?? '')")
+        assert not page.errors
+    left = re.sub(r"PSNR|SSIM|RMS|dB|ms", "", " ".join(labels))
+    assert len(labels) > 20
+    assert not re.findall("[A-Za-z]{3,}", left)
+    return labels
