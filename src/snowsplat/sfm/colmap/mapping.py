@@ -48,13 +48,14 @@ _LARGE_MODEL = 40
 _GROWTH = 1.4
 _ITERATIONS = 20
 # Bundle adjustment ends when an iteration reduces the cost by less than this share. There is one
-# share for local and one for global bundle adjustment in the mapper, one for the final bundle
-# adjustment of the result, and one for this before the last scale of its loss. By default, COLMAP
-# goes on until the gradient is small, which takes several times as long.
+# share for local and one for global bundle adjustment in the mapper, and two for that of a result,
+# before the last scale of its loss and with it. The alignment of features moves cameras by little,
+# so larger shares suffice after it: the centres are the same within 0.005% of the extent. By
+# default, COLMAP goes on until the gradient is small, which takes several times as long.
 _LOCAL_TOLERANCE = 1e-4
 _GLOBAL_TOLERANCE = 1e-5
-_FINAL_TOLERANCE = 1e-4
-_EARLY_TOLERANCE = 1e-3
+_EARLY_TOLERANCE, _FINAL_TOLERANCE = 1e-3, 1e-4
+_ALIGNED_TOLERANCES = (1e-2, 1e-3)
 # The bundle adjustment of the result has a Cauchy loss, so false matches that became observations
 # have little effect on the poses. Its scale, in units of the mean reprojection error, is decreased:
 # with the small one alone, a model that is bent may remain bent. Before the check of the poses, the
@@ -148,7 +149,7 @@ class Mapping:
         ``image_size``: the longest side of the photos in which the features were detected.
         """
         align_features(model, self.database, self.images, image_size, self.threads)
-        self._refine(model, _MIN_POINTS_ALIGNED)
+        self._refine(model, _MIN_POINTS_ALIGNED, tolerances=_ALIGNED_TOLERANCES)
 
     def add_points(self, model: pycolmap.Reconstruction) -> None:
         """Add points that only two photos of ``model`` see, for the training. Changes ``model``."""
@@ -298,15 +299,17 @@ class Mapping:
         model: pycolmap.Reconstruction,
         min_points: int = MIN_POINTS,
         scales: Sequence[float] = _FINAL_LOSS_SCALES,
+        tolerances: tuple[float, float] = (_EARLY_TOLERANCE, _FINAL_TOLERANCE),
     ) -> pycolmap.Reconstruction:
         """Remove outliers and run bundle adjustment, for each of ``scales`` of the loss. Changes
-        ``model`` and returns it. ``min_points`` as in `_remove_outliers`."""
+        ``model`` and returns it. ``min_points`` as in `_remove_outliers`;
+        ``tolerances``: before the last scale, and with it."""
         self._remove_outliers(model, min_points)
         for scale in scales:
             if model.num_reg_images() < MIN_PHOTOS:
                 break
             last = scale == _FINAL_LOSS_SCALES[-1]
-            self._adjust(model, scale, _FINAL_TOLERANCE if last else _EARLY_TOLERANCE)
+            self._adjust(model, scale, tolerances[last])
             self._remove_outliers(model, min_points)
         return model
 
