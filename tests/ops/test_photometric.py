@@ -121,6 +121,10 @@ def test_loss_is_the_weighted_sum(variant: Variant) -> None:
         loss = variant.ops.photometric_loss(a, b, weight)
         assert loss.shape == ()
         assert float(loss) == pytest.approx((1 - weight) * l1 + weight * dssim, rel=1e-5)
+    size = (a - b).abs()
+    huber = float(torch.where(size < 0.1, size.square(), 0.1 * (2 * size - 0.1)).mean())
+    loss = variant.ops.photometric_loss(a, b, 0.2, 10.0)
+    assert float(loss) == pytest.approx(0.8 * l1 + 0.2 * dssim + 10.0 * huber, rel=1e-5)
     default = variant.ops.photometric_loss(a, b)
     assert float(default) == pytest.approx(0.8 * l1 + 0.2 * dssim, rel=1e-5)
 
@@ -151,13 +155,13 @@ def test_storage_does_not_matter(variant: Variant) -> None:
     assert_close(interleaved, planar, 1e-6)
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_finite_differences(double: Variant, weight: float) -> None:
+@pytest.mark.parametrize("weights", [(0.0, 0.0), (0.2, 0.0), (1.0, 0.0), (0.2, 10.0)])
+def test_finite_differences(double: Variant, weights: tuple[float, float]) -> None:
     a, b = images(5, 3, 13)
     assert (a - b).abs().min() > 1e-5  # |a − b| has a kink where they are equal
 
     def loss(image: Tensor) -> Tensor:
-        return double.ops.photometric_loss(image, b, weight)
+        return double.ops.photometric_loss(image, b, *weights)
 
     assert torch.autograd.gradcheck(loss, (a.requires_grad_(),), eps=1e-6, atol=1e-8, rtol=1e-5)
 
@@ -252,7 +256,9 @@ def value_and_gradient(
 ) -> tuple[Tensor, Tensor]:
     a, b = images(height + width, height, width)
     image = a.to(variant.dtype, copy=True).requires_grad_()
-    value = getattr(variant.ops, name)(image, b.to(variant.dtype))
+    function = functools.partial(variant.ops.photometric_loss, huber_weight=10.0)
+    function = function if name == "huber" else getattr(variant.ops, name)
+    value = function(image, b.to(variant.dtype))
     assert value.dtype == variant.dtype
     (3 * value).backward()
     assert image.grad is not None
@@ -266,7 +272,7 @@ def expected(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize(("height", "width"), [*SIZES, *TILES, *STRIPS])
-@pytest.mark.parametrize("name", ["ssim", "photometric_loss"])
+@pytest.mark.parametrize("name", ["ssim", "photometric_loss", "huber"])
 def test_native_agrees_with_the_reference(
     native: Variant, name: str, height: int, width: int
 ) -> None:

@@ -314,7 +314,7 @@ struct BackgroundBackwardParams {
 
 // ---- photometric --------------------------------------------------------------------------------
 
-// L1 and SSIM between two images. Target is T, or uint8_t, where 255 means 1.
+// L1, the Huber function and SSIM between two images. Target is T, or uint8_t, where 255 means 1.
 template <class T, class Target>
 struct PhotometricParams {
   int64_t n;                      // channels
@@ -322,9 +322,10 @@ struct PhotometricParams {
   const T* image;                 // (n, height, width)
   const Target* target;           // (n, height, width)
   double l1_weight, ssim_weight;  // weights of L1 and SSIM in the gradient
+  double huber_weight;            // weight of the Huber function in the gradient
   T* grad;                        // out, the gradient of the weighted sum, or null
-  double* means;                  // out, (2,) mean |a − b| and mean SSIM
-  SNOW_FIELDS(n, width, height, image, target, l1_weight, ssim_weight, grad, means)
+  double* means;                  // out, (3,) means of |a − b|, of SSIM, of the Huber function
+  SNOW_FIELDS(n, width, height, image, target, l1_weight, ssim_weight, huber_weight, grad, means)
 };
 
 // ---- neighbours ---------------------------------------------------------------------------------

@@ -9,6 +9,8 @@ namespace snow {
 constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 constexpr int kSsimRadius = 5;  // 11×11 window, Gaussian with σ = 1.5
 constexpr int kSsimTaps = 2 * kSsimRadius + 1;
+// The Huber function is x² up to this distance and grows linearly beyond it: δ (2 |x| − δ).
+constexpr double kHuberDelta = 0.1;
 
 // The separable window: exp(−x²/(2·1.5²)) / Σ for x = k − 5.
 SNOW_INLINE constexpr double ssim_tap(int k) {

@@ -288,6 +288,7 @@ class PhotometricParams(Params):
     target: Tensor
     l1_weight: float
     ssim_weight: float
+    huber_weight: float
     grad: Tensor | None
     means: Tensor
 

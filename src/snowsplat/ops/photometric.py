@@ -14,8 +14,13 @@ from snowsplat.ops.native import launch
 from snowsplat.ops.params import PhotometricParams
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 − λ) · mean |a − b| + λ · (1 − SSIM), a scalar; λ is `ssim_weight` (the paper, eq. 7).
+def photometric_loss(
+    image: Tensor, target: Tensor, ssim_weight: float = 0.2, huber_weight: float = 0.0
+) -> Tensor:
+    """(1 − λ) · mean |a − b| + λ · (1 − SSIM) + w · mean h(a − b), a scalar.
+
+    λ is `ssim_weight`, and w, which is 0 in the paper (eq. 7), is `huber_weight`. The Huber
+    function h(x) is x² where |x| ≤ δ = 0.1, and δ (2 |x| − δ) elsewhere (Huber 1964).
 
     image (H, W, 3): float32 or float64. target (H, W, 3): of the same dtype, or uint8, which is
     divided by 255. If the storage is planar, as of `planar.permute(1, 2, 0)`, no copy is made. The
@@ -24,8 +29,8 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 
     Raises ValueError if shapes, dtypes or devices do not match.
     """
-    weighted = _Photometric.apply(image, target, 1 - ssim_weight, -ssim_weight, "photometric_loss")
-    return weighted + ssim_weight
+    weights = (1 - ssim_weight, -ssim_weight, huber_weight)
+    return _Photometric.apply(image, target, weights, "photometric_loss") + ssim_weight
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -34,7 +39,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     The window is Gaussian, 11×11 with σ = 1.5; the images are padded with zeros; C₁ = 0.01²,
     C₂ = 0.03². Arguments and errors are as for `photometric_loss`.
     """
-    return _Photometric.apply(image, target, 0.0, 1.0, "ssim")
+    return _Photometric.apply(image, target, (0.0, 1.0, 0.0), "ssim")
 
 
 def _planar(op: str, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,22 +58,21 @@ def _planar(op: str, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Photometric(torch.autograd.Function):
-    """l1_weight · L1 + ssim_weight · SSIM; `op` is the name in error messages."""
+    """The sum of L1, SSIM and Huber with `weights`; `op` is the name in error messages."""
 
     @staticmethod
     def forward(
         ctx: Any,
         image: Tensor,
         target: Tensor,
-        l1_weight: float,
-        ssim_weight: float,
+        weights: tuple[float, float, float],
         op: str,
     ) -> Tensor:
         planes, target_planes = _planar(op, image.detach(), target)
         grad = None
         if ctx.needs_input_grad[0]:
             grad = scratch.empty_like(planes)
-        means = torch.empty(2, dtype=torch.float64, device=planes.device)
+        means = torch.empty(3, dtype=torch.float64, device=planes.device)
         name = "photometric_u8" if target_planes.dtype == torch.uint8 else "photometric"
         channels, height, width = planes.shape
         launch(
@@ -79,21 +83,25 @@ class _Photometric(torch.autograd.Function):
                 height=height,
                 image=planes,
                 target=target_planes,
-                l1_weight=l1_weight,
-                ssim_weight=ssim_weight,
+                l1_weight=weights[0],
+                ssim_weight=weights[1],
+                huber_weight=weights[2],
                 grad=grad,
                 means=means,
             ),
         )
         ctx.grad = grad
-        l1, similarity = means  # tensors, because reading their values would wait for a GPU
-        return (l1_weight * l1 + ssim_weight * similarity).to(planes.dtype)
+        # Tensors, because reading their values would wait for a GPU. Without Huber, its mean is not
+        # added: the recordings of CUDA graphs have one operation less.
+        value = weights[0] * means[0] + weights[1] * means[1]
+        value = value + weights[2] * means[2] if weights[2] else value
+        return value.to(planes.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_value: Tensor) -> tuple[Tensor | None, ...]:
         if ctx.grad is None:
-            return None, None, None, None, None
+            return None, None, None, None
         on_cpu = grad_value.device.type == "cpu"  # on a GPU, reading the value would wait
         grad = ctx.grad if on_cpu and float(grad_value) == 1.0 else ctx.grad * grad_value
-        return grad.permute(1, 2, 0), None, None, None, None
+        return grad.permute(1, 2, 0), None, None, None

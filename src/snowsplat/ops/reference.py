@@ -475,13 +475,19 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     return (luminance * structure).mean()
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def photometric_loss(
+    image: Tensor, target: Tensor, ssim_weight: float = 0.2, huber_weight: float = 0.0
+) -> Tensor:
     """(1 − λ) · mean |image − target| + λ · (1 − SSIM), eq. 7 with λ = `ssim_weight`: a scalar.
 
+    `huber_weight` times the mean of the Huber function with δ = 0.1 is added.
     image (H, W, C) in [0, 1]; target of the same shape, floating in [0, 1] or uint8.
     """
-    l1 = (image - _as_unit(target, image)).abs().mean()
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(image, target))
+    size = (image - _as_unit(target, image)).abs()
+    near = size.clamp(max=0.1)
+    huber = (near * (2 * size - near)).mean()
+    l1 = (1 - ssim_weight) * size.mean()
+    return l1 + ssim_weight * (1 - ssim(image, target)) + huber_weight * huber
 
 
 def _as_unit(target: Tensor, like: Tensor) -> Tensor:

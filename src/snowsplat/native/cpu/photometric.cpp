@@ -1,4 +1,5 @@
-// photometric: L1 and SSIM between two images and the gradient of their weighted sum, in one pass.
+// photometric: L1, the Huber function and SSIM between two images, and the gradient of their weighted
+// sum, in one pass.
 //
 // Images are planar, (channels, H, W). A task is one channel of a strip of columns and a segment of
 // rows. It processes the rows from top to bottom, kBatch at a time. Ring buffers contain the last
@@ -119,8 +120,8 @@ struct Photometric {
   int64_t width, height;
   const T* image;
   const Target* target;
-  double l1_weight, ssim_weight;  // already divided by the number of values
-  T* grad;                        // null: values only
+  double l1_weight, ssim_weight, huber_weight;  // already divided by the number of values
+  T* grad;                                      // null: values only
 
   void run(int channel, int64_t strip, int64_t row_begin, int64_t row_end, double* sums) const {
     thread_local Scratch<V> s;
@@ -194,9 +195,10 @@ struct Photometric {
       const int64_t yo = ys - kSsimRadius;  // the rows whose gradient is complete now
       if (yo + kBatch <= row_begin) continue;
       for (int k = 0; k < kReach; k++) rows[k] = s.filtered[ring(yo - kSsimRadius + k)][0];
-      const V up(l1_weight), down(-l1_weight), weight(ssim_weight), zero(0.f);
-      V distance[kBatch];
-      for (int r = 0; r < kBatch; r++) distance[r] = V(0.f);
+      const V up(l1_weight), weight(ssim_weight), zero(0.f);
+      const V slope(2 * huber_weight), delta(kHuberDelta);
+      V distance[kBatch], huber[kBatch];
+      for (int r = 0; r < kBatch; r++) distance[r] = huber[r] = V(0.f);
       for (int64_t x = x0; x < x1; x += W) {
         const int n = x1 - x < W ? int(x1 - x) : W;
         V terms[3][kBatch];
@@ -207,15 +209,18 @@ struct Photometric {
           const int64_t at = plane + (yo + r) * width + x;
           const V a = load_pixels<V>(image + at, x1 - x), b = load_pixels<V>(target + at, x1 - x);
           const V difference = a - b;
-          distance[r] += max(difference, -difference);
+          const V size = max(difference, -difference), near = min(size, delta);
+          distance[r] += size, huber[r] += near * (V(2.f) * size - near);
           if (!grad) continue;
-          const V sign = select(difference > zero, up, select(zero > difference, down, zero));
+          const V away = up + slope * near;
+          const V sign = select(difference > zero, away, select(zero > difference, -away, zero));
           const V g = sign + weight * (terms[0][r] + V(2.f) * a * terms[1][r] + b * terms[2][r]);
           g.store_first(grad + at, n);
         }
       }
       for (int r = 0; r < kBatch; r++)
-        for (int l = 0; l < W; l++) sums[0] += double(distance[r].v[l]);
+        for (int l = 0; l < W; l++)
+          sums[0] += double(distance[r].v[l]), sums[2] += double(huber[r].v[l]);
     }
   }
 };
@@ -225,19 +230,26 @@ int64_t photometric(const PhotometricParams<typename V::Scalar, Target>& p) {
   const int64_t strips = strip_count(p.width);
   const int64_t segments = (p.height + kSegment - 1) / kSegment;
   const double count = double(p.n * p.width * p.height);
-  const Photometric<V, Target> images = {
-      p.width, p.height, p.image, p.target, p.l1_weight / count, p.ssim_weight / count, p.grad};
+  const Photometric<V, Target> images = {p.width,
+                                         p.height,
+                                         p.image,
+                                         p.target,
+                                         p.l1_weight / count,
+                                         p.ssim_weight / count,
+                                         p.huber_weight / count,
+                                         p.grad};
   const int64_t tasks = p.n * strips * segments;
-  std::vector<double> sums(size_t(2 * tasks), 0.0);
+  std::vector<double> sums(size_t(3 * tasks), 0.0);
   parallel_for(tasks, [&](int64_t task) {
     const int64_t segment = task % segments, strip = task / segments % strips;
     const Range rows = split_range(p.height, segments, segment);
-    images.run(int(task / segments / strips), strip, rows.begin, rows.end, &sums[size_t(2 * task)]);
+    images.run(int(task / segments / strips), strip, rows.begin, rows.end, &sums[size_t(3 * task)]);
   });
-  p.means[0] = p.means[1] = 0;
-  for (int64_t t = 0; t < tasks; t++)
-    p.means[0] += sums[size_t(2 * t)], p.means[1] += sums[size_t(2 * t + 1)];
-  p.means[0] /= count, p.means[1] /= count;
+  for (int k = 0; k < 3; k++) {
+    p.means[k] = 0;
+    for (int64_t t = 0; t < tasks; t++) p.means[k] += sums[size_t(3 * t + k)];
+    p.means[k] /= count;
+  }
   return 0;
 }
 

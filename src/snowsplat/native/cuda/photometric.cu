@@ -7,7 +7,7 @@
 // filter is the same filter, applied to the maps of derivatives.
 //
 //   photometric_similarity   SSIM per pixel, sums per block, the three derivatives of SSIM as maps
-//   photometric_gradient     the gradient from the filtered maps, plus that of L1
+//   photometric_gradient     the gradient from the filtered maps, plus that of L1 and Huber
 //   photometric_means        adds the sums of the blocks in order: bit-identical in every run
 //
 // The maps are written to global memory and read back. Without them, a block would have to load its
@@ -57,27 +57,27 @@ struct PhotometricSimilarityParams {
   const Target* target;   // (n, height, width)
   T* maps;       // out, (n, 3, height, width), or null: the derivatives of SSIM with respect
                  // to the windowed means of a, of a² + b² and of ab
-  double* sums;  // out, (blocks, 2) of |a − b| and of SSIM
+  double* sums;  // out, (blocks, 3) of |a − b|, of SSIM and of the Huber function
   SNOW_FIELDS(n, width, height, image, target, maps, sums)
 };
 
 template <class T, class Target>
 struct PhotometricGradientParams {
-  int64_t n;                      // channels
-  int64_t width, height;          // pixels
-  const T* image;                 // (n, height, width)
-  const Target* target;           // (n, height, width)
-  const T* maps;                  // (n, 3, height, width)
-  double l1_weight, ssim_weight;  // divided by the number of values
-  T* grad;                        // out, (n, height, width)
-  SNOW_FIELDS(n, width, height, image, target, maps, l1_weight, ssim_weight, grad)
+  int64_t n;                                    // channels
+  int64_t width, height;                        // pixels
+  const T* image;                               // (n, height, width)
+  const Target* target;                         // (n, height, width)
+  const T* maps;                                // (n, 3, height, width)
+  double l1_weight, ssim_weight, huber_weight;  // divided by the number of values
+  T* grad;                                      // out, (n, height, width)
+  SNOW_FIELDS(n, width, height, image, target, maps, l1_weight, ssim_weight, huber_weight, grad)
 };
 
 struct PhotometricMeansParams {
   int64_t n;           // blocks
-  const double* sums;  // (n, 2)
+  const double* sums;  // (n, 3)
   int64_t values;      // of the images
-  double* means;       // out, (2,)
+  double* means;       // out, (3,)
   SNOW_FIELDS(n, sums, values, means)
 };
 
@@ -165,7 +165,7 @@ SNOW_INLINE void similarity(int width, int height, const T* __restrict__ image,
   SNOW_SHARED(T, a, Tile<T>::kWideCount);
   SNOW_SHARED(T, b, Tile<T>::kWideCount);
   SNOW_SHARED(T, rows, 4 * Tile<T>::kCount);
-  SNOW_SHARED(T, warp_sums, 2 * kWarps);
+  SNOW_SHARED(T, warp_sums, 3 * kWarps);
   const Tile<T> tile(width, height);
   const int64_t plane = int64_t(width) * height;
   image += tile.channel * plane, target += tile.channel * plane;
@@ -185,7 +185,8 @@ SNOW_INLINE void similarity(int width, int height, const T* __restrict__ image,
   const int x = tile.x + lane_id();
   T means[4][Tile<T>::kOwnRows];
   filter_column<4>(rows, first, means);
-  T differences = T(0), similarities = T(0);
+  const T delta = T(kHuberDelta);
+  T differences = T(0), similarities = T(0), huber = T(0);
 #pragma unroll
   for (int i = 0; i < Tile<T>::kOwnRows; i++) {
     const int y = tile.y + first + i;
@@ -194,32 +195,38 @@ SNOW_INLINE void similarity(int width, int height, const T* __restrict__ image,
     const T difference = a[index] - b[index];
     SsimDerivatives<T> d;
     similarities += ssim_pixel(means[0][i], means[1][i], means[2][i], means[3][i], d);
-    differences += max(difference, -difference);
+    const T size = max(difference, -difference), near = min(size, delta);
+    differences += size, huber += near * (T(2) * size - near);
     if (maps) {
       T* const map = maps + 3 * tile.channel * plane + (y * width + x);
       map[0] = d.mean_a, map[plane] = d.mean_aa, map[2 * plane] = d.mean_ab;
     }
   }
   differences = warp_sum(differences), similarities = warp_sum(similarities);
-  if (lane_id() == 0)
+  huber = warp_sum(huber);
+  if (lane_id() == 0) {
     warp_sums[warp_id()] = differences, warp_sums[kWarps + warp_id()] = similarities;
+    warp_sums[2 * kWarps + warp_id()] = huber;
+  }
   __syncthreads();
-  if (threadIdx.x < 2) {
+  if (threadIdx.x < 3) {
     T sum = T(0);
     for (int w = 0; w < kWarps; w++) sum += warp_sums[int(threadIdx.x) * kWarps + w];
-    sums[2 * int64_t(blockIdx.x) + threadIdx.x] = double(sum);
+    sums[3 * int64_t(blockIdx.x) + threadIdx.x] = double(sum);
   }
 }
 
 template <class T, class Target>
 SNOW_INLINE void gradient(int width, int height, const T* __restrict__ image,
                           const Target* __restrict__ target, const T* __restrict__ maps,
-                          double l1_weight, double ssim_weight, T* __restrict__ grad) {
+                          double l1_weight, double ssim_weight, double huber_weight,
+                          T* __restrict__ grad) {
   SNOW_SHARED(T, derivatives, 3 * Tile<T>::kWideCount);
   SNOW_SHARED(T, rows, 3 * Tile<T>::kCount);
   // Converted once per block: consumer GPUs are slow at double.
-  SNOW_SHARED(T, weights, 2);
-  if (threadIdx.x == 0) weights[0] = T(l1_weight), weights[1] = T(ssim_weight);
+  SNOW_SHARED(T, weights, 3);
+  if (threadIdx.x == 0)
+    weights[0] = T(l1_weight), weights[1] = T(ssim_weight), weights[2] = T(2 * huber_weight);
   const Tile<T> tile(width, height);
   const int64_t plane = int64_t(width) * height;
   image += tile.channel * plane, target += tile.channel * plane, grad += tile.channel * plane;
@@ -249,7 +256,8 @@ SNOW_INLINE void gradient(int width, int height, const T* __restrict__ image,
     if (x >= width || y >= height) continue;
     const int at = y * width + x;
     const T p = pixel<T>(image, at), q = pixel<T>(target, at);
-    const T sign = p > q ? weights[0] : q > p ? -weights[0] : T(0);
+    const T near = min(max(p - q, q - p), T(kHuberDelta)), away = weights[0] + weights[2] * near;
+    const T sign = p > q ? away : q > p ? -away : T(0);
     grad[at] =
         sign + weights[1] * (filtered[0][i] + T(2) * p * filtered[1][i] + q * filtered[2][i]);
   }
@@ -266,7 +274,7 @@ using namespace snow;
   }                                                                                               \
   SNOW_KERNEL(photometric_gradient##SUFFIX, kThreads, PhotometricGradientParams<T, TARGET>) {     \
     gradient(int(p.width), int(p.height), p.image, p.target, p.maps, p.l1_weight, p.ssim_weight,  \
-             p.grad);                                                                             \
+             p.huber_weight, p.grad);                                                             \
   }
 
 SNOW_PHOTOMETRIC_KERNELS(, float, float)
@@ -274,17 +282,20 @@ SNOW_PHOTOMETRIC_KERNELS(_u8, float, uint8_t)
 SNOW_PHOTOMETRIC_KERNELS(_f64, double, double)
 SNOW_PHOTOMETRIC_KERNELS(_u8_f64, double, uint8_t)
 
-// One block: means[0] = Σ |a − b| / values, means[1] = Σ SSIM / values.
+// One block: means[0] = Σ |a − b| / values; means[1] and means[2] are those of SSIM and Huber.
 SNOW_KERNEL(photometric_means, 256, PhotometricMeansParams) {
-  SNOW_SHARED(double, partial, 256 * 2);
+  SNOW_SHARED(double, partial, 256 * 3);
   const int t = int(threadIdx.x);
-  double l1 = 0, ssim = 0;
-  for (int64_t i = t; i < p.n; i += 256) l1 += p.sums[2 * i], ssim += p.sums[2 * i + 1];
-  partial[t] = l1, partial[256 + t] = ssim;
+  for (int k = 0; k < 3; k++) {
+    double sum = 0;
+    for (int64_t i = t; i < p.n; i += 256) sum += p.sums[3 * i + k];
+    partial[256 * k + t] = sum;
+  }
   __syncthreads();
   for (int half = 128; half > 0; half /= 2) {
-    if (t < half) partial[t] += partial[t + half], partial[256 + t] += partial[256 + t + half];
+    if (t < half)
+      for (int k = 0; k < 3; k++) partial[256 * k + t] += partial[256 * k + t + half];
     __syncthreads();
   }
-  if (t < 2) p.means[t] = partial[256 * t] / double(p.values);
+  if (t < 3) p.means[t] = partial[256 * t] / double(p.values);
 }

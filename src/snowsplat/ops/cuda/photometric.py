@@ -35,6 +35,7 @@ class PhotometricGradientParams(Params):
     maps: Tensor
     l1_weight: float
     ssim_weight: float
+    huber_weight: float
     grad: Tensor
 
 
@@ -71,7 +72,7 @@ def _photometric(target_suffix: str, run: Run, suffix: str, p: PhotometricParams
     channels, width, height = p.n, p.width, p.height
     tiles = -(-width // _TILE_WIDTH) * -(-height // _TILE_HEIGHT[suffix])  # of a channel
     device, dtype = p.image.device, p.image.dtype
-    sums = torch.empty(channels * tiles, 2, dtype=torch.float64, device=device)
+    sums = torch.empty(channels * tiles, 3, dtype=torch.float64, device=device)
     values = channels * width * height
     at_once = channels
     if p.grad is not None:
@@ -107,6 +108,7 @@ def _photometric(target_suffix: str, run: Run, suffix: str, p: PhotometricParams
                     maps=maps,
                     l1_weight=p.l1_weight / values,
                     ssim_weight=p.ssim_weight / values,
+                    huber_weight=p.huber_weight / values,
                     grad=p.grad[first:last],
                 ),
             )

@@ -9,8 +9,14 @@ from snowsplat import ops
 from snowsplat.data.decode import LoadedImage
 
 
-def view_loss(image: Tensor, photo: LoadedImage, background: Tensor, ssim_weight: float) -> Tensor:
-    """The scalar (1 − λ) · L1 + λ · (1 − SSIM), λ = ``ssim_weight``, differentiable in ``image``.
+def view_loss(
+    image: Tensor,
+    photo: LoadedImage,
+    background: Tensor,
+    ssim_weight: float,
+    huber_weight: float = 0.0,
+) -> Tensor:
+    """`ops.photometric_loss` of ``image`` and ``photo``: eq. 7, and ``huber_weight`` · Huber.
 
     A transparent photo is first composited over ``background``. At pixels where the mask is False,
     the image is replaced with the photo, so that they have no difference and no gradient.
@@ -23,4 +29,4 @@ def view_loss(image: Tensor, photo: LoadedImage, background: Tensor, ssim_weight
     if photo.mask is not None:
         counts = photo.mask[:, :, None]
         image = torch.where(counts, image, target / 255 if target.dtype == torch.uint8 else target)
-    return ops.photometric_loss(image, target, ssim_weight)
+    return ops.photometric_loss(image, target, ssim_weight, huber_weight)

@@ -20,8 +20,8 @@ from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.rates import LearningRates
 
-#: β₁ and β₂ for a batch of one view.
-BETAS = (0.9, 0.999)
+#: β₂ for a batch of one view.
+_BETA2 = 0.999
 
 
 class Adam:
@@ -43,6 +43,7 @@ class Adam:
         schedule: Schedule,
         extent: float,
         views: int = 0,
+        beta1: float = 0.9,
         visible_only: bool = False,
         shards: Shards = ALONE,
     ) -> None:
@@ -51,6 +52,7 @@ class Adam:
             extent: extent of the scene, in world units; the learning rate of the means is
                 multiplied by it.
             views: number of training views; see `LearningRates.at`.
+            beta1: β₁ for a batch of one view.
             visible_only: whether a step leaves Gaussians unchanged that its view does not see.
             shards: the processes; ``gaussians`` are those of this process.
         """
@@ -58,6 +60,7 @@ class Adam:
         self.schedule = schedule
         self.extent = extent
         self.views = views
+        self.beta1 = beta1
         self.visible_only = visible_only
         self.shards = shards
         self.rows: dict[str, Tensor] = {}
@@ -87,7 +90,7 @@ class Adam:
         rates = AdamRates(
             {name: math.sqrt(batch) * rate for name, rate in self.rates_at(step).items()},
             self.schedule.update_of(step),
-            (BETAS[0] ** batch, BETAS[1] ** batch),
+            (self.beta1**batch, _BETA2**batch),
         )
         ops.adam_step(
             gaussians,

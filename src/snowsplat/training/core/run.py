@@ -176,12 +176,21 @@ class Run:
             config.batch,
             shards,
         )
-        self.loss = loss or partial(view_loss, ssim_weight=config.ssim_weight)
+        usual = partial(view_loss, ssim_weight=config.ssim_weight)
         self.has_own_loss = loss is not None
+        self._first_loss = loss or usual
+        huber = partial(usual, huber_weight=config.huber_weight) if config.huber_weight else usual
+        self._last_loss = loss or huber
         self.parts = _with_valid_names(parts_of(config) if parts is None else parts)
         self._begin()
         if state is not None:
             self.load_state(state)
+
+    @property
+    def loss(self) -> Loss:
+        """Compares an image with a photo in the present step. It is replaced once at most."""
+        last = self.step >= self.schedule.step_of(self.config.huber_from)
+        return self._last_loss if last else self._first_loss
 
     def _begin(self) -> None:
         """Prepare the parts, and create the first Gaussians and what belongs to them."""
@@ -203,6 +212,7 @@ class Run:
             schedule=self.schedule,
             extent=self.dataset.extent,
             views=len(self.dataset.train),
+            beta1=config.beta1,
             visible_only=config.visible_only and not regularizing(parts),
             shards=self.shards,
         )

@@ -151,7 +151,8 @@ class ViewGraphs:
 
         Args:
             photo: what the image is compared with.
-            loss: takes an image (H, W, 3), the photo and the background (3,).
+            loss: takes an image (H, W, 3), the photo and the background (3,). Another object has
+                other recordings.
         """
         if self._record is None:
             return None
@@ -161,7 +162,7 @@ class ViewGraphs:
             if self._recordings:
                 self._recordings.clear()
                 self._record.forget()
-        key = _key(gaussians, view, photo, sh_degree, runner)
+        key = (_key(gaussians, view, photo, sh_degree, runner), loss)
         repeated, self._last = (memory, key) == self._last, (memory, key)
         recording = self._recordings.pop(key, None)
         if recording is None:

@@ -150,6 +150,22 @@ class TrainConfig(Settings):
         metavar="F",
         aliases=("--lambda-dssim",),
     )
+    huber_weight: float = setting(
+        0.0,
+        "Weight of a term of the loss that is the squared difference up to 0.1, and linear beyond; "
+        "from `huber_from` on. It decreases the largest differences, which the PSNR counts most.",
+        least=0.0,
+        metavar="F",
+    )
+    huber_from: When = setting(0.7, "First moment of `huber_weight`.", least=0)
+    beta1: float = setting(
+        0.9,
+        "Decay rate of Adam's mean of gradients, for a step with one view. Each step has another "
+        "view, so with a smaller rate, fewer views share a step.",
+        least=0.0,
+        below=1.0,
+        metavar="F",
+    )
     depth_weight: float = setting(
         0.0,
         "Weight of the depth maps of the dataset (depths/IMG.png) in the loss; 0: they are not "

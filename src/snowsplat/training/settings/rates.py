@@ -11,8 +11,8 @@ from snowsplat.training.settings.declare import Settings, When, setting
 if TYPE_CHECKING:
     from snowsplat.training.core.step_schedule import Schedule
 
-#: The largest factor of the rate of the view-dependent colours with few passes.
-_MOST = 6.0
+#: The factor of the rate of the view-dependent colours with few passes: power, largest factor.
+_POWER, _MOST = 1.5, 6.0
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class LearningRates(Settings):
     sh_rest_passes: float = setting(
         0.0,
         "With fewer passes over the photos than this, the rate of the view-dependent colours is "
-        "higher by the same ratio, at most six times, so that a colour can change as much in "
-        "total; 0: never.",
+        "higher by the power 1.5 of the ratio, at most six times: a colour can change as much in "
+        "total, and reaches its value earlier; 0: never.",
         least=0.0,
         metavar="F",
     )
@@ -115,7 +115,7 @@ class LearningRates(Settings):
             "quats": factor * self.quats,
             "opacity_logits": factor * self.opacity_logits,
             "sh_dc": factor * self.sh_dc,
-            "sh_rest": factor * min(max(1.0, few), _MOST) * self.sh_rest,
+            "sh_rest": factor * min(max(1.0, few) ** _POWER, _MOST) * self.sh_rest,
         }
 
 

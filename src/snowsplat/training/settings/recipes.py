@@ -25,7 +25,8 @@ def default() -> TrainConfig:
     points on the surfaces, which are found by plane sweep, and in the sky; in the last part of the
     training, all learning rates decrease; opacities and scales decay, so that Gaussians which no
     photo needs become transparent; with few passes over the photos, view-dependent colours change
-    faster, and there are more steps, with small images for longer; Gaussians with an opacity below
+    faster, and there are more steps, with small images for longer; the mean of gradients covers
+    fewer steps, and the last steps decrease squared differences; Gaussians with an opacity below
     0.1 are removed, and their places are used again; no Gaussian is much nearer to a camera than
     the points that it sees; densification lasts longer, uses absolute gradients, and always reaches
     the maximum number; more Gaussians and fewer steps take the same time; objects that move between
@@ -39,6 +40,8 @@ def default() -> TrainConfig:
         initial_points=0.4,
         initial_opacity=0.3,
         initial_scale=0.6,
+        beta1=0.8,
+        huber_weight=10.0,
         sky=True,
         learning_rates=replace(
             config.learning_rates, sh_rest_passes=40.0, anneal=0.1, anneal_from=0.7
