@@ -168,8 +168,7 @@ class TrainConfig(Settings):
         "points",
         "Where the first Gaussians come from. points: the points of the dataset; sweep: depth maps "
         "computed from the photos (plane sweep); depth: the depth maps of the dataset "
-        "(depths/IMG.png); carve: voxels with the same colour in all photos (space carving); "
-        "random: random depths of random pixels. Example: points+sweep.",
+        "(depths/IMG.png); random: random depths of random pixels. Example: points+sweep.",
         allowed="names of starts, such as points+sweep",
         check=check_starts,
         metavar="START[+START…]",
