@@ -100,8 +100,7 @@ class Document:
 def _chunks(data: bytes) -> tuple[bytes, memoryview]:
     """The JSON text and the binary chunk (empty if there is none) of a GLB file.
 
-    Raises:
-        Damaged: not GLB 2, or chunks that exceed the file.
+    Raises: Damaged: not GLB 2, or chunks that exceed the file.
     """
     if len(data) < 20:
         raise Damaged("not a GLB file")

@@ -74,9 +74,8 @@ def is_gltf(head: bytes) -> bool:
 def read_gltf(path: Path | str) -> GaussianArrays:
     """Read all splats of the scene, placed by their nodes, as one set of Gaussians.
 
-    Raises:
-        UserError: the file cannot be read, is damaged, has no splats, or needs an unsupported
-            feature.
+    Raises: UserError: the file cannot be read, is damaged, has no splats, or needs an unsupported
+    feature.
     """
     path = Path(path)
     data = packing.read_file(path)
@@ -133,8 +132,7 @@ def _parts(
 
     The log scales are SCALE as it is stored; ``notes`` gets what is not read as it is meant.
 
-    Raises:
-        Damaged: more splats than the file can have, or another violation of the specification.
+    Raises: Damaged: more splats than the file can have, or another violation of the specification.
     """
     parts: list[tuple[GaussianArrays, np.ndarray]] = []
     seen = count = 0

@@ -68,8 +68,7 @@ def write_lod(
     The index is written last, so an interrupted call changes nothing. The levels of an index that
     is replaced are removed. The folder of the index is created if it is missing.
 
-    Args:
-        report: called with the number of finished files, of all files, and the word "files".
+    ``report``: called with the number of finished files, of all files, and the word "files".
 
     Raises:
         UserError: ``path`` has another name.

@@ -40,8 +40,7 @@ def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
 def write_mesh(path: Path, mesh: Mesh, comments: list[str]) -> None:
     """Write a mesh, or a cloud of points, in the format of the suffix, atomically.
 
-    Args:
-        comments: ASCII lines, for formats that have comments.
+    ``comments``: ASCII lines, for formats that have comments.
 
     Raises:
         UserError: an unknown suffix, or a mesh too large for the format.

@@ -65,8 +65,7 @@ class NearLimit(Part):
 
     def __init__(self, share: float) -> None:
         """
-        Args:
-            share: the limit, relative to the depth of the nearest points.
+        ``share``: the limit, relative to the depth of the nearest points.
         """
         self.share = share
         self._views: Frusta | None = None  # before the limits; None: no limit
@@ -124,8 +123,7 @@ class NearLimit(Part):
 def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:
     """Cameras between each camera and others that show the same points, and on its other side.
 
-    Args:
-        points: (P, 3) in the world frame, a sample of the scene.
+    ``points``: (P, 3) in the world frame, a sample of the scene.
     """
     partners = source_views(cameras, points, _PARTNERS)
     return [

@@ -112,8 +112,7 @@ class OverfittingCheck(Part):
     def between(self, run: Run) -> None:
         """Estimate if it is time; shorten the schedule if the scene overfits.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         step, schedule, dataset = run.step, run.schedule, run.dataset
         percent = _FIRST + _EVERY * self._estimates
@@ -186,11 +185,9 @@ def unseen_views(
         points: (P, 3) in the world frame.
         background: (3,) colour in 0..1.
 
-    Returns:
-        Empty if too few points have the same colour in two photos.
+    Returns: Empty if too few points have the same colour in two photos.
 
-    Raises:
-        UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged.
     """
     cameras = [view.camera for view in views]
     sample = points[:: max(1, len(points) // _SAMPLE)]

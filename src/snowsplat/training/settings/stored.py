@@ -29,8 +29,7 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
     Settings that an older version did not have get their default. Settings that this version does
     not have are ignored, with a warning, or refused if ``strict``.
 
-    Raises:
-        UserError: the density control is not registered; or the values are damaged.
+    Raises: UserError: the density control is not registered; or the values are damaged.
     """
     if not isinstance(values, dict) or _DENSITY_NAME not in values:
         raise UserError("the configuration: damaged; start the training again")
