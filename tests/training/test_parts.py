@@ -341,12 +341,11 @@ def test_parts_of_names_each_option():
         exposure="on",
         leave_out_after=0.1,
         refine_poses=True,
-        stop_overfitting=True,
         depth_weight=0.1,
         surfaces=True,
     )
     assert [part.name for part in parts_of(everything)] == [
-        "exposure", "unexplained", "poses", "overfitting", "transients", "depth", "near_limit",
+        "exposure", "unexplained", "poses", "transients", "depth", "near_limit",
         "sky", "density", "decay", "scale_limit", "smoothing", "surfaces",
     ]  # fmt: skip
     assert [part.name for part in parts_of(recipe("paper"))] == ["density", "decay"]

@@ -140,6 +140,5 @@ def _last_config(
         test_iterations=(),
         leave_out_after=0,
         transients="off",
-        stop_overfitting=False,
         sky=False,
     )

@@ -99,13 +99,6 @@ class TrainConfig(Settings):
         "the first masks are known.",
         metavar="{auto,on,off}",
     )
-    stop_overfitting: bool = setting(
-        False,
-        "Whether the training ends earlier if the views between the photos become worse. This "
-        "happens in long training runs with few photos. The dataset needs points.",
-        "off",
-        metavar="{on,off}",
-    )
     exposure: AutoOnOff = setting(
         "off",
         "Whether to learn a gain for each photo and colour channel, for photos with different "
@@ -369,7 +362,6 @@ def parts_of(config: TrainConfig) -> list[Part]:
     from snowsplat.training.parts.depth_supervision import DepthSupervision
     from snowsplat.training.parts.exposure import Exposure
     from snowsplat.training.parts.near_limit import NearLimit
-    from snowsplat.training.parts.overfitting import OverfittingCheck
     from snowsplat.training.parts.pose_refinement import PoseRefinement
     from snowsplat.training.parts.scale_limit import ScaleLimit
     from snowsplat.training.parts.sky import SkyPart
@@ -382,7 +374,6 @@ def parts_of(config: TrainConfig) -> list[Part]:
         (config.exposure != "off", Exposure(config.exposure)),
         (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
         (config.refine_poses, PoseRefinement()),
-        (config.stop_overfitting, OverfittingCheck()),
         (config.transients != "off", Transients(config.transients)),
         (config.depth_weight > 0, DepthSupervision(config.depth_weight)),
         (config.near_limit > 0, NearLimit(config.near_limit)),
