@@ -36,6 +36,7 @@ from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.safe_json import quoted
+from snowsplat.util.srgb import from_linear, to_linear
 
 logger = logging.getLogger(__name__)
 
@@ -250,7 +251,7 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     present = [name for name in names if name in attributes]
     if not present and "COLOR_0" in attributes:
         notes.add("it has no SH coefficients; the colours are those of COLOR_0")
-        sh = [(_display(read("COLOR_0", "VEC3", "VEC4")[:, :3]) - 0.5) / SH_C0]
+        sh = [(from_linear(read("COLOR_0", "VEC3", "VEC4")[:, :3]) - 0.5) / SH_C0]
     elif present != names[: len(present)] or len(present) - 1 not in SH_REST_COUNTS:
         raise Damaged(f"its {len(present)} SH coefficients do not match an SH degree")
     else:
@@ -266,17 +267,6 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     if len({len(array) for array in (*arrays, *sh)}) != 1:
         raise Damaged("its attributes have different lengths")
     return GaussianArrays(*(np.ascontiguousarray(array, np.float32) for array in arrays))
-
-
-def _display(linear: np.ndarray) -> np.ndarray:
-    """Colours of linear light, as COLOR_0 in glTF, encoded as sRGB; the inverse of `_linear`."""
-    power = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(linear <= 0.0031308, 12.92 * linear, power)
-
-
-def _linear(color: np.ndarray) -> np.ndarray:
-    """Colours in sRGB, 0 … 1, as linear light."""
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def _coefficients(degree: int) -> list[str]:
@@ -379,4 +369,4 @@ def _contents(names: list[str], arrays: list[np.ndarray], node: dict[str, Any]) 
 def _point_colors(sh_dc: np.ndarray, opacity: np.ndarray) -> np.ndarray:
     """(N, 4) uint8 RGBA: the colour without its view-dependent part, in linear light as in glTF."""
     color = np.clip(0.5 + SH_C0 * sh_dc[:, 0], 0, 1)
-    return packing.to_bytes(255 * np.concatenate([_linear(color), opacity[:, None]], 1))
+    return packing.to_bytes(255 * np.concatenate([to_linear(color), opacity[:, None]], 1))

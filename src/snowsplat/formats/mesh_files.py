@@ -18,6 +18,7 @@ from snowsplat.scene.origin import HERE
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.ply import header_of
+from snowsplat.util.srgb import to_linear
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 POINTS_SUFFIXES = (".ply", ".las", ".laz")
@@ -88,7 +89,7 @@ def _write_ply(path: Path, mesh: Mesh, comments: list[str]) -> None:
 def _write_glb(path: Path, mesh: Mesh, comments: list[str]) -> None:
     turn = y_up(mesh.up).T
     colors = np.full((len(mesh.colors), 4), 65535, "<u2")
-    colors[:, :3] = np.rint(65535 * _linear(mesh.colors / 255.0))
+    colors[:, :3] = np.rint(65535 * to_linear(mesh.colors / 255.0))
     arrays = {
         "POSITION": (mesh.vertices @ turn).astype("<f4"),
         "NORMAL": (_unit(mesh.normals) @ turn).astype("<f4"),
@@ -135,11 +136,6 @@ def _write_glb(path: Path, mesh: Mesh, comments: list[str]) -> None:
     }
     with open(path, "wb") as file:
         file.writelines(glb.pack(document, list(arrays.values())))
-
-
-def _linear(color: np.ndarray) -> np.ndarray:
-    """Linear light, as glTF stores colours, of sRGB in 0..1."""
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def _unit(normals: np.ndarray) -> np.ndarray:
