@@ -53,8 +53,8 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
             if weak or position[other] - position[one] > _MAX_GAP:
                 return True
         near = np.flatnonzero(strong[index])
-        links = np.nonzero(strong[np.ix_(near, near)])
-        return len(near) < 2 or bool(components(*links, len(near)).any())
+        edges = np.nonzero(strong[np.ix_(near, near)])
+        return len(near) < 2 or bool(components(*edges, len(near)).any())
 
     # The number of matches of the second strongest pair of each photo. It is small for a photo at
     # the end of a walk, which may have one strong pair only.
