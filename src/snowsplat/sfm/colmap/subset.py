@@ -54,7 +54,7 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
                 return True
         near = np.flatnonzero(strong[index])
         edges = np.nonzero(strong[np.ix_(near, near)])
-        return len(near) < 2 or bool(components(*edges, len(near)).any())
+        return len(near) < 2 or bool(components(edges[0], edges[1], len(near)).any())
 
     # The number of matches of the second strongest pair of each photo. It is small for a photo at
     # the end of a walk, which may have one strong pair only.
