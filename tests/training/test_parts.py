@@ -319,6 +319,12 @@ def test_what_is_missing_is_named(dataset, saved, resumed, message):
     assert "\n" not in str(error.value)
 
 
+def test_the_state_of_a_part_that_left_the_package_is_dropped(dataset):
+    state = Trainer(dataset, CONFIG).state_tensors()
+    state["overfitting.best"] = torch.zeros(())
+    assert "overfitting.best" not in Trainer(dataset, CONFIG, state=state).state_tensors()
+
+
 def test_two_parts_of_one_name_are_rejected(dataset):
     with pytest.raises(UserError, match="two parts have the name 'Counted'"):
         trainer_with(dataset, Counted(), Counted())
