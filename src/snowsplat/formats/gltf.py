@@ -58,7 +58,7 @@ _MOST_PARTS = 1 << 12  # maximum number of primitives with splats
 OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
 LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
 _GLB_LIMIT = (1 << 32) - 1
-_FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
+_POINTS = 0  # the mode of a primitive
 
 
 def is_glb(head: bytes) -> bool:
@@ -302,19 +302,23 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     sh = np.concatenate([sh_dc, sh_rest], 1)
     degree = SH_REST_COUNTS.index(sh_rest.shape[1])
     attributes |= {name: sh[:, k] for k, name in enumerate(_coefficients(degree))}
-    arrays = [
-        np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
-        for values in attributes.values()
-    ]
-    if sum(array.nbytes for array in arrays) > _GLB_LIMIT - (1 << 20):
+    attributes = {
+        name: np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+        for name, values in attributes.items()
+    }
+    if sum(array.nbytes for array in attributes.values()) > _GLB_LIMIT - (1 << 20):
         raise UserError(f"{path}: {len(means)} Gaussians are too many for .glb; write .ply or .spz")
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "snowsplat"}}
     document["extensionsUsed"] = [EXTENSION]
     if gaussians.metres_per_unit:
         document["asset"]["extras"] = {"metres_per_unit": 1.0}
+    arrays: list[np.ndarray] = []
     if len(means):
+        splats = {"kernel": "ellipse", "colorSpace": _SPACES[0]}
+        primitive = {"mode": _POINTS, "extensions": {EXTENSION: splats}}
         node = _node(gaussians.origin, gaussians.metres_per_unit or 1.0)
-        document |= _contents(list(attributes), arrays, node)
+        scene, arrays = glb.contents(node, primitive, attributes)
+        document |= scene
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(glb.pack(document, arrays))
     cut.report(".ply keeps them")
@@ -327,43 +331,6 @@ def _node(origin: Origin, metres: float) -> dict[str, Any]:
     if any(origin):
         node["translation"] = [metres * x, -metres * y, -metres * z]
     return node | ({"scale": [metres] * 3} if metres != 1 else {})
-
-
-def _contents(names: list[str], arrays: list[np.ndarray], node: dict[str, Any]) -> dict[str, Any]:
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    offset = 0
-    for array in arrays:
-        count, width = array.shape
-        colors = array.dtype == np.uint8
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES}
-        views.append(view)
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": _BYTE if colors else _FLOAT,
-                "count": count,
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width],
-                **({"normalized": True} if colors else {}),
-            }
-        )
-        offset += array.nbytes
-    # The specification requires the bounds of POSITION, as exact float32 values.
-    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(names)},
-        "mode": _POINTS,
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": _SPACES[0]}},
-    }
-    return {
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
-    }
 
 
 def _point_colors(sh_dc: np.ndarray, opacity: np.ndarray) -> np.ndarray:
