@@ -21,7 +21,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from snowsplat.scene.orientation import up_direction
+from snowsplat.scene.orientation import level_of_cameras
 from snowsplat.sfm.gps import east_north_up, middle_of
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
@@ -87,7 +87,7 @@ def row(dataset: Path) -> str:
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     rotations = np.array([image.cam_from_world().matrix()[:, :3] for image in images])
     scene = oriented.scene_from_sfm
-    held = scene.rotation.numpy() @ up_direction(rotations)
+    held = scene.rotation.numpy() @ level_of_cameras(rotations)[0]
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     tilt, share = largest_plane(scene.apply(torch.from_numpy(points)).numpy())
     centres = np.array([image.projection_center() for image in images])

@@ -11,12 +11,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat._version import __version__
 from snowsplat.cli import main as module
 from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core import checkpoint
 
 from ..fork_server import ENVIRONMENT
@@ -141,14 +141,12 @@ def test_info_describes_each_kind_of_file_and_folder_without_torch(tmp_path):
         for suffix in (".compressed.ply", ".ply", ".spz", ".sog", ".glb", ".splat")
     ]
     for path in scenes:
-        write_gaussians(
-            path, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator(), sh_degree=1)
-        )
+        write_gaussians(path, gaussians_in_box(UNIT_BOX, 20, torch.Generator(), sh_degree=1))
     write_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3)))
     saved = checkpoint.save(tmp_path, 5, {"a": torch.zeros(3)}, {})
     trained = tmp_path / "out/point_cloud/iteration_7/point_cloud.ply"
     trained.parent.mkdir(parents=True)
-    write_gaussians(trained, Gaussians.random_in_bounds(UNIT_BOX, 20, torch.Generator()))
+    write_gaussians(trained, gaussians_in_box(UNIT_BOX, 20, torch.Generator()))
     (tmp_path / "out/cfg_args").write_text("Namespace(source_path='garden')")
     described = [*scenes, tmp_path / "points.ply", saved, tmp_path / "out"]
     found = imported_by(*(["info", path] for path in described))

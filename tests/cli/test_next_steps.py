@@ -5,18 +5,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.cli.main import SUBCOMMANDS
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.subcommands import _WORDS
 from snowsplat.formats import write_gaussians
-from snowsplat.scene.gaussians import Gaussians
 
 
 @pytest.fixture
 def scene(tmp_path) -> Path:
     box = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    write_gaussians(tmp_path / "box.ply", Gaussians.random_in_bounds(box, 200, torch.Generator()))
+    write_gaussians(tmp_path / "box.ply", gaussians_in_box(box, 200, torch.Generator()))
     return tmp_path / "box.ply"
 
 

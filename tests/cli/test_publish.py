@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.scene.gaussians import Gaussians
 
 from ..browser import Browser
 
@@ -24,7 +24,7 @@ def scene(tmp_path_factory):
     """A file without cameras: a dense box of small Gaussians in random colours."""
     path = tmp_path_factory.mktemp("publish") / "box.ply"
     box = torch.tensor([[-0.3, -0.6, -0.3], [0.3, 0.0, 0.3]])
-    write_gaussians(path, Gaussians.random_in_bounds(box, 1500, torch.Generator(), 1, 0.9))
+    write_gaussians(path, gaussians_in_box(box, 1500, torch.Generator(), 1, 0.9))
     return path
 
 
@@ -126,7 +126,7 @@ def test_errors(refused, scene, tmp_path):
     assert "`iteration`" not in refused(*site, "--iteration", 3)
     empty = tmp_path / "empty.ply"
     box = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    nothing = Gaussians.random_in_bounds(box, 1, torch.Generator()).select(torch.zeros(0).long())
+    nothing = gaussians_in_box(box, 1, torch.Generator()).select(torch.zeros(0).long())
     write_gaussians(empty, nothing)
     assert "contains no Gaussians" in refused("publish", empty, "-o", tmp_path / "b")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.ply"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
@@ -21,7 +22,6 @@ from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.view import viewed_scene
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
@@ -43,7 +43,7 @@ def scene(request, tmp_path):
 def write_scene(folder: Path, with_cameras: bool) -> Path:
     """A scene file; with cameras, in the folder of `make`, tilted and large: the page turns it."""
     box = torch.tensor([[-40.0, -40.0, -40.0], [40.0, 40.0, 40.0]])
-    gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
+    gaussians = gaussians_in_box(box, N, torch.Generator().manual_seed(0), 1)
     gaussians = replace(gaussians, log_scales=gaussians.log_scales + 2.0)
     file = folder / "made" / "tour.ply"
     file.parent.mkdir()

@@ -18,7 +18,7 @@ from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.parts import overfitting, unexplained
+from snowsplat.training.parts import unexplained
 from snowsplat.training.parts.unexplained import left_out_line
 from snowsplat.util.errors import SettingError, UserError
 
@@ -232,40 +232,6 @@ def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
 )  # fmt: skip
 def test_the_line_about_photos_that_are_left_out(count, expected):
     assert left_out_line([f"{i}.jpg" for i in range(count)]) == expected
-
-
-def test_a_training_that_ends_early_says_so_also_when_resumed(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(overfitting, "_DIFFERENCE", -100.0)  # every estimate is worse
-    settings = {"iterations": 200, "stop_overfitting": True}
-    line = "stopped after 133 of 200 steps: the views between the photos became worse"
-    whole = train(dataset, tmp_path / "whole", TrainOptions(settings=settings))
-
-    recorder = Recorder(interrupt_at=120)
-    with pytest.raises(TrainingStopped):
-        train(dataset, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
-    assert recorder.notes.count(line) == 1
-    assert recorder.events.index("note", 3) == recorder.events.index("step 111") - 1
-
-    recorder = Recorder()
-    result = resume(tmp_path / "out", observer=recorder)
-    assert recorder.notes.count(line) == 1
-    assert (result.step, result.ended_early) == (133, line)
-    assert f"<p>The training {line}.</p>" in result.report.read_text()
-    assert result.scene.read_bytes() == whole.scene.read_bytes()
-
-    longer = resume(tmp_path / "out", TrainOptions(settings={"iterations": 205}))
-    assert (longer.step, longer.ended_early) == (205, None)
-    assert "<p>The training stopped" not in longer.report.read_text()
-
-
-def test_a_time_budget_does_not_lengthen_a_training_that_ends_early(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(overfitting, "_DIFFERENCE", -100.0)
-    options = TrainOptions(minutes=0.1, settings={"stop_overfitting": True})
-    result = train(dataset, tmp_path, options)
-    assert result.ended_early is not None
-    assert result.ended_early.startswith(f"stopped after {result.step} of ")
-    assert result.time is not None
-    assert result.time[0] < result.time[1]
 
 
 def test_options_that_contradict_each_other():

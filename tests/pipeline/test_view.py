@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.lod import INDEX, read_index
@@ -24,7 +25,7 @@ from snowsplat.viewer.http.served_file import FileOnDisk
 @pytest.fixture
 def scene(tmp_path) -> Path:
     box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(box, 500, torch.Generator().manual_seed(0), 1)
+    gaussians = gaussians_in_box(box, 500, torch.Generator().manual_seed(0), 1)
     write_gaussians(tmp_path / "box.ply", gaussians)
     return tmp_path / "box.ply"
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.extras.globe.make_globe import make_globe
 from snowsplat.formats import write_gaussians
@@ -13,7 +14,6 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.train import TrainOptions, train
 from snowsplat.pipeline.view import viewed_scene
-from snowsplat.scene.gaussians import Gaussians
 
 
 class Waits(Observer):
@@ -38,7 +38,7 @@ class Waits(Observer):
 @pytest.fixture
 def scene(tmp_path) -> Path:
     box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(box, 300, torch.Generator().manual_seed(0), 1)
+    gaussians = gaussians_in_box(box, 300, torch.Generator().manual_seed(0), 1)
     write_gaussians(tmp_path / "box.ply", gaussians)
     return tmp_path / "box.ply"
 

@@ -108,17 +108,6 @@ def test_coincident_points_have_a_size_and_no_points_is_an_error():
         Gaussians.from_points(Points(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)))
 
 
-def test_random_in_bounds_is_inside_and_repeatable():
-    bounds = torch.tensor([[-1.0, 2.0, -3.0], [1.0, 3.0, 0.0]])
-    a, b = (
-        Gaussians.random_in_bounds(bounds, 500, torch.Generator().manual_seed(7)) for _ in range(2)
-    )
-    assert ((a.means >= bounds[0]) & (a.means <= bounds[1])).all()
-    assert (a.means.amax(0) - a.means.amin(0) > 0.9 * (bounds[1] - bounds[0])).all()
-    for name, tensor in a.parameters().items():
-        assert torch.equal(tensor, b.parameters()[name])
-
-
 def test_usable_rows():
     gaussians = Gaussians(
         torch.zeros(4, 3),

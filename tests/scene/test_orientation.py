@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from snowsplat.scene.geometry import look_at, rotation_from_quat
-from snowsplat.scene.orientation import scene_up, up_direction, up_of_surfaces
+from snowsplat.scene.orientation import level_of_cameras, scene_up, up_of_surfaces
 
 UP = torch.nn.functional.normalize(torch.tensor([0.2, -0.9, 0.3], dtype=torch.float64), dim=0)
 
@@ -33,19 +33,19 @@ def rotations(pitch: float, roll: float, sector: float) -> np.ndarray:
 
 @pytest.mark.parametrize("pitch", [0.0, 0.5, 1.0])
 def test_cameras_on_a_circle_look_down(pitch):
-    up = up_direction(rotations(pitch, 0.0, 6.0))
+    up = level_of_cameras(rotations(pitch, 0.0, 6.0))[0]
     assert float(up @ UP.numpy()) > math.cos(math.radians(0.5))
 
 
 def test_cameras_on_an_arc_with_random_roll():
-    up = up_direction(rotations(0.3, math.radians(3), 2.0))
+    up = level_of_cameras(rotations(0.3, math.radians(3), 2.0))[0]
     assert float(up @ UP.numpy()) > math.cos(math.radians(3))
 
 
 def test_photos_rolled_by_90_degrees_have_little_weight():
     some = rotations(0.3, math.radians(2), 6.0)
     some[::4] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ some[::4]
-    assert float(up_direction(some) @ UP.numpy()) > math.cos(math.radians(3))
+    assert float(level_of_cameras(some)[0] @ UP.numpy()) > math.cos(math.radians(3))
 
 
 @pytest.mark.parametrize("sector", [0.05, 0.5, 3.0])
@@ -63,7 +63,7 @@ def test_the_result_is_the_most_likely_direction(sector):
         spread = math.radians(3) ** 2 + (roll / 3) ** 2
         return float(4.5 * np.log(spread).sum() - mean @ up / math.radians(30) ** 2)
 
-    up = up_direction(found)
+    up = level_of_cameras(found)[0]
     across = np.linalg.svd(up[None])[2][1:]
     for angle in np.linspace(0, 2 * math.pi, 12):
         other = up + 1e-3 * (math.cos(angle) * across[0] + math.sin(angle) * across[1])

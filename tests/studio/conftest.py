@@ -13,10 +13,10 @@ from urllib.parse import urlsplit
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import write_gaussians
 from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.studio import job, worker
 from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library
@@ -53,7 +53,7 @@ def of_the_command_line(folder: Path, step: int = 5) -> Path:
     file = OutputFolder(folder).scene_path(step)
     file.parent.mkdir(parents=True)
     box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
-    write_gaussians(file, Gaussians.random_in_bounds(box, 50, torch.Generator().manual_seed(0), 1))
+    write_gaussians(file, gaussians_in_box(box, 50, torch.Generator().manual_seed(0), 1))
     return file
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.publish import publish
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.studio.library import Scene
 from snowsplat.util.files import write_json
 
@@ -28,7 +28,7 @@ def finished(library) -> Scene:
     """A scene of Gaussians in a flat box, as a job leaves it."""
     scene = library.new("Box", [])
     box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
-    gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
+    gaussians = gaussians_in_box(box, N, torch.Generator().manual_seed(0), 1)
     file = scene.made / "box.ply"
     file.parent.mkdir()
     write_gaussians(file, gaussians)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.decay import INTERVAL, Decay
@@ -15,7 +16,7 @@ from .stage import stage
 def scene() -> Gaussians:
     generator = torch.Generator().manual_seed(5)
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(bounds, 7, generator)
+    gaussians = gaussians_in_box(bounds, 7, generator)
     gaussians.opacity_logits = torch.linspace(-30.0, 30.0, 7)
     return gaussians
 

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 from torch import Tensor
 
 from snowsplat.data import load_dataset
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.trainer import Trainer
@@ -40,7 +40,7 @@ def removed(
 ) -> list[bool]:
     """Which Gaussians at ``means`` a limit of 0.5 removes."""
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
+    gaussians = gaussians_in_box(bounds, len(means), torch.Generator().manual_seed(5))
     gaussians.means = torch.tensor(means)
     before = gaussians.clone()
     limit, run = NearLimit(0.5), stage(gaussians, INTERVAL, cameras=cameras, points=points)
@@ -93,7 +93,7 @@ def test_views_with_few_points_have_no_limit():
 
 def test_nothing_is_removed_without_points_and_between_the_steps_of_the_limit():
     assert removed([camera(0.0)], None, [[0.0, 0.0, 4.0]]) == [False]
-    gaussians = Gaussians.random_in_bounds(
+    gaussians = gaussians_in_box(
         torch.tensor([[-1.0, -1.0, 1.0], [1.0, 1.0, 2.0]]), 9, torch.Generator().manual_seed(5)
     )
     before = gaussians.clone()

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
@@ -26,7 +27,7 @@ CAMERAS = [camera(0.0), camera(100.0)]
 def scene() -> Gaussians:
     """Means at the distances 2, 8, 5 and 0 from the nearest camera; scales 0.5, 1.5 and 3."""
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(bounds, 4, torch.Generator().manual_seed(5))
+    gaussians = gaussians_in_box(bounds, 4, torch.Generator().manual_seed(5))
     gaussians.means = torch.tensor(
         [[2.0, 0.0, 0.0], [0.0, 0.0, 8.0], [103.0, 4.0, 0.0], [0.0, 0.0, 0.0]]
     )

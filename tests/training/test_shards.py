@@ -25,7 +25,6 @@ RUNS = [
     {
         **DENSE,
         "batch": 4,
-        "stop_overfitting": True,
         "leave_out_after": 0.3,
         "exposure": "on",
         "transients": "on",

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tests.gaussians import gaussians_in_box
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -18,7 +19,6 @@ from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at, rotation_from_quat
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts import found_sky
@@ -210,7 +210,7 @@ def test_the_limit_removes_gaussians_before_the_sky(outdoors):
     sky = find_sky(outdoors, images(outdoors))
     means = torch.cat([EMPTY, outdoors.points.xyz[:4], sky.points(5).xyz])
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(bounds, len(means), torch.Generator().manual_seed(5))
+    gaussians = gaussians_in_box(bounds, len(means), torch.Generator().manual_seed(5))
     gaussians.means = means
     before = gaussians.opacities.clone()
     limit = SkyPart()

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
@@ -34,7 +35,7 @@ def test_the_rate_is_the_largest_of_the_photos_that_show_the_mean():
 
 def scene() -> Gaussians:
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    gaussians = Gaussians.random_in_bounds(bounds, 5, torch.Generator().manual_seed(5))
+    gaussians = gaussians_in_box(bounds, 5, torch.Generator().manual_seed(5))
     gaussians.means = MEANS.clone()
     gaussians.log_scales = torch.tensor([0.01, 1e-4, 0.5]).log().repeat(5, 1)
     gaussians.log_scales[1:] = math.log(1e-4)

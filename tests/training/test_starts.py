@@ -1,4 +1,4 @@
-"""The starts that need no points: random rays and space carving; the choice of starts."""
+"""The starts that need no points: random rays; the choice of starts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, transform_points
 from snowsplat.training.settings import TrainConfig, changed
-from snowsplat.training.starts import carve, carved_points, random_points
+from snowsplat.training.starts import random_points
 from snowsplat.training.starts.init import initial_count, initial_gaussians, starts_at_random
 
 SIZE = 64
@@ -77,36 +77,8 @@ def sphere(request, tmp_path_factory) -> Dataset:
     return written(tmp_path_factory.mktemp("sphere"), request.param)
 
 
-@pytest.fixture
-def coarse(monkeypatch) -> None:
-    """Carving with large voxels, which takes an eighth of the time."""
-    monkeypatch.setattr(carve, "_SIDE", 48)
-
-
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
-
-
-@pytest.mark.slow
-def test_carved_points_lie_on_the_surface(sphere: Dataset) -> None:
-    points = carved_points(sphere, ImageLoader(sphere.train), 2000, generator())
-    low, high = sphere.bounds
-    voxel = float((high - low).max()) / carve._SIDE
-    colored = points.rgb.to(torch.int32).amax(1) > 50  # a black background is a consistent shape
-    xyz, rgb = points.xyz[colored], points.rgb[colored]
-    assert len(xyz) > 600
-    distance = xyz.norm(dim=1) - RADIUS
-    assert float(distance.abs().median()) < voxel
-    assert float(distance.abs().quantile(0.9)) < 4 * voxel
-    on_sphere = torch.nn.functional.normalize(xyz, dim=1)
-    assert float((rgb - 255 * texture(on_sphere)).abs().median()) < 20
-
-
-def test_without_a_view_that_shows_it_nothing_is_carved(sphere: Dataset, coarse) -> None:
-    points = carved_points(
-        replace(sphere, train=sphere.train[:1]), ImageLoader(sphere.train), 100, generator()
-    )
-    assert len(points) == 0
 
 
 def test_random_points_have_the_colours_of_their_rays(tmp_path: Path) -> None:
@@ -140,8 +112,7 @@ def test_random_points_are_in_several_views(sphere: Dataset) -> None:
     assert bool(opaque.all()) == transparent  # transparent pixels are not used
 
 
-@pytest.mark.parametrize("start", [carved_points, random_points])
-def test_the_same_seed_gives_the_same_points(sphere: Dataset, coarse, start) -> None:
+def test_the_same_seed_gives_the_same_points(sphere: Dataset) -> None:
     threads = torch.get_num_threads()
     images = ImageLoader(sphere.train)
     few = replace(sphere, train=sphere.train[::4])
@@ -149,7 +120,7 @@ def test_the_same_seed_gives_the_same_points(sphere: Dataset, coarse, start) -> 
     try:
         for n, seed in ((1, 0), (3, 0), (1, 1)):
             torch.set_num_threads(n)
-            clouds.append(start(few, images, 300, generator(seed)))
+            clouds.append(random_points(few, images, 300, generator(seed)))
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(clouds[0].xyz, clouds[1].xyz)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.gaussians import gaussians_in_box
 
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import ImageSource, LoadedImage
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.step_runner import StepRunner
@@ -26,7 +26,7 @@ from snowsplat.training.settings.rates import LearningRates
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(3, 4).double())
 VIEW = View("a.png", CAMERA, ImageSource(Path("a.png"), 8, 6))
 PHOTO = LoadedImage(torch.zeros(3, 6, 8, dtype=torch.uint8))
-GAUSSIANS = Gaussians.random_in_bounds(
+GAUSSIANS = gaussians_in_box(
     torch.tensor([[-1.0, -1.0, 1.0], [1.0, 1.0, 3.0]]), 4, torch.Generator().manual_seed(0)
 )
 

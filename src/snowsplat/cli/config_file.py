@@ -26,11 +26,9 @@ def expanded(kind: Any, arguments: Sequence[str]) -> list[str]:
 
     Flags among the arguments have priority. A `config.json` is left to `training_in`.
 
-    Args:
-        kind: the dataclass of the subcommand.
+    ``kind``: the dataclass of the subcommand.
 
-    Raises:
-        UserError: the file is not readable, or contains what is no flag of the subcommand.
+    Raises: UserError: the file is not readable, or contains what is no flag of the subcommand.
     """
     rest, added = list(arguments), list[str]()
     known = spellings(kind)
@@ -108,11 +106,9 @@ def _spelling(argument: str) -> str:
 def _arguments(spelling: str, value: Any, hint: Any, repeated: bool) -> Iterator[str]:
     """The arguments that set a flag to a value of JSON.
 
-    Args:
-        repeated: whether the flag is given once for each item of a list.
+    ``repeated``: whether the flag is given once for each item of a list.
 
-    Raises:
-        ValueError: the flag cannot have the value.
+    Raises: ValueError: the flag cannot have the value.
     """
     kinds = kinds_of(hint)
     if bool in kinds:

@@ -79,8 +79,7 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
 def spellings(kind: Any) -> dict[str, tuple[str, Any, Setting]]:
     """Each spelling of a flag of a subcommand -> its field, its type, and its declaration.
 
-    Args:
-        kind: the dataclass of the subcommand.
+    ``kind``: the dataclass of the subcommand.
     """
     return dict(_flags(kind))
 

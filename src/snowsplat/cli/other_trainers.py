@@ -62,6 +62,8 @@ def advice(subcommand: str, name: str, flags: Collection[str]) -> str | None:
         return "convert.py is snowsplat sfm -s DATASET"
     if groups and f"--{word}" in flags:
         return f"use --{word}"
+    if word == "stop-overfitting":
+        return "leave it out; it was removed, because the default recipe does not overfit"
     if word in ("save-ply", "disable-video"):
         return "leave it out; train writes the scene as PLY, and render writes videos"
     of_word = {w: new for new, words in _FLAGS.items() for w in words.split()}

@@ -107,8 +107,7 @@ def _scale_of(path: Path) -> NDArray[np.uint8] | None:
 def _scale(folder: Path, suffix: str, changed: int) -> NDArray[np.uint8] | None:
     """As `_scale_of`, for the files with an extension.
 
-    Args:
-        changed: when a file was added; only to read the folder again.
+    ``changed``: when a file was added; only to read the folder again.
     """
     low, high = 65535, 0
     for values in _deep_photos(folder, suffix):

@@ -38,8 +38,7 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
         cameras: at least one.
         points: (P, 3) in the world frame, or None.
 
-    Raises:
-        ValueError: there are no cameras.
+    Raises: ValueError: there are no cameras.
     """
     if not cameras:
         raise ValueError("scene_bounds needs at least one camera")

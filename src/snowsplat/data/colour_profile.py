@@ -96,8 +96,7 @@ def _apply(transform: ImageCms.ImageCmsTransform, image: Image.Image) -> Image.I
 def _transform(profile: bytes, pixels: str) -> ImageCms.ImageCmsTransform | str | None:
     """The conversion to sRGB; None if it changes no colour; or why the profile cannot be used.
 
-    Args:
-        pixels: the mode of the image: RGB, L or CMYK. Grey pixels may have a profile of colours.
+    ``pixels``: the mode of the image: RGB, L or CMYK. Grey pixels may have a profile of colours.
     """
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))

@@ -106,8 +106,7 @@ class Header:
 def read_header(path: Path) -> Header:
     """Read the size and orientation of an image file, without decoding it.
 
-    Raises:
-        UserError: the file is missing or is not a readable image.
+    Raises: UserError: the file is missing or is not a readable image.
     """
     with _opened(path, header_only=True) as image:
         # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
@@ -125,8 +124,7 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
         source: the file and the size of the result.
         background: RGB in 0..1. A transparent image is composited over it.
 
-    Raises:
-        UserError: the file is missing, damaged, or not an image.
+    Raises: UserError: the file is missing, damaged, or not an image.
     """
     planes = _decoded(source, background)
     return torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
@@ -158,8 +156,7 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
     A JPEG file is decoded at a fraction of its size, which is several times faster. The pixels are
     close to those of `load_image`, but not equal. Smaller images are not enlarged.
 
-    Raises:
-        UserError: the file is missing, damaged, or not an image.
+    Raises: UserError: the file is missing, damaged, or not an image.
     """
     size = scaled_size(source.width, source.height, side)
     with _opened(source.path) as opened:
@@ -179,8 +176,7 @@ def load_mask(source: ImageSource) -> Tensor:
 
     Pixels of a view that the lens does not show are False.
 
-    Raises:
-        UserError: see `load_image`.
+    Raises: UserError: see `load_image`.
     """
     return _mask_of(None if source.blank else _decoded_mask(source), source)
 

@@ -90,9 +90,8 @@ def to_z(
         photo_z: (H, W); the values are of a photo whose optical axis has another direction, and
             this is z in the frame of the photo of the points at z = 1 of the camera.
 
-    Raises:
-        UserError: no value is known, or only one of ``near`` and ``far`` is given, or they are not
-            0 < near < far.
+    Raises: UserError: no value is known, or only one of ``near`` and ``far`` is given, or they are
+    not 0 < near < far.
     """
     if (near is None) != (far is None):
         raise UserError("`near` and `far` are the two ends of a range; set both of them")

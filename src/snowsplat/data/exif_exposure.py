@@ -16,9 +16,8 @@ def exif_exposure(path: Path) -> float | None:
 
     One more means a photo of twice the brightness. The zero point is arbitrary.
 
-    Returns:
-        None if exposure time t, f-number N or ISO is missing or not positive, or the file cannot
-        be read.
+    Returns: None if exposure time t, f-number N or ISO is missing or not positive, or the file
+    cannot be read.
     """
     try:
         with Image.open(path) as image:

@@ -247,10 +247,9 @@ def _estimated_bytes(key: _Key) -> int:
 def available_memory(device: torch.device | None = None) -> int:
     """Bytes of memory that this process can still allocate.
 
-    Args:
-        device: the device. For a CUDA device, the result is its free memory; otherwise the free
-            memory of the computer without swap space, limited by the control group (container)
-            of the process.
+    ``device``: the device. For a CUDA device, the result is its free memory; otherwise the free
+    memory of the computer without swap space, limited by the control group (container) of the
+    process.
     """
     if device is not None and device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]

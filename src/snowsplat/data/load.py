@@ -159,8 +159,7 @@ def read_files(
 ) -> DatasetFiles:
     """Read and check the files of a dataset, once for several resolutions.
 
-    Args:
-        resolution: 2, 4 or 8 selects the folder ``images_2`` …; other values select the full size.
+    ``resolution``: 2, 4 or 8 selects the folder ``images_2`` …; other values select the full size.
 
     The other arguments and the errors are those of `load_dataset`.
     """

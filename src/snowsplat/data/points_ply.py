@@ -19,8 +19,7 @@ def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
 
     The normals (nx, ny, nz) are 0.
 
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full.
+    Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
     rows = np.zeros(len(xyz), _POINT)
     for column, name in enumerate(_POSITION):
@@ -40,8 +39,7 @@ def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
 
     Floating-point colours are expected in 0..1. Without colours, all points are grey (128).
 
-    Raises:
-        UserError: the file is missing, damaged, truncated, or has no columns x, y, z.
+    Raises: UserError: the file is missing, damaged, truncated, or has no columns x, y, z.
     """
     table = open_table(path)
     if not all(name in table.columns for name in _POSITION):

@@ -80,8 +80,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
         files: the result of `find_transforms`.
         images: a folder to use instead of ``images``, for example ``images_4``.
 
-    Raises:
-        UserError: a file is damaged or of another kind, or no image is there.
+    Raises: UserError: a file is damaged or of another kind, or no image is there.
     """
     root = files[0].parent
     shown = " + ".join(path.name for path in files)
@@ -209,8 +208,7 @@ def _named_splits(scene: _Json) -> dict[str, _Split]:
 def _path_inside(where: str, root: Path, name: str) -> Path:
     """``root / name``, or if that is not there, the end of ``name`` that is a path in ``root``.
 
-    Raises:
-        UserError: there is no such file, and ``root / name`` is outside the folder ``root``.
+    Raises: UserError: there is no such file, and ``root / name`` is outside the folder ``root``.
     """
     name = name.replace("\\", "/")
     path = inside(root, name)

@@ -69,8 +69,7 @@ def lens_of(
         width, height: of the photo that the intrinsics are for.
         intrinsics: fx, fy, cx, cy in pixels.
 
-    Raises:
-        UserError: the model is not known, or a coefficient is not a number.
+    Raises: UserError: the model is not known, or a coefficient is not a number.
     """
     if is_panorama(values):
         return LensModel("EQUIRECTANGULAR", width, height, (float(width), float(height)))

@@ -63,9 +63,8 @@ def is_archive(head: bytes) -> bool:
 def read_archive(path: Path | str) -> GaussianArrays:
     """Read the scene in a zip file.
 
-    Raises:
-        UserError: the file cannot be read, is damaged, or contains no scene, several scenes, or one
-            of a kind that is only read on its own.
+    Raises: UserError: the file cannot be read, is damaged, or contains no scene, several scenes, or
+    one of a kind that is only read on its own.
     """
     path = Path(path)
     try:

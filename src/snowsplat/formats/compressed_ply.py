@@ -55,8 +55,7 @@ def is_compressed_ply(head: bytes) -> bool:
 def read_compressed_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     """Read a scene of any SH degree.
 
-    Args:
-        data: see `open_table`.
+    ``data``: see `open_table`.
 
     Raises:
         UserError: the file cannot be read, is damaged or truncated, or is another kind of PLY file.
@@ -151,8 +150,7 @@ def _dequantize(
 def write_compressed_ply(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write the layout above, in the order of a space-filling curve, atomically.
 
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full.
+    Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
     parts = _encode(Path(path), gaussians)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:

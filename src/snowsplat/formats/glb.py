@@ -34,6 +34,9 @@ _COMPONENTS = {
     5123: ("<u2", 65535.0),
     5126: ("<f4", 1.0),
 }
+#: The component types of the arrays that are written.
+_CODES = {("f", 4): 5126, ("u", 1): 5121, ("u", 2): 5123, ("u", 4): 5125}
+_VERTICES, _ROWS = 34962, 34963  # the targets of buffer views
 
 
 class Document:
@@ -100,8 +103,7 @@ class Document:
 def _chunks(data: bytes) -> tuple[bytes, memoryview]:
     """The JSON text and the binary chunk (empty if there is none) of a GLB file.
 
-    Raises:
-        Damaged: not GLB 2, or chunks that exceed the file.
+    Raises: Damaged: not GLB 2, or chunks that exceed the file.
     """
     if len(data) < 20:
         raise Damaged("not a GLB file")
@@ -121,6 +123,54 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview]:
         raise Damaged("its first chunk is not JSON")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _BIN else memoryview(b"")
     return bytes(chunks[0][1]), binary
+
+
+def contents(
+    node: dict[str, Any],
+    primitive: dict[str, Any],
+    attributes: dict[str, np.ndarray],
+    rows: np.ndarray | None = None,
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The JSON of a scene of one ``node`` with one ``primitive``, and the arrays for `pack`.
+
+    Args:
+        attributes: (N, C) little-endian float32, or unsigned integers, which are normalised;
+            POSITION is the first.
+        rows: (M, 1) uint32, the corners of triangles.
+    """
+    arrays = [*attributes.values(), *([] if rows is None else [rows])]
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    offset = 0
+    for array in arrays:
+        target = _ROWS if array is rows else _VERTICES
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target}
+        accessor = {
+            "bufferView": len(views),
+            "componentType": _CODES[array.dtype.kind, array.itemsize],
+            "count": len(array),
+            "type": next(name for name, width in _WIDTHS.items() if width == array.shape[1]),
+        }
+        if array.dtype.kind == "u" and array is not rows:
+            accessor["normalized"] = True
+        views.append(view)
+        accessors.append(accessor)
+        offset += array.nbytes
+    # The specification requires the bounds of POSITION, as exact float32 values.
+    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}
+    used: dict[str, Any] = {"attributes": {name: k for k, name in enumerate(attributes)}}
+    if rows is not None:
+        used["indices"] = len(attributes)
+    document = {
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [used | primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    return document, arrays
 
 
 def pack(document: dict[str, Any], arrays: list[np.ndarray]) -> Iterator[bytes]:

@@ -36,6 +36,7 @@ from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.safe_json import quoted
+from snowsplat.util.srgb import from_linear, to_linear
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ _MOST_PARTS = 1 << 12  # maximum number of primitives with splats
 OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
 LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
 _GLB_LIMIT = (1 << 32) - 1
-_FLOAT, _BYTE, _POINTS, _VERTICES = 5126, 5121, 0, 34962
+_POINTS = 0  # the mode of a primitive
 
 
 def is_glb(head: bytes) -> bool:
@@ -74,9 +75,8 @@ def is_gltf(head: bytes) -> bool:
 def read_gltf(path: Path | str) -> GaussianArrays:
     """Read all splats of the scene, placed by their nodes, as one set of Gaussians.
 
-    Raises:
-        UserError: the file cannot be read, is damaged, has no splats, or needs an unsupported
-            feature.
+    Raises: UserError: the file cannot be read, is damaged, has no splats, or needs an unsupported
+    feature.
     """
     path = Path(path)
     data = packing.read_file(path)
@@ -133,8 +133,7 @@ def _parts(
 
     The log scales are SCALE as it is stored; ``notes`` gets what is not read as it is meant.
 
-    Raises:
-        Damaged: more splats than the file can have, or another violation of the specification.
+    Raises: Damaged: more splats than the file can have, or another violation of the specification.
     """
     parts: list[tuple[GaussianArrays, np.ndarray]] = []
     seen = count = 0
@@ -252,7 +251,7 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     present = [name for name in names if name in attributes]
     if not present and "COLOR_0" in attributes:
         notes.add("it has no SH coefficients; the colours are those of COLOR_0")
-        sh = [(_display(read("COLOR_0", "VEC3", "VEC4")[:, :3]) - 0.5) / SH_C0]
+        sh = [(from_linear(read("COLOR_0", "VEC3", "VEC4")[:, :3]) - 0.5) / SH_C0]
     elif present != names[: len(present)] or len(present) - 1 not in SH_REST_COUNTS:
         raise Damaged(f"its {len(present)} SH coefficients do not match an SH degree")
     else:
@@ -268,17 +267,6 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     if len({len(array) for array in (*arrays, *sh)}) != 1:
         raise Damaged("its attributes have different lengths")
     return GaussianArrays(*(np.ascontiguousarray(array, np.float32) for array in arrays))
-
-
-def _display(linear: np.ndarray) -> np.ndarray:
-    """Colours of linear light, as COLOR_0 in glTF, encoded as sRGB; the inverse of `_linear`."""
-    power = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(linear <= 0.0031308, 12.92 * linear, power)
-
-
-def _linear(color: np.ndarray) -> np.ndarray:
-    """Colours in sRGB, 0 … 1, as linear light."""
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def _coefficients(degree: int) -> list[str]:
@@ -314,19 +302,23 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     sh = np.concatenate([sh_dc, sh_rest], 1)
     degree = SH_REST_COUNTS.index(sh_rest.shape[1])
     attributes |= {name: sh[:, k] for k, name in enumerate(_coefficients(degree))}
-    arrays = [
-        np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
-        for values in attributes.values()
-    ]
-    if sum(array.nbytes for array in arrays) > _GLB_LIMIT - (1 << 20):
+    attributes = {
+        name: np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+        for name, values in attributes.items()
+    }
+    if sum(array.nbytes for array in attributes.values()) > _GLB_LIMIT - (1 << 20):
         raise UserError(f"{path}: {len(means)} Gaussians are too many for .glb; write .ply or .spz")
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "snowsplat"}}
     document["extensionsUsed"] = [EXTENSION]
     if gaussians.metres_per_unit:
         document["asset"]["extras"] = {"metres_per_unit": 1.0}
+    arrays: list[np.ndarray] = []
     if len(means):
+        splats = {"kernel": "ellipse", "colorSpace": _SPACES[0]}
+        primitive = {"mode": _POINTS, "extensions": {EXTENSION: splats}}
         node = _node(gaussians.origin, gaussians.metres_per_unit or 1.0)
-        document |= _contents(list(attributes), arrays, node)
+        scene, arrays = glb.contents(node, primitive, attributes)
+        document |= scene
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(glb.pack(document, arrays))
     cut.report(".ply keeps them")
@@ -341,44 +333,7 @@ def _node(origin: Origin, metres: float) -> dict[str, Any]:
     return node | ({"scale": [metres] * 3} if metres != 1 else {})
 
 
-def _contents(names: list[str], arrays: list[np.ndarray], node: dict[str, Any]) -> dict[str, Any]:
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    offset = 0
-    for array in arrays:
-        count, width = array.shape
-        colors = array.dtype == np.uint8
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES}
-        views.append(view)
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": _BYTE if colors else _FLOAT,
-                "count": count,
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width],
-                **({"normalized": True} if colors else {}),
-            }
-        )
-        offset += array.nbytes
-    # The specification requires the bounds of POSITION, as exact float32 values.
-    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(names)},
-        "mode": _POINTS,
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": _SPACES[0]}},
-    }
-    return {
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
-    }
-
-
 def _point_colors(sh_dc: np.ndarray, opacity: np.ndarray) -> np.ndarray:
     """(N, 4) uint8 RGBA: the colour without its view-dependent part, in linear light as in glTF."""
     color = np.clip(0.5 + SH_C0 * sh_dc[:, 0], 0, 1)
-    return packing.to_bytes(255 * np.concatenate([_linear(color), opacity[:, None]], 1))
+    return packing.to_bytes(255 * np.concatenate([to_linear(color), opacity[:, None]], 1))

@@ -37,8 +37,7 @@ def is_checkpoint(head: bytes) -> bool:
 def read_checkpoint(path: Path | str) -> GaussianArrays:
     """Read the Gaussians of a checkpoint; SH coefficients beyond degree 3 are ignored.
 
-    Raises:
-        UserError: the file cannot be read, is damaged, or is another kind of checkpoint.
+    Raises: UserError: the file cannot be read, is damaged, or is another kind of checkpoint.
     """
     path = Path(path)
     try:
@@ -104,8 +103,7 @@ def _splats(path: Path, content: Any) -> dict[Any, Any]:
 def _array(path: Path, tensor: Any) -> np.ndarray:
     """A tensor as float32, or as float64 if it has doubles.
 
-    Raises:
-        Damaged: not a tensor of floats, or larger than the file.
+    Raises: Damaged: not a tensor of floats, or larger than the file.
     """
     import torch
 

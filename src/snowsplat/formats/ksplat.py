@@ -55,8 +55,7 @@ class _Section:
 def read_ksplat(path: Path | str) -> GaussianArrays:
     """Read a scene of SH degree 0 to 3; the SH of sections of a lower degree are padded with zeros.
 
-    Raises:
-        UserError: the file cannot be read, has another version, or is damaged or truncated.
+    Raises: UserError: the file cannot be read, has another version, or is damaged or truncated.
     """
     path = Path(path)
     data = packing.read_file(path)

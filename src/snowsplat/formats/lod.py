@@ -77,12 +77,10 @@ def is_lod(head: bytes) -> bool:
 def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
     """Read one level of `lod-meta.json`; level 0 is the complete scene.
 
-    Args:
-        level: leaves without this level are read at the next coarser level that they have, and if
-            there is none, at the next finer one.
+    ``level``: leaves without this level are read at the next coarser level that they have, and if
+    there is none, at the next finer one.
 
-    Raises:
-        UserError: a file is missing or damaged.
+    Raises: UserError: a file is missing or damaged.
     """
     path = Path(path)
     index = read_index(path)
@@ -101,8 +99,7 @@ def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
 def read_index(path: Path) -> LodIndex:
     """The content of `lod-meta.json`.
 
-    Raises:
-        UserError: it cannot be read, is damaged, or names a file outside of its folder.
+    Raises: UserError: it cannot be read, is damaged, or names a file outside of its folder.
     """
     try:
         with reading(path):
@@ -127,8 +124,7 @@ def read_index(path: Path) -> LodIndex:
 def lod_files(path: Path) -> list[Path]:
     """The index and all files that it needs, directly or through the SOG scenes.
 
-    Raises:
-        UserError: a file is damaged.
+    Raises: UserError: a file is damaged.
     """
     index = read_index(path)
     scenes = [*index.files, *([index.environment] if index.environment else [])]

@@ -68,8 +68,7 @@ def write_lod(
     The index is written last, so an interrupted call changes nothing. The levels of an index that
     is replaced are removed. The folder of the index is created if it is missing.
 
-    Args:
-        report: called with the number of finished files, of all files, and the word "files".
+    ``report``: called with the number of finished files, of all files, and the word "files".
 
     Raises:
         UserError: ``path`` has another name.
@@ -271,14 +270,11 @@ class _Writer:
 
 def _corners(gaussians: GaussianArrays) -> np.ndarray:
     """(2, N, 3) the boxes around the ellipsoids of one standard deviation."""
-    w, x, y, z = gaussians.quats.astype(np.float64).T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    import torch  # not for the import of this module: it takes time
+
+    from snowsplat.scene.geometry import rotation_from_quat
+
+    rotation = rotation_from_quat(torch.from_numpy(gaussians.quats.astype(np.float64))).numpy()
     scales = np.exp(np.minimum(gaussians.log_scales, _LARGEST).astype(np.float64))
-    reach = np.sqrt(np.square(rotation * scales.T).sum(1)).T  # rotation[i, j]: entry i of axis j
+    reach = np.sqrt(np.square(rotation * scales[:, None]).sum(2))  # rotation[:, i, j]: i of axis j
     return np.stack([gaussians.means - reach, gaussians.means + reach])

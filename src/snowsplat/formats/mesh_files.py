@@ -18,6 +18,7 @@ from snowsplat.scene.origin import HERE
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.ply import header_of
+from snowsplat.util.srgb import to_linear
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 POINTS_SUFFIXES = (".ply", ".las", ".laz")
@@ -40,8 +41,7 @@ def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
 def write_mesh(path: Path, mesh: Mesh, comments: list[str]) -> None:
     """Write a mesh, or a cloud of points, in the format of the suffix, atomically.
 
-    Args:
-        comments: ASCII lines, for formats that have comments.
+    ``comments``: ASCII lines, for formats that have comments.
 
     Raises:
         UserError: an unknown suffix, or a mesh too large for the format.
@@ -89,58 +89,29 @@ def _write_ply(path: Path, mesh: Mesh, comments: list[str]) -> None:
 def _write_glb(path: Path, mesh: Mesh, comments: list[str]) -> None:
     turn = y_up(mesh.up).T
     colors = np.full((len(mesh.colors), 4), 65535, "<u2")
-    colors[:, :3] = np.rint(65535 * _linear(mesh.colors / 255.0))
-    arrays = {
+    colors[:, :3] = np.rint(65535 * to_linear(mesh.colors / 255.0))
+    attributes = {
         "POSITION": (mesh.vertices @ turn).astype("<f4"),
         "NORMAL": (_unit(mesh.normals) @ turn).astype("<f4"),
         "COLOR_0": colors,
-        "": mesh.faces.astype("<u4").reshape(-1, 1),
     }
-    if sum(array.nbytes for array in arrays.values()) > _GLB_LIMIT:
+    rows = mesh.faces.astype("<u4").reshape(-1, 1)
+    if sum(array.nbytes for array in (*attributes.values(), rows)) > _GLB_LIMIT:
         raise UserError("the mesh is too large for .glb; use .ply, or fewer `triangles`")
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    offset = 0
-    for name, array in arrays.items():
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes})
-        views[-1]["target"] = 34962 if name else 34963
-        kind = {"f": 5126, "u": 5123 if array.itemsize == 2 else 5125}[array.dtype.kind]
-        accessor: dict[str, Any] = {"bufferView": len(accessors), "componentType": kind}
-        accessor |= {
-            "count": len(array),
-            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]],
-        }
-        accessors.append(accessor | ({"normalized": True} if array.itemsize == 2 else {}))
-        offset += array.nbytes
-    places = arrays["POSITION"]
-    accessors[0] |= {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
     node: dict[str, Any] = {"mesh": 0, "name": "mesh"}
     if mesh.origin != HERE:
         node["translation"] = (np.array(mesh.origin) @ turn).tolist()
-    attributes = {name: i for i, name in enumerate(arrays) if name}
-    primitive = {"attributes": attributes, "indices": 3, "mode": 4, "material": 0}
+    scene, arrays = glb.contents(node, {"mode": 4, "material": 0}, attributes, rows)
     # The light of the scene is in the colours of the photos.
     material = {"extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
     material["pbrMetallicRoughness"] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
     document = {
         "asset": {"version": "2.0", "generator": "snowsplat"},
         "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
         "materials": [material],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
     }
     with open(path, "wb") as file:
-        file.writelines(glb.pack(document, list(arrays.values())))
-
-
-def _linear(color: np.ndarray) -> np.ndarray:
-    """Linear light, as glTF stores colours, of sRGB in 0..1."""
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+        file.writelines(glb.pack(document | scene, arrays))
 
 
 def _unit(normals: np.ndarray) -> np.ndarray:

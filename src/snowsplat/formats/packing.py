@@ -47,8 +47,7 @@ def check_count(path: Path, count: int, file_size: int) -> None:
     any format. A few bytes can declare millions of equal Gaussians, and each takes up to 600 bytes
     of memory while the file is read.
 
-    Raises:
-        UserError: more Gaussians than bytes, and more than `ALWAYS_ALLOWED`.
+    Raises: UserError: more Gaussians than bytes, and more than `ALWAYS_ALLOWED`.
     """
     if count > max(ALWAYS_ALLOWED, file_size):
         raise UserError(

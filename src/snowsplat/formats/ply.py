@@ -87,11 +87,9 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     are read as they are. Two scales are a flat Gaussian. The 3D filter of Mip-Splatting becomes
     part of scales and opacities (equation 9 of Yu et al. 2024).
 
-    Args:
-        data: see `open_table`.
+    ``data``: see `open_table`.
 
-    Raises:
-        UserError: the file is missing, damaged, truncated, or a PLY file without Gaussians.
+    Raises: UserError: the file is missing, damaged, truncated, or a PLY file without Gaussians.
     """
     table = open_table(path, data=data)
     if missing := _missing(table):
@@ -147,8 +145,7 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
 def _rest_count(table: PlyTable) -> int:
     """K of the f_rest properties of a file; may be that of a degree above 3.
 
-    Raises:
-        UserError: their number or their names do not match an SH degree.
+    Raises: UserError: their number or their names do not match an SH degree.
     """
     rest = [name for name in table.columns if name.startswith("f_rest_")]
     counts = [(degree + 1) ** 2 - 1 for degree in range(_HIGHEST_DEGREE + 1)]
@@ -219,11 +216,9 @@ def scene_comments(antialiased: bool, origin: Origin, metres: float | None) -> l
 def write_ply(path: Path | str, gaussians: GaussianArrays, *, georeferenced: bool = False) -> None:
     """Write the layout above, binary little-endian, atomically.
 
-    Args:
-        georeferenced: write the positions in the world, as doubles if the scene has an origin.
+    ``georeferenced``: write the positions in the world, as doubles if the scene has an origin.
 
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full.
+    Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
     write_ply_parts(
         path,
@@ -257,8 +252,7 @@ def write_ply_parts(
         origin, metres_per_unit: those of all parts.
         georeferenced: see `write_ply`.
 
-    Raises:
-        OSError: see `write_ply`.
+    Raises: OSError: see `write_ply`.
     """
     names = [*_MEANS, *_NORMALS, *_DC, *_rest_names(rest), "opacity", *_SCALES, *_QUATS]
     exact = georeferenced and any(origin)

@@ -64,9 +64,8 @@ def is_sog(head: bytes) -> bool:
 def read_sog(path: Path | str) -> GaussianArrays:
     """Read a zip file, or the `meta.json` of a folder, of version 1 or 2.
 
-    Raises:
-        UserError: the file cannot be read, is damaged, or declares an implausible number of
-            Gaussians.
+    Raises: UserError: the file cannot be read, is damaged, or declares an implausible number of
+    Gaussians.
     """
     return without_unusable(Path(path), read_stored(path))
 
@@ -98,8 +97,7 @@ def read_stored(path: Path | str) -> GaussianArrays:
 def sog_files(path: Path) -> list[Path]:
     """The files of a scene: the zip file, or `meta.json` and the images beside it.
 
-    Raises:
-        UserError: the file cannot be read or is damaged.
+    Raises: UserError: the file cannot be read or is damaged.
     """
     try:
         with Bundle(path) as files:
@@ -236,8 +234,7 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
 def sog_bytes(path: Path, gaussians: GaussianArrays) -> bytes:
     """The content of the file that `write_sog` writes; errors name ``path``.
 
-    Raises:
-        UserError: see `write_sog`.
+    Raises: UserError: see `write_sog`.
     """
     packable = packing.packable(path, gaussians)
     if len(packable.means) > (_SIDE_LIMIT - 3) ** 2:

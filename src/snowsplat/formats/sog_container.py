@@ -55,8 +55,7 @@ class Bundle:
     def image(self, name: str, least: int, most: int) -> np.ndarray:
         """The image ``name``, (H, W, 4) uint8, with ``least`` to ``most`` pixels.
 
-        Raises:
-            Damaged: it is missing, cannot be read, or has another number of pixels.
+        Raises: Damaged: it is missing, cannot be read, or has another number of pixels.
         """
         data = self._member(name) if self._zip is not None else self._file(self._beside(name))
         try:

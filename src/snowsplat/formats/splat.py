@@ -24,8 +24,7 @@ _LOG_LIMIT = 87.0  # the exponential of a larger number exceeds float32
 def read_splat(path: Path | str) -> GaussianArrays:
     """Read a scene of SH degree 0.
 
-    Raises:
-        UserError: the file cannot be read, or its size is not a multiple of 32.
+    Raises: UserError: the file cannot be read, or its size is not a multiple of 32.
     """
     path = Path(path)
     data = packing.read_file(path)
@@ -53,8 +52,7 @@ def write_splat(path: Path | str, gaussians: GaussianArrays) -> None:
     The format cannot store view-dependent colour (``sh_rest``). Gaussians are sorted by volume
     times opacity, as is usual for this format.
 
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full.
+    Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
     means, log_scales, quats, opacity_logits, sh_dc, _ = packing.packable(path, gaussians)

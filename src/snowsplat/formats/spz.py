@@ -70,9 +70,8 @@ def read_spz(path: Path | str) -> GaussianArrays:
 
     Of a tree of levels of detail of Spark, the finest level is read.
 
-    Raises:
-        UserError: the file cannot be read, has another version, is damaged or truncated, or
-            declares an implausible number of Gaussians.
+    Raises: UserError: the file cannot be read, has another version, is damaged or truncated, or
+    declares an implausible number of Gaussians.
     """
     return parse_spz(Path(path), packing.read_file(Path(path)))
 

@@ -87,8 +87,7 @@ def is_of_spark(data: bytes) -> bool:
 def read_header(path: Path, data: bytes) -> Header:
     """The header of the file content ``data``.
 
-    Raises:
-        UserError: another version, a damaged header, or an implausible number of Gaussians.
+    Raises: UserError: another version, a damaged header, or an implausible number of Gaussians.
     """
     head = data
     try:
@@ -102,8 +101,7 @@ def read_header(path: Path, data: bytes) -> Header:
 def unpack(path: Path, data: bytes) -> Contents:
     """The columns of the file content ``data``.
 
-    Raises:
-        UserError: see `read_header`; or the file is damaged or truncated.
+    Raises: UserError: see `read_header`; or the file is damaged or truncated.
     """
     try:
         return _unpack(path, data)

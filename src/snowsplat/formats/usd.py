@@ -73,8 +73,7 @@ def _usd(path: Path) -> Iterator[tuple[Any, ...]]:
 def read_usd(path: Path | str) -> GaussianArrays:
     """Read all splats of the stage, placed by their prims, as one set of Gaussians.
 
-    Raises:
-        UserError: usd-core is missing; the file cannot be read, is damaged, or has no splats.
+    Raises: UserError: usd-core is missing; the file cannot be read, is damaged, or has no splats.
     """
     path = Path(path)
     packing.read_file(path)  # a clear error if that is not possible

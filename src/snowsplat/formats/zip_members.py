@@ -71,8 +71,7 @@ class ZipMembers:
     def read(self, name: str, inflation: int) -> bytes:
         """The content of a member, at most ``inflation`` times as large as it is packed.
 
-        Raises:
-            Damaged: it is missing, damaged, or larger than that.
+        Raises: Damaged: it is missing, damaged, or larger than that.
         """
         try:
             info = self._zip.getinfo(name)

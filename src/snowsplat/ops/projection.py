@@ -193,9 +193,8 @@ def project_vjp(
 def pose_gradient(sums: Tensor, cam_from_world: Tensor) -> Tensor:
     """The gradient (3, 4) of a pose from the kernel's sums.
 
-    Args:
-        sums: (16,): 9 for R, 3 for t, 3 for the centre c = −Rᵀ t. The last one, for the focal
-            length, is not used.
+    ``sums``: (16,): 9 for R, 3 for t, 3 for the centre c = −Rᵀ t. The last one, for the focal
+    length, is not used.
     """
     d_rotation, d_translation, d_centre = sums[:9].view(3, 3), sums[9:12], sums[12:15]
     rotation, translation = cam_from_world[:, :3].double(), cam_from_world[:, 3].double()

@@ -63,8 +63,7 @@ def train_on_all(
         iteration: of the scene to begin with.
         seconds: the time that is left; infinite if there is no limit.
 
-    Raises:
-        UserError: scene, settings, dataset or a photo are missing or damaged.
+    Raises: UserError: scene, settings, dataset or a photo are missing or damaged.
     """
     if (folder.path / "masks").is_dir():
         return LastPart(why_not="something moves in the photos")
@@ -141,6 +140,5 @@ def _last_config(
         test_iterations=(),
         leave_out_after=0,
         transients="off",
-        stop_overfitting=False,
         sky=False,
     )

@@ -20,8 +20,7 @@ def cameras_from_above(output: Path | str) -> str:
 
     It needs no points. Up is the up direction of the cameras, whatever that of the dataset is.
 
-    Args:
-        output: the output folder of a training run that has begun.
+    ``output``: the output folder of a training run that has begun.
 
     Raises: UserError: its cameras or points are missing or damaged.
     """

@@ -43,9 +43,8 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
 
     The same call resumes after an interruption.
 
-    Args:
-        output: the output folder. It contains photos/, truth/ (the true poses) and made/ (the
-            output folder of `make`).
+    ``output``: the output folder. It contains photos/, truth/ (the true poses) and made/ (the
+    output folder of `make`).
 
     Raises:
         UserError: ``output`` is a file or contains other files; see also `make`.

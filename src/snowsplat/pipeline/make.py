@@ -60,7 +60,7 @@ from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures", "all")  # `make_dataset` records its own stages
 # The fields of a preset that affect the training.
-_TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval", "stop_overfitting")
+_TRAINING_FIELDS = ("side", "iterations", "max_gaussians", "densify_interval")
 # Photos that the scene does not explain after this fraction of the steps are left out of the
 # training: see docs/cameras.md.
 _LEAVE_OUT_AFTER = 0.2
@@ -345,6 +345,8 @@ class _Job:
         if self.options.minutes is None:
             preset = PRESETS[self.plan.quality]
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
+            # Version 0.2 recorded it, and its scenes need not be made again.
+            settings["stop_overfitting"] = self.plan.quality == "best"
         else:
             settings["minutes"] = self.options.minutes
         settings |= {**self._split, "exposure": self.options.exposure}

@@ -18,16 +18,13 @@ class Preset:
     # max_gaussians, densify_interval: settings of the training; None: the value of the recipe.
     max_gaussians: int | None
     densify_interval: int | None
-    # Whether the training ends earlier if the scene overfits. With few steps, this would only cost
-    # time.
-    stop_overfitting: bool
     # About the time of the training and of the test views, in seconds of one core of the reference
     # machine of `sfm.cost`.
     training: float
 
 
 PRESETS: dict[Quality, Preset] = {
-    "draft": Preset(1600, 640, 1500, 60_000, 50, False, 120.0),
-    "normal": Preset(2400, 1000, 2000, None, None, False, 500.0),
-    "best": Preset(3200, 1600, 10_000, 250_000, None, True, 4000.0),
+    "draft": Preset(1600, 640, 1500, 60_000, 50, 120.0),
+    "normal": Preset(2400, 1000, 2000, None, None, 500.0),
+    "best": Preset(3200, 1600, 10_000, 250_000, None, 4000.0),
 }

@@ -76,8 +76,7 @@ def render_panoramas(
         size: the width, twice the height, in pixels, e.g. "3840"; default: 3840.
         antialias: as in `render_images`.
 
-    Returns:
-        The folders and the number of images in each.
+    Returns: The folders and the number of images in each.
 
     Raises:
         UserError: there are no views in these splits, or the size is not possible.

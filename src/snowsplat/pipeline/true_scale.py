@@ -29,8 +29,7 @@ class KnownDistance:
         between: what it is between: two points "X,Y,Z" in the world of the scene, in the frame of
             a PLY, or the names of two photos, with or without suffix.
 
-    Raises:
-        SettingError: the length is none, or the two are the same.
+    Raises: SettingError: the length is none, or the two are the same.
     """
 
     length: str

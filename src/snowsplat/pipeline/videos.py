@@ -268,8 +268,7 @@ def cameras_along(
         trained: names and cameras of the photos; None for a scene file without an output folder.
         ease: see `VideoOptions`.
 
-    Raises:
-        UserError: no such path or file, or one that needs the cameras of a training run.
+    Raises: UserError: no such path or file, or one that needs the cameras of a training run.
     """
     if path not in CAMERA_PATHS:
         if Path(path).suffix.lower() != ".json":

@@ -55,8 +55,7 @@ def watch(
         dataset, resolution, compute: as in `load_trained`. With one of these, or with
             ``iteration``, only the folder is shown.
 
-    Raises:
-        UserError: scene, settings or dataset are missing or damaged; an unusable device.
+    Raises: UserError: scene, settings or dataset are missing or damaged; an unusable device.
     """
     folder = watched_folder(Path(output))
     of_folder = any(each is not None for each in (iteration, dataset, resolution))

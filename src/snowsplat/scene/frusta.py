@@ -13,8 +13,7 @@ from snowsplat.scene.camera import Camera
 def frusta_of(cameras: Sequence[Camera], depths: Sequence[tuple[float, float]]) -> Frusta:
     """The frusta of V cameras, in float64 on their device.
 
-    Args:
-        depths: for each camera the range of depths, world units.
+    ``depths``: for each camera the range of depths, world units.
     """
     double, device = torch.float64, cameras[0].cam_from_world.device
     size = [(c.width, c.height) for c in cameras]

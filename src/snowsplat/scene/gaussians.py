@@ -215,34 +215,6 @@ class Gaussians:
             sh_rest=means.new_zeros(n, SH_REST_COUNTS[sh_degree], 3),
         )
 
-    @staticmethod
-    def random_in_bounds(
-        bounds: Tensor,
-        n: int,
-        generator: torch.Generator,
-        sh_degree: int = 3,
-        initial_opacity: float = 0.1,
-    ) -> Gaussians:
-        """``n`` Gaussians with random colours and positions, initialised as in `from_points`.
-
-        Args:
-            bounds: (2, 3) lower and upper corner of the box of positions.
-            n: number of Gaussians, at least 1.
-            generator: random numbers, on the CPU.
-            sh_degree: 0 to 3.
-            initial_opacity: in (0, 1).
-        """
-        low, high = bounds.to(torch.float32)
-        xyz = low + (high - low) * torch.rand(n, 3, generator=generator)
-        rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
-        return Gaussians.from_points(_RandomPoints(xyz, rgb), sh_degree, initial_opacity)
-
-
-@dataclass
-class _RandomPoints:
-    xyz: Tensor
-    rgb: Tensor
-
 
 def _spacing(points: Tensor) -> Tensor:
     """(N,) mean distance of each point to its 3 nearest other points (to all if fewer exist)."""

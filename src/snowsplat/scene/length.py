@@ -20,8 +20,7 @@ _LEAST, _MOST = 1e-12, 1e12
 def metres_of(text: str) -> float:
     """The length that ``text`` states, such as "0.45m", "45 cm" or "17.5in", in metres.
 
-    Raises:
-        ValueError: there is no positive number, or no unit after it.
+    Raises: ValueError: there is no positive number, or no unit after it.
     """
     found = _LENGTH.fullmatch(text.strip())
     unit = UNITS.get(found[2].lower()) if found else None

@@ -68,8 +68,7 @@ def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 def largest_parts(faces: np.ndarray, count: int, share: float) -> np.ndarray:
     """(F,) bool: the triangles of connected parts with at least ``share`` of the largest part's.
 
-    Args:
-        faces: (F, 3) rows of ``count`` vertices.
+    ``faces``: (F, 3) rows of ``count`` vertices.
     """
     label = _parts(faces, count)[faces[:, 0]]
     size = np.bincount(label, minlength=count)[label]

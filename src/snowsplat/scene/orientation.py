@@ -40,14 +40,6 @@ _STANDS = 0.05
 _NO_DIRECTION = 0.3
 
 
-def up_direction(rotations: np.ndarray) -> np.ndarray:
-    """The up direction of the world: the one most perpendicular to the x axes of the cameras.
-
-    (3,) unit vector in the world frame; see `level_of_cameras`.
-    """
-    return level_of_cameras(rotations)[0]
-
-
 def scene_up(rotations: np.ndarray) -> np.ndarray:
     """The up direction of a scene with cameras: −y, unless the cameras contradict it.
 

@@ -40,8 +40,7 @@ class PanoramaRenderer:
         width, height: pixels; a column is a longitude and a row a latitude, with the direction
             ahead at the centre.
 
-    Raises:
-        ValueError: a width that is not a positive multiple of 4.
+    Raises: ValueError: a width that is not a positive multiple of 4.
     """
 
     def __init__(self, width: int, device: torch.device | None = None) -> None:
@@ -105,8 +104,7 @@ def _span(used: Tensor) -> slice:
 def level_pose(cam_from_world: Tensor, up: np.ndarray) -> Tensor:
     """(3, 4) float64: the camera turned so that its horizon is level; its heading is kept.
 
-    Args:
-        up: (3,) unit vector in the world frame.
+    ``up``: (3,) unit vector in the world frame.
     """
     rotation, shift = cam_from_world.double()[:, :3].cpu(), cam_from_world.double()[:, 3].cpu()
     position, upward = -rotation.T @ shift, torch.from_numpy(np.asarray(up, np.float64))

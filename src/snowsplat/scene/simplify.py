@@ -208,8 +208,7 @@ def _costs(mixture: _Mixture) -> Tensor:
 def _cheapest_pairs(costs: Tensor, most: int) -> tuple[Tensor, Tensor]:
     """At most ``most`` disjoint pairs (i, j): the greedy choice in the order of their costs.
 
-    Args:
-        costs: (W, N), of i and i + 1 + row; inf: no pair.
+    ``costs``: (W, N), of i and i + 1 + row; inf: no pair.
     """
     count = costs.shape[1]
     # Ranks are distinct, so two Gaussians that are each other's cheapest partner always exist.

@@ -90,8 +90,7 @@ class Step:
 def steps_of(photos: Photos, size: int | None, effort: EffortName) -> dict[str, Step]:
     """The steps of the table above, in their order.
 
-    Args:
-        size: the longer side to which photos are reduced, in pixels; None: they are not reduced.
+    ``size``: the longer side to which photos are reduced, in pixels; None: they are not reduced.
     """
     parameters = EFFORTS[effort]
     largest = max(photos.longest, photos.video)

@@ -38,11 +38,9 @@ class Coverage:
 def measure_coverage(model: Path) -> Coverage:
     """The measures of a COLMAP model.
 
-    Args:
-        model: its folder. Every point has its observations.
+    ``model``: its folder. Every point has its observations.
 
-    Raises:
-        ValueError: the model cannot be read.
+    Raises: ValueError: the model cannot be read.
     """
     import pycolmap
 

@@ -52,14 +52,12 @@ td img { height: 74px; border-radius: 4px; display: block; }
 def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     """Write ``dataset_report.html`` of a finished dataset; returns its path.
 
-    Args:
-        facts: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
-            an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage;
-            "problems", what is wrong with single photos, by name; "verdict", a `Verdict`; "alone",
-            whether the user has to start the training.
+    ``facts``: JSON values: "inputs", a list of paths; "settings"; "gathered", a `Gathered`; "sfm",
+    an `SfmResult`; "undistorted", an `Undistorted`; "seconds", the duration of each stage;
+    "problems", what is wrong with single photos, by name; "verdict", a `Verdict`; "alone", whether
+    the user has to start the training.
 
-    Raises:
-        UserError: the model in ``sparse/0`` or an image cannot be read.
+    Raises: UserError: the model in ``sparse/0`` or an image cannot be read.
     """
     photos = _photos_with_poses(dataset, facts["gathered"]["photos"])
     name = _name(facts["inputs"])

@@ -32,8 +32,7 @@ BRIGHT = "is too bright: large parts are pure white; use a shorter exposure"
 def problem_of(grey: np.ndarray) -> str | None:
     """What is wrong with a photo, and what to do; None: nothing.
 
-    Args:
-        grey: (H, W) uint8, a copy of `SHARPNESS_SIDE`.
+    ``grey``: (H, W) uint8, a copy of `SHARPNESS_SIDE`.
     """
     if np.quantile(grey, 0.95) < _DARK:
         return DARK
@@ -45,8 +44,7 @@ def problem_of(grey: np.ndarray) -> str | None:
 def problems(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """The photos of a folder with a problem: names and `problem_of` them. Missing ones are skipped.
 
-    Raises:
-        OSError: a photo cannot be read.
+    Raises: OSError: a photo cannot be read.
     """
     found = {}
     for name in names:

@@ -44,8 +44,7 @@ class Photos:
 def survey(sources: Sources, options: GatherOptions | None = None) -> Photos:
     """The photos and frames that `gather` will use, if none of them is unusable.
 
-    Raises:
-        UserError: a video is not readable.
+    Raises: UserError: a video is not readable.
     """
     options = options or GatherOptions()
     photos = [source.path for source in sources.photos]

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from snowsplat.util.srgb import from_linear
+
 if TYPE_CHECKING:
     from av import VideoFrame
 
@@ -84,10 +86,7 @@ def _light_of_hlg(signal: np.ndarray) -> np.ndarray:
 
 
 def _srgb(light: np.ndarray) -> np.ndarray:
-    curve = np.where(
-        light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055
-    )
-    return np.rint(255 * curve).astype(np.uint8)
+    return np.rint(255 * from_linear(light)).astype(np.uint8)
 
 
 _SIGNALS = np.linspace(0, 1, _STEPS)

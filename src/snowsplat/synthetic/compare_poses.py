@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from snowsplat.scene.geometry import Similarity, invert_rigid, similarity_from_points
+from snowsplat.scene.geometry import invert_rigid, similarity_from_points
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,6 @@ class PoseErrors:
     rotations: Tensor  # (N,) degrees, angle between the estimated and the true rotation
     centres: Tensor  # (N,) distance between the camera centres, as a fraction of ``extent``
     extent: float  # largest distance between two true centres, in their unit
-    true_from_found: Similarity
 
 
 def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> PoseErrors:
@@ -40,7 +39,7 @@ def compare_poses(found: Mapping[str, Tensor], true: Mapping[str, Tensor]) -> Po
     distances = (invert_rigid(aligned)[..., 3] - true_centres).norm(dim=1)
     missing = sorted(true.keys() - found.keys())
     rotations = _angles(aligned[..., :3], true_poses[..., :3])
-    return PoseErrors(names, missing, rotations, distances / extent, extent, similarity)
+    return PoseErrors(names, missing, rotations, distances / extent, extent)
 
 
 def _angles(a: Tensor, b: Tensor) -> Tensor:

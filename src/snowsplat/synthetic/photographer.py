@@ -21,6 +21,7 @@ from snowsplat.synthetic.lens import CentredLens, Lens
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.util.files import atomic_path
+from snowsplat.util.srgb import from_linear
 
 RAYS = 2  # along each side of a pixel
 _TILE = 64  # pixels along each side; the rays of a tile hit few shapes
@@ -171,7 +172,8 @@ def developed(light: np.ndarray, random: np.random.Generator) -> np.ndarray:
     electrons += np.sqrt(electrons + _READ_NOISE**2) * random.standard_normal(
         light.shape, np.float32
     )
-    return _srgb8(electrons / _FULL_WELL)
+    srgb = from_linear((electrons / _FULL_WELL).clip(0, 1))
+    return np.rint(255 * srgb).astype(np.uint8)
 
 
 def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
@@ -196,12 +198,6 @@ def tiles(lens: CentredLens) -> list[tuple[slice, slice, np.ndarray]]:
             rays = lens.directions(np.stack(np.meshgrid(x, y)).reshape(2, -1))
             tiles.append((slice(top, bottom), slice(left, right), rays.astype(np.float32)))
     return tiles
-
-
-def _srgb8(linear: np.ndarray) -> np.ndarray:
-    linear = linear.clip(0, 1)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.rint(255 * srgb).astype(np.uint8)
 
 
 def _save(path: Path, pixels: np.ndarray, lens: CentredLens) -> None:

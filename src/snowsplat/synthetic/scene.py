@@ -17,6 +17,7 @@ from PIL import Image
 
 from snowsplat.synthetic.light import Lamp, irradiance
 from snowsplat.synthetic.shapes import Shape
+from snowsplat.util.srgb import to_linear
 
 _LEVELS = 5  # each texture is stored at 1, 1/2 … 1/16 of its size
 _BLOCK = 1 << 14  # rays per batch; a batch fits into the processor's cache
@@ -218,8 +219,7 @@ class Scene:
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
     """Linear light of sRGB values; values above 1 (brighter than white) are unchanged."""
-    low, high = srgb / 12.92, ((srgb.clip(0, 1) + 0.055) / 1.055) ** 2.4
-    return np.where(srgb > 1, srgb, np.where(srgb <= 0.04045, low, high)).astype(np.float32)
+    return np.where(srgb > 1, srgb, to_linear(srgb.clip(0, 1))).astype(np.float32)
 
 
 def _halved(texture: np.ndarray) -> np.ndarray:

@@ -25,8 +25,7 @@ class Spline:
             values: (K, D).
             smoothing: ≥ 0, in units of time³.
 
-        Raises:
-            ValueError: there are fewer than two samples, or the times do not increase.
+        Raises: ValueError: there are fewer than two samples, or the times do not increase.
         """
         times, values = times.to(torch.float64), values.to(torch.float64)
         steps = times.diff()

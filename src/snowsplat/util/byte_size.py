@@ -12,8 +12,7 @@ _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 def parse_bytes(text: str) -> int:
     """The number of bytes of "4GB", "800 MB", "1.5g" or a plain number; "GiB" is 1024³ bytes.
 
-    Raises:
-        SettingError: the text of ``memory`` is not a size.
+    Raises: SettingError: the text of ``memory`` is not a size.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]?)(i?)b?\s*", text.lower())
     if match is None or (match[3] and not match[2]) or float(match[1]) <= 0:

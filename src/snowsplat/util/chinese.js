@@ -40,9 +40,6 @@
         'Gaussians': '高斯',
         'steps': '步',
         'of training': '训练时间',
-        'The training {}.': '训练{0}。',
-        'stopped after # of # steps: the views between the photos became worse':
-            '在第 {0} 步（共 {1} 步）停止：照片之间的视图变差了',
         'Photos that the scene does not explain': '场景不能解释的照片',
         'Left out of the training, because their camera poses are probably wrong: {}.':
             '没有参加训练，因为它们的相机位姿很可能是错的：{0}。',

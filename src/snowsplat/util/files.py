@@ -35,9 +35,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     part of it. If the block raises, the temporary file is removed and ``path`` does not change. If
     the process is killed, the temporary file stays; the next write of ``path`` reuses it.
 
-    Raises:
-        OSError: the folder is missing or not writable, or the disk is full. The error names
-            ``path``.
+    Raises: OSError: the folder is missing or not writable, or the disk is full. The error names
+    ``path``.
     """
     path = Path(path)
     try:
@@ -84,9 +83,8 @@ def _temporary(path: Path) -> tuple[int | None, Path]:
 def _lock(temporary: Path) -> int:
     """Create or open a file, lock and empty it; return its handle.
 
-    Raises:
-        OSError: another writer holds the lock, locks are not supported, or the file cannot be
-            created.
+    Raises: OSError: another writer holds the lock, locks are not supported, or the file cannot be
+    created.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     handle = os.open(temporary, flags, 0o600)

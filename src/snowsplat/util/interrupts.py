@@ -20,8 +20,7 @@ _children: list[subprocess.Popen[Any]] = []
 def raise_deferred_interrupt(agree: Callable[[bool], bool] = bool) -> None:
     """Raise KeyboardInterrupt if a Ctrl-C is deferred; for code that waits between steps.
 
-    Args:
-        agree: combines whether a Ctrl-C is deferred in this process with the same in the others.
+    ``agree``: combines whether a Ctrl-C is deferred in this process with the same in the others.
     """
     if agree(_pending.is_set()):
         raise KeyboardInterrupt

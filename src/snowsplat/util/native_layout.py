@@ -74,8 +74,7 @@ class Layout:
 
         Returns the first tensor, or None.
 
-        Raises:
-            TypeError: the value of a field has the wrong type.
+        Raises: TypeError: the value of a field has the wrong type.
         """
         values = list(self.values(params))
         first = None

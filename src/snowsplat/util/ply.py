@@ -70,8 +70,7 @@ class PlyTable:
         The columns have their declared types; in ASCII files, all floating-point columns are
         float64.
 
-        Raises:
-            UserError: the file ends early, or an ASCII value is not a number.
+        Raises: UserError: the file ends early, or an ASCII value is not a number.
         """
         order = _BYTE_ORDERS[self.format]
         # A text may have more digits than the declared type, and often has.
@@ -141,12 +140,10 @@ def _open(path: Path, data: bytes | None) -> BinaryIO:
 def open_table(path: Path | str, element: str = "vertex", data: bytes | None = None) -> PlyTable:
     """Read the header of a PLY file and check that the file is large enough for ``element``.
 
-    Args:
-        data: the content of the file, if it is not at ``path`` but, for example, inside of a zip
-            file; then ``path`` is for messages.
+    ``data``: the content of the file, if it is not at ``path`` but, for example, inside of a zip
+    file; then ``path`` is for messages.
 
-    Raises:
-        UserError: the file is missing, truncated, or not a PLY file, or its header is invalid.
+    Raises: UserError: the file is missing, truncated, or not a PLY file, or its header is invalid.
     """
     path = Path(path)
     with reading(path), _open(path, data) as file:

@@ -162,8 +162,7 @@ def _try(file: Path) -> tuple[int, bool] | None:
 def _lock(handle: int) -> bool:
     """Lock an open file; False if somebody else has the lock.
 
-    Raises:
-        OSError: the file system has no locks.
+    Raises: OSError: the file system has no locks.
     """
     try:
         if sys.platform == "win32":

@@ -33,8 +33,7 @@ _LONGEST_NAME = 255
 def read_json(path: Path, ratio: int = _RATIO) -> Any:
     """The value in a JSON file.
 
-    Args:
-        ratio: see `parse_json`.
+    ``ratio``: see `parse_json`.
 
     Raises:
         OSError: the file is missing or cannot be read.
@@ -51,11 +50,9 @@ def parse_json(data: bytes, ratio: int = _RATIO) -> Any:
     Some texts, such as ``[[],[],[]``, need twenty times their size in memory. A text that would
     need too much is rejected before it is parsed.
 
-    Args:
-        ratio: memory that is allowed per byte of the text, in addition to a fixed amount.
+    ``ratio``: memory that is allowed per byte of the text, in addition to a fixed amount.
 
-    Raises:
-        ValueError: not JSON, nested too deeply, or too many values. No other error is raised.
+    Raises: ValueError: not JSON, nested too deeply, or too many values. No other error is raised.
     """
     needed = sum(data.count(sign) * size for sign, size in _BYTES_OF.items())
     if needed > _ALWAYS_ALLOWED + ratio * len(data):

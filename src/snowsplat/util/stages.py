@@ -49,8 +49,7 @@ class Stages:
         file: the JSON file of the record; it need not exist.
         names: the stages of the job in order.
 
-    Raises:
-        UserError: the file is damaged.
+    Raises: UserError: the file is damaged.
     """
 
     def __init__(self, file: Path, names: Sequence[str]) -> None:

@@ -86,12 +86,6 @@ def test_opaque_gaussians_hide_what_is_behind_them():
     assert (picture[wood] == transparent[wood]).all()
 
 
-def test_colors_are_converted_to_linear_light_and_back():
-    levels = np.linspace(0, 1, 1001)
-    assert np.abs(glass.to_srgb(glass.to_linear(levels)) - levels).max() < 1e-6
-    assert glass.to_linear(np.array(0.5)) == pytest.approx(0.2140, abs=1e-4)
-
-
 def test_an_engraving_shows_the_whole_name():
     short, long = engraving("A"), engraving(60 * "W")
     assert short.shape == long.shape

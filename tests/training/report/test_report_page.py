@@ -129,14 +129,6 @@ def test_photos_that_are_left_out_are_named_and_not_evaluated(trained, tmp_path)
     assert content.count(names[0]) == 1
 
 
-def test_the_page_says_that_the_training_ended_early(trained, tmp_path):
-    path = tmp_path / "report.html"
-    write_training_report(path, Trained(**trained, ended_early="stopped after 40 of 80 steps: <"))
-    assert "The training stopped after 40 of 80 steps: <." in words(path)
-    write_training_report(path, Trained(**trained))
-    assert "The training stopped" not in words(path)
-
-
 def test_train_writes_the_report_and_a_resumed_run_continues_its_curves(tmp_path):
     """The command line is used. The page contains names, but no absolute paths."""
     from snowsplat.cli.main import main

@@ -121,8 +121,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 def read_images(path: Path) -> list[ColmapImage]:
     """Read an images.bin, in the order of the file. Observations are skipped.
 
-    Raises:
-        UserError: the file is unreadable or damaged.
+    Raises: UserError: the file is unreadable or damaged.
     """
     return [image for image, _ in _images(path)]
 
@@ -130,14 +129,11 @@ def read_images(path: Path) -> list[ColmapImage]:
 def read_observations(path: Path, wanted: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Read some observations of an images.bin.
 
-    Args:
-        wanted: (N,) int64, indices of the observations of an image, by its id.
+    ``wanted``: (N,) int64, indices of the observations of an image, by its id.
 
-    Returns:
-        (N, 3) float64: x and y in pixels, and the id of the point. NaN: no such observation.
+    Returns: (N, 3) float64: x and y in pixels, and the id of the point. NaN: no such observation.
 
-    Raises:
-        UserError: the file is unreadable or damaged.
+    Raises: UserError: the file is unreadable or damaged.
     """
     record = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
     found = {}
@@ -170,8 +166,7 @@ def _images(path: Path) -> Iterator[tuple[ColmapImage, memoryview]]:
 def read_frames(path: Path) -> list[tuple[int, list[int]]]:
     """Read a frames.bin: the id of each frame and the ids of its images.
 
-    Raises:
-        UserError: the file is unreadable or damaged.
+    Raises: UserError: the file is unreadable or damaged.
     """
     cursor = _Cursor(path, "frames", _FRAME_HEAD.size)
     check_count(path, "frames", cursor.count)
@@ -189,11 +184,7 @@ def read_frames(path: Path) -> list[tuple[int, list[int]]]:
 
 
 def read_points(path: Path) -> PointFile:
-    """Read a points3D.bin.
-
-    Raises:
-        UserError: the file is unreadable or damaged.
-    """
+    """Read a points3D.bin. Raises: UserError: the file is unreadable or damaged."""
     cursor = _Cursor(path, "points", _POINT_BYTES)
     # The length of a record is stored in the record, so a loop finds where each record starts.
     # Everything else is done for all records at once.

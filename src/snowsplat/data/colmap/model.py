@@ -53,8 +53,7 @@ def count_images(folder: Path) -> int:
 def read_model(folder: Path) -> ColmapModel:
     """Read cameras and images of the model in a folder; images are sorted by name.
 
-    Raises:
-        UserError: there is no model, or a file is damaged. The message names the file.
+    Raises: UserError: there is no model, or a file is damaged. The message names the file.
     """
     is_text = model_is_text(folder)
     if is_text is None:
@@ -85,8 +84,7 @@ def read_points(folder: Path) -> Points | None:
 
     `usable_points` removes points that are not finite or implausibly far away.
 
-    Raises:
-        UserError: a file is damaged.
+    Raises: UserError: a file is damaged.
     """
     if (found := read_point_file(folder)) is None:
         return None
@@ -97,8 +95,7 @@ def read_points(folder: Path) -> Points | None:
 def read_point_file(folder: Path) -> tuple[Path, PointFile] | None:
     """The file of the points of the model in a folder, and what is in it; None if it has none.
 
-    Raises:
-        UserError: the file is damaged.
+    Raises: UserError: the file is damaged.
     """
     for files, suffix in _FILES.values():
         path = folder / f"points3D{suffix}"

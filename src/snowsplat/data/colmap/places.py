@@ -33,11 +33,9 @@ def find_models_below(root: Path, images: str) -> list[Path]:
 
     Outputs of snowsplat in ``root`` are skipped.
 
-    Args:
-        images: name of the folders of images, which tell datasets apart.
+    ``images``: name of the folders of images, which tell datasets apart.
 
-    Raises:
-        UserError: there are several datasets.
+    Raises: UserError: there are several datasets.
     """
     models = []
     queue, seen = deque([(root, 0)]), 0

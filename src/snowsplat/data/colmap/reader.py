@@ -42,8 +42,7 @@ def read_colmap(
         models: folders of models inside ``root``, from `find_models`.
         images: name of the folder of images inside ``root``.
 
-    Raises:
-        UserError: damaged files, or no images.
+    Raises: UserError: damaged files, or no images.
     """
     folder = models[0]
     name = folder.relative_to(root).as_posix()
@@ -139,8 +138,7 @@ def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
 def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
     """The camera of an image, with its pose in float64. A distortion of its lens is left out.
 
-    Raises:
-        UserError: the camera is missing or damaged.
+    Raises: UserError: the camera is missing or damaged.
     """
     colmap = model.cameras.get(image.camera_id)
     if colmap is None:

@@ -106,8 +106,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 def read_images(path: Path) -> list[ColmapImage]:
     """Read an images.txt, in the order of the file. Observations are skipped.
 
-    Raises:
-        UserError: the file is unreadable or damaged.
+    Raises: UserError: the file is unreadable or damaged.
     """
     images = [image for image, _ in _images(path)]
     _warn_if_fewer(path, "images", len(images))
@@ -182,8 +181,7 @@ def _is_number(word: str) -> bool:
 def read_frames(path: Path) -> list[tuple[int, list[int]]]:
     """Read a frames.txt: the id of each frame and the ids of its images.
 
-    Raises:
-        UserError: the file is unreadable or damaged.
+    Raises: UserError: the file is unreadable or damaged.
     """
     frames = []
     for line in filter(None, _lines(path)):
@@ -198,11 +196,7 @@ def read_frames(path: Path) -> list[tuple[int, list[int]]]:
 
 
 def read_points(path: Path) -> PointFile:
-    """Read a points3D.txt.
-
-    Raises:
-        UserError: the file is unreadable or damaged.
-    """
+    """Read a points3D.txt. Raises: UserError: the file is unreadable or damaged."""
     # Rows end with tracks of different lengths. numpy's reader is fast, but it would split the
     # complete track into words, so it gets only the columns that are used.
     tracks: dict[int, str] = {}

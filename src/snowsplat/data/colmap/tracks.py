@@ -26,8 +26,7 @@ def points_with_tracks(model: ColmapModel, names: Mapping[int, str]) -> Points |
         model: of which the points are read.
         names: of views, by the ids of the images that are used.
 
-    Raises:
-        UserError: a file is damaged.
+    Raises: UserError: a file is damaged.
     """
     if (found := read_point_file(model.folder)) is None:
         return None

@@ -100,8 +100,7 @@ def files_below(
         enter: the subfolders of a folder to search, from the names of those that are not hidden.
         broken: gets the broken links.
 
-    Raises:
-        OSError: a folder cannot be read.
+    Raises: OSError: a folder cannot be read.
     """
 
     def fail(error: OSError) -> None:

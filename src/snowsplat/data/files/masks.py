@@ -56,12 +56,10 @@ class FoundMasks:
 def find_masks(root: Path, photos: Sequence[str]) -> FoundMasks:
     """The masks of photos below a folder, or beside it if it is called "images" or the like.
 
-    Args:
-        photos: all image files outside of folders of masks, relative to ``root`` with "/". Some may
-            turn out to be masks.
+    ``photos``: all image files outside of folders of masks, relative to ``root`` with "/". Some may
+    turn out to be masks.
 
-    Raises:
-        OSError: a folder cannot be read.
+    Raises: OSError: a folder cannot be read.
     """
     found = FoundMasks()
     by_folder: dict[str, list[str]] = {}
@@ -107,8 +105,7 @@ def _find_beside(root: Path, names: Sequence[str], found: FoundMasks) -> None:
 def _find_in(folder: Path, photos: dict[str, str], found: FoundMasks) -> set[Path]:
     """Masks in a folder of masks: all of its files. Adds to ``found`` those of photos without one.
 
-    Args:
-        photos: photo -> its path relative to the parent of ``folder``.
+    ``photos``: photo -> its path relative to the parent of ``folder``.
     """
     masks = [
         file
@@ -193,8 +190,7 @@ def with_masks(root: Path, posed: Sequence[PosedImage]) -> list[PosedImage]:
 
     Logs a line if there are masks of no image in the folders of the images.
 
-    Args:
-        root: the folder of the dataset.
+    ``root``: the folder of the dataset.
     """
     posed = list(posed)
     for base in dict.fromkeys(_base(root, image) for image in posed):

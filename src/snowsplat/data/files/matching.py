@@ -108,8 +108,7 @@ def _same_end(
 ) -> dict[str, set[str]]:
     """The files that share most of the end of their path with a name.
 
-    Args:
-        renamed: a folder that says nothing may differ; otherwise, one path is the end of the other.
+    ``renamed``: a folder that says nothing may differ; otherwise, one path is the end of the other.
     """
     whole: dict[tuple[str, ...], list[tuple[tuple[str, ...], str]]] = {}
     ends: dict[tuple[str, ...], list[tuple[tuple[str, ...], str]]] = {}

@@ -21,8 +21,7 @@ def photos_below(root: Path) -> list[str]:
     Hidden files, masks, depth maps, thumbnails and smaller copies (``images_4`` beside ``images``)
     are left out.
 
-    Raises:
-        OSError: a folder cannot be read.
+    Raises: OSError: a folder cannot be read.
     """
 
     def enter(_: Path, names: list[str]) -> list[str]:
@@ -55,8 +54,7 @@ def find_photos(
         names: as the dataset states them.
         taken: files of other photos of the dataset, relative to ``root``.
 
-    Returns:
-        name -> file, relative to ``root``; see `match_names`.
+    Returns: name -> file, relative to ``root``; see `match_names`.
     """
     try:
         files = [file for file in photos_below(root) if file not in taken]

@@ -32,8 +32,7 @@ def perspective(
         tangential: p₁, p₂.
         skew: in pixels: how much further right a point with y = 1 is.
 
-    Raises:
-        UserError: the size or a focal length is not valid.
+    Raises: UserError: the size or a focal length is not valid.
     """
     size = _checked(where, width, height, intrinsics)
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]

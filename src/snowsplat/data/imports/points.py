@@ -38,9 +38,8 @@ def points_beside(
     another one than the cameras. Of several frames, the one in which the points have the colours of
     the photos is used. If the photos show few points in all of them, a warning tells it.
 
-    Args:
-        frames: world_from_frame (3, 4), which may have a scale, of the frames in which the points
-            may be, the most probable first.
+    ``frames``: world_from_frame (3, 4), which may have a scale, of the frames in which the points
+    may be, the most probable first.
     """
     fitting: list[tuple[Path, np.ndarray, np.ndarray]] = []
     rejected = None

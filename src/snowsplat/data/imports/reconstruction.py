@@ -29,8 +29,7 @@ class PhotoFolder:
         root: the folder that is searched; no photo outside of it is used.
         images: name of the folder of photos; photos elsewhere are used if it has the default name.
 
-    Raises:
-        SettingError: there is no folder ``images``, and it does not have the default name.
+    Raises: SettingError: there is no folder ``images``, and it does not have the default name.
     """
 
     def __init__(self, root: Path, images: str = "images") -> None:
@@ -44,8 +43,7 @@ class PhotoFolder:
     def find(self, name: str) -> str | None:
         """The file of a photo, relative to the root, with "/"; None if it is not there.
 
-        Raises:
-            UserError: several photos have this name.
+        Raises: UserError: several photos have this name.
         """
         name = safe_name(name)
         if not name:

@@ -107,8 +107,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
 def _frames(path: Path, images: Path, count: int) -> dict[int, Path]:
     """The photo of each pose: 0.jpg, 1.jpg …; with other names, the photos in their order.
 
-    Raises:
-        UserError: the photos have other names, and there are not as many as poses.
+    Raises: UserError: the photos have other names, and there are not as many as poses.
     """
     files = [file for file in sorted(images.iterdir()) if is_photo(file.name) and is_file(file)]
     numbered = {int(file.stem): file for file in files if _DIGITS.fullmatch(file.stem)}

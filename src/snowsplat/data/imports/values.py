@@ -35,11 +35,9 @@ def damaged(where: object, problem: str) -> UserError:
 def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
     """The value in a JSON file.
 
-    Args:
-        ratio: see `parse_json`.
+    ``ratio``: see `parse_json`.
 
-    Raises:
-        UserError: the file cannot be read, or is not JSON.
+    Raises: UserError: the file cannot be read, or is not JSON.
     """
     try:
         with reading(path):
@@ -53,8 +51,7 @@ def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
 def load_text(path: Path) -> str:
     """The text of a file. Bytes that are not UTF-8 stay as they are in file names.
 
-    Raises:
-        UserError: the file cannot be read.
+    Raises: UserError: the file cannot be read.
     """
     return _load_bytes(path).decode("utf-8-sig", "surrogateescape")
 
@@ -63,8 +60,7 @@ def load_xml(path: Path) -> Element:
     """The root element of an XML file. Files with a document type, which may define entities, are
     refused.
 
-    Raises:
-        UserError: the file cannot be read, or is not XML.
+    Raises: UserError: the file cannot be read, or is not XML.
     """
     data = _load_bytes(path)
     most = _ELEMENTS + len(data) // _BYTES_PER_ELEMENT
@@ -180,8 +176,7 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 def from_opengl(where: object, world_from_cam: np.ndarray) -> np.ndarray:
     """cam_from_world (3, 4), OpenCV axes, of a camera (3, 4) whose y is up and that looks along −z.
 
-    Raises:
-        UserError: its matrix is not a rotation.
+    Raises: UserError: its matrix is not a rotation.
     """
     flipped = world_from_cam[:, :3] * (1.0, -1.0, -1.0)
     return inverse(rigid(where, flipped, world_from_cam[:, 3]))

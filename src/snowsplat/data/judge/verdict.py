@@ -154,8 +154,7 @@ def _poses(views: list[View], rig: Rig, points: Points | None, *, far: bool) -> 
 def _inexact(fit: Fit | None, tracks: TrackFit | None, *, far: bool) -> list[Finding]:
     """Poses of which some are right, or nearly right, so that no other witness has named them.
 
-    Args:
-        far: the scene was far from the origin, where numbers lose digits.
+    ``far``: the scene was far from the origin, where numbers lose digits.
     """
     shares = np.ones(0) if fit is None else fit.shares
     wrong = int((shares < _MATCHES_CONTRADICT).sum())

@@ -50,8 +50,7 @@ def is_pinhole(lens: LensModel) -> bool:
 def pinhole_of(lens: LensModel) -> Pinhole:
     """The pinhole camera for a distorted one: the same focal lengths, no blank borders.
 
-    Raises:
-        ValueError: the calibration is valid only for a small part of the photo.
+    Raises: ValueError: the calibration is valid only for a small part of the photo.
     """
     fx, fy, cx, cy, _ = intrinsics(lens)
     if is_pinhole(lens):

@@ -170,8 +170,7 @@ def rotated_view(
         half_angles: radians between the axis and the middle of the right and of the lower border.
         circle: see `LensView`.
 
-    Raises:
-        ValueError: the view would be more than twice as large as the photo.
+    Raises: ValueError: the view would be more than twice as large as the photo.
     """
     focal = _central_scale(lens)
     half_width, half_height = (focal * math.tan(angle) for angle in half_angles)
@@ -204,8 +203,7 @@ def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, 
         lens: of the photo.
         circle: see `LensView`.
 
-    Raises:
-        ValueError: the model is valid only in a small part of the photo.
+    Raises: ValueError: the model is valid only in a small part of the photo.
     """
     if not all(map(math.isfinite, lens.params)):
         raise ValueError("a parameter is not finite")

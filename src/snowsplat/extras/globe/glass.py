@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from snowsplat.extras.globe.dimensions import BASE, BLEND, FLOOR, FLOOR_RADIUS, GROUND
 from snowsplat.scene.camera import Camera
+from snowsplat.util.srgb import from_linear, to_linear
 
 # Colours are linear, unless they are called sRGB.
 BACKGROUND = ((0.93, 0.95, 0.98), (0.50, 0.60, 0.74))  # in the middle, and at the corners
@@ -53,8 +54,8 @@ class Backdrop:
         """
         # Gaussians are blended in sRGB, as they were trained; light is added in linear light.
         inside = color + (1.0 - alpha[:, :, None]) * self.behind
-        light = to_linear(inside) * self.keep + self.add
-        return np.rint(to_srgb(light) * 255).astype(np.uint8)
+        light = to_linear(inside.clip(0, 1)) * self.keep + self.add
+        return np.rint(from_linear(light.clip(0, 1)) * 255).astype(np.uint8)
 
 
 def draw(camera: Camera, plate: np.ndarray | None = None, samples: int = 2) -> Backdrop:
@@ -68,7 +69,7 @@ def draw(camera: Camera, plate: np.ndarray | None = None, samples: int = 2) -> B
         for first in range(0, camera.height, 64)
     ]
     behind, keep, add = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Backdrop(to_srgb(behind), keep, add)
+    return Backdrop(from_linear(behind.clip(0, 1)), keep, add)
 
 
 def _draw_rows(
@@ -272,18 +273,6 @@ def _shadow(rays: np.ndarray, origin: np.ndarray, light: np.ndarray) -> np.ndarr
     # Opposite to the light, the shadow is longer and softer.
     cast = _smooth(2.3, 0.3, np.hypot(x + 0.55 * light[0], z + 0.55 * light[2]))
     return np.where(distance < 1e5, 1 - (1 - 0.75 * contact) * (1 - 0.55 * cast), 0)
-
-
-def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB in 0..1 -> linear light."""
-    srgb = np.clip(srgb, 0, 1)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def to_srgb(light: np.ndarray) -> np.ndarray:
-    """Linear light -> sRGB, clipped to 0..1."""
-    light = np.clip(light, 0, 1)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def _smooth(low: float, high: float, x: np.ndarray) -> np.ndarray:

@@ -83,8 +83,7 @@ class Fitter:
             fitter.step()
         image = fitter.gaussians.render()
 
-    Args:
-        target: the image (H, W, 3) in 0..1, float32.
+    ``target``: the image (H, W, 3) in 0..1, float32.
 
     Attributes:
         steps_done: number of steps so far.

@@ -45,9 +45,8 @@ def discs(
         sigma: (N,) or a number, the standard deviation in the image, in pixels.
         opacity: (N,) or a number, in (0, 1).
 
-    Returns:
-        N Gaussians in the world frame; differentiable with respect to ``points``, ``colors``,
-        ``sigma`` and ``opacity``.
+    Returns: N Gaussians in the world frame; differentiable with respect to ``points``, ``colors``,
+    ``sigma`` and ``opacity``.
     """
     axes, lengths = _axes(tangents)
     pose = camera.world_from_cam.to(points.dtype)

@@ -29,8 +29,7 @@ def candidates(file: str, capability: Capability, cuda_major: int) -> Iterator[b
         file: the file of the `Kernel`.
         cuda_major: the CUDA version of the driver, which cannot load code of later versions.
 
-    Raises:
-        UserError: there is no cubin in the wheel, and no compiler.
+    Raises: UserError: there is no cubin in the wheel, and no compiler.
     """
     major, minor = capability
     for lower in range(minor, -1, -1):

@@ -53,8 +53,7 @@ Execute = Callable[[Kernel, str, int, Params], None]
 def launch(name: str, params: Params) -> int:
     """`native.launch` for tensors on a GPU: queues the kernels on torch's current stream.
 
-    Raises:
-        UserError: the GPU cannot be used; the message says why.
+    Raises: UserError: the GPU cannot be used; the message says why.
     """
     return launch_by(driver.run, name, params)
 

@@ -69,8 +69,7 @@ def sources(path: Path) -> list[Path]:
 def find(majors: Sequence[int] = (12, 13)) -> str:
     """The path of the library of the first available major version, or its name for the loader.
 
-    Raises:
-        NotFound: none of them is installed.
+    Raises: NotFound: none of them is installed.
     """
     for major in majors:
         for entry in sys.path:

@@ -38,8 +38,7 @@ def write_block_dataset(
             ``images_2`` ….
         origin: that of poses and points; the model is in the world.
 
-    Raises:
-        OSError: a file cannot be written.
+    Raises: OSError: a file cannot be written.
     """
     shutil.rmtree(folder, ignore_errors=True)
     cameras: dict[ColmapCamera, int] = {}

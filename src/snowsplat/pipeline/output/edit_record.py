@@ -29,8 +29,7 @@ class Note:
         title, text: at most 60 and 280 characters.
         view: the view that shows it, whose target is the place; see `EditRecord.start`.
 
-    Raises:
-        ValueError: the title is empty, a text is too long, or the view is none.
+    Raises: ValueError: the title is empty, a text is too long, or the view is none.
     """
 
     title: str
@@ -62,9 +61,8 @@ class EditRecord:
         turn: a person has turned the scene upright, −y is up: the rotation from the world of the
             other scene, about its origin, as a quaternion wxyz. None: not turned by a person.
 
-    Raises:
-        ValueError: the scale is not positive, the view or the rotation is none, or there are too
-            many annotations.
+    Raises: ValueError: the scale is not positive, the view or the rotation is none, or there are
+    too many annotations.
     """
 
     scene: str
@@ -105,8 +103,7 @@ class PageEdit:
         turn: the rotation by which a person turns the scene in the viewer, whose y axis points up,
             as a quaternion wxyz. Views and places are those before it. None: not turned.
 
-    Raises:
-        ValueError: the number of bits, the scale, a view or a limit is not possible.
+    Raises: ValueError: the number of bits, the scale, a view or a limit is not possible.
     """
 
     count: int

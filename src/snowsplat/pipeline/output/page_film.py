@@ -28,8 +28,7 @@ class PageFilm:
         ease: slow at the start and at the end.
         loop: from the last key back to the first one; it needs at least three keys.
 
-    Raises:
-        ValueError: a value is not possible.
+    Raises: ValueError: a value is not possible.
     """
 
     keys: list[list[float]]

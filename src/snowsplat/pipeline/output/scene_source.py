@@ -151,8 +151,7 @@ class ViewableScene:
 def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
     """Load a scene file of any format, levels of detail, or a scene of an output folder.
 
-    Args:
-        iteration: an iteration of an output folder; default: the last one.
+    ``iteration``: an iteration of an output folder; default: the last one.
 
     Raises:
         UserError: the scene is missing or damaged, or ``iteration`` is set and ``path`` is a file.

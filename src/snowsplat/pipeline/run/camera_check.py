@@ -26,8 +26,7 @@ def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tupl
 
     Returns one sentence for each doubt, for the report. Each is also logged as a warning.
 
-    Raises:
-        UserError: the cameras are impossible. The message says why, and what to do.
+    Raises: UserError: the cameras are impossible. The message says why, and what to do.
     """
     findings = judge(dataset)
     for finding in findings:

@@ -23,7 +23,7 @@ class CheckpointMeta:
     recipe: str  # the recipe from which the configuration was derived
     training: dict[str, Any]  # the configuration, see `config_to_json`
     time: dict[str, float] | None = None  # see `TimeBudget.as_json`; None without a time budget
-    # The schedule, if it has changed: for a time budget, or because the scene overfits.
+    # The schedule, if it has changed: for a time budget.
     schedule: Schedule | None = None
     # Stamps of the photos and masks; None in checkpoints of earlier versions.
     photos: dict[str, Stamp] | None = None

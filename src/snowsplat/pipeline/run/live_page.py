@@ -33,9 +33,8 @@ class LivePage:
             host: address at which to listen; None: accept connections from this machine only.
             allow_host: names of proxies; see `KnownHosts`.
 
-        Raises:
-            UserError: the port is in use, this machine cannot listen at ``host``, or an allowed
-                name is none.
+        Raises: UserError: the port is in use, this machine cannot listen at ``host``, or an allowed
+        name is none.
         """
         self.port, self.host, self.allow_host = port, host or LOCAL_HOST, allow_host
         KnownHosts(self.host, allow_host)

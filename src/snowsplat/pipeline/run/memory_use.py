@@ -42,8 +42,7 @@ class MemoryUse:
             budget: bytes, or a text such as "4GB"; None: no limit.
             present: number of Gaussians of the run that is resumed; 0 for a new run.
 
-        Raises:
-            UserError: ``budget`` is not a number of bytes, or is too small.
+        Raises: UserError: ``budget`` is not a number of bytes, or is too small.
         """
         from snowsplat.data.image_loader import available_memory
         from snowsplat.training.budgets.memory_budget import plan_memory

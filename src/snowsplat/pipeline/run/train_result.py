@@ -28,8 +28,6 @@ class TrainResult:
             explain them; see ``TrainConfig.leave_out_after``.
         moving: the share of each photo that is masked because something moves there, by name; see
             ``TrainConfig.transients``.
-        ended_early: the line about a training run that ends before its last planned step, because
-            the scene overfits; otherwise None. See ``TrainConfig.stop_overfitting``.
         poses: the line about the camera poses: how far they were refined, or that they are not
             exact; None if there is nothing to say.
         verdict: whether the scene is good, usable or poor, and why; None if no photos were held
@@ -49,7 +47,6 @@ class TrainResult:
     evaluation: tuple[int, Evaluation] | None
     left_out: tuple[str, ...]
     moving: Mapping[str, float]
-    ended_early: str | None
     poses: str | None
     verdict: Verdict | None
     time: tuple[float, float] | None

@@ -38,7 +38,6 @@ from snowsplat.training.core.run import DatasetCameras
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.misalignment import misalignment
-from snowsplat.training.parts.overfitting import OverfittingCheck
 from snowsplat.training.parts.pose_refinement import PoseRefinement
 from snowsplat.training.parts.transients import Transients
 from snowsplat.training.report import Trained, write_training_report
@@ -84,7 +83,6 @@ class TrainingRun:
         self.together = Collective(self.trainer)
         self.watchers = Watchers(self.out.path, self.trainer, self.page)
         self.transients = self.trainer.part(Transients)
-        self.overfitting = self.trainer.part(OverfittingCheck)
         self.poses = self.trainer.part(PoseRefinement)
 
     def run(self) -> TrainResult:
@@ -152,14 +150,10 @@ class TrainingRun:
         if paused and self.budget is not None:
             self.pace.postpone(paused)
             self.budget.started += paused
-        # If the scene overfits, the schedule was shortened, and no more time is needed.
-        if self.overfitting is None or self.overfitting.found is None:
-            schedule, step = self.trainer.schedule, progress.step
-            length = self.pace.iterations_after(
-                schedule, step, progress.downscale, progress.gaussians
-            )
-            if length is not None:
-                self.together.stretch(step, length)
+        schedule, step = self.trainer.schedule, progress.step
+        length = self.pace.iterations_after(schedule, step, progress.downscale, progress.gaussians)
+        if length is not None:
+            self.together.stretch(step, length)
 
     def _seconds_left(self, progress: Progress) -> float:
         schedule = self.trainer.schedule
@@ -168,9 +162,6 @@ class TrainingRun:
 
     def _left_out(self) -> tuple[str, ...]:
         return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
-
-    def _ended_early(self) -> str | None:
-        return None if self.overfitting is None else self.overfitting.line()
 
     def _masks(self) -> dict[str, Image]:
         return {} if self.transients is None else self.transients.pictures()
@@ -276,7 +267,6 @@ class TrainingRun:
             evaluation=self.evaluation,
             left_out=self._left_out(),
             moving={} if self.transients is None else self.transients.shares(),
-            ended_early=self._ended_early(),
             poses=poses,
             verdict=verdict,
             time=time_used,
@@ -371,7 +361,6 @@ class TrainingRun:
                 left_out=self._left_out(),
                 exposures=self._mean_exposures(),
                 masks=self._masks(),
-                ended_early=self._ended_early(),
                 poses=about_poses,
                 doubts=self.doubts,
                 verdict=verdict,

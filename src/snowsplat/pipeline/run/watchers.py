@@ -87,8 +87,7 @@ class Watchers:
 
     def __init__(self, output: Path, trainer: Trainer, page: LivePage | None = None) -> None:
         """
-        Args:
-            page: the page that is open from the beginning; None: there is none yet.
+        ``page``: the page that is open from the beginning; None: there is none yet.
         """
         self._output, self._trainer = output, trainer
         self._page, self._given = page, page is not None

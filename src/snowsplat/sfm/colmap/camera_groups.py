@@ -61,9 +61,8 @@ def own_focals(model: pycolmap.Reconstruction, threads: int) -> dict[int, float]
     Runs bundle adjustment with a camera for each photo, on a part of the points. ``model`` is not
     changed.
 
-    Returns:
-        image id -> focal length in pixels, of photos that have a pose and enough points. Empty: the
-        focal lengths of ``model`` agree nearly as well with the matches.
+    Returns: image id -> focal length in pixels, of photos that have a pose and enough points.
+    Empty: the focal lengths of ``model`` agree nearly as well with the matches.
     """
     part = _with_separate_cameras(model)
     part.update_point_3d_errors()

@@ -161,8 +161,7 @@ class PoseEstimation:
     def run(self, effort: Effort) -> SfmResult:
         """Make the attempts, the first with ``effort``; write ``sparse/`` and the database.
 
-        Raises:
-            UserError: no camera poses were found.
+        Raises: UserError: no camera poses were found.
         """
         shutil.rmtree(self.folders.sparse, ignore_errors=True)
         second = self.folders.distorted / "database_strong.db"

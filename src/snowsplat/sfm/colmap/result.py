@@ -73,9 +73,8 @@ def names_in(model: pycolmap.Reconstruction) -> set[str]:
 def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
     """Statistics of existing models in ``distorted/sparse``; these may be from an unknown source.
 
-    Raises:
-        UserError: there is no model, or the first one is damaged, has none of ``photos``, or has
-            photos outside of ``input/``.
+    Raises: UserError: there is no model, or the first one is damaged, has none of ``photos``, or
+    has photos outside of ``input/``.
     """
     sparse = dataset / "distorted" / "sparse"
     numbered = sorted(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.pairs import numbered_series
+from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.colmap.view_graph import ViewGraph
 
 _MIN_MATCHES = 100  # number of verified matches of a strong pair
@@ -52,7 +53,8 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
             if weak or position[other] - position[one] > _MAX_GAP:
                 return True
         near = np.flatnonzero(strong[index])
-        return len(near) < 2 or not _connected(strong[np.ix_(near, near)])
+        edges = np.nonzero(strong[np.ix_(near, near)])
+        return len(near) < 2 or bool(components(edges[0], edges[1], len(near)).any())
 
     # The number of matches of the second strongest pair of each photo. It is small for a photo at
     # the end of a walk, which may have one strong pair only.
@@ -85,14 +87,3 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
 def _second_largest(values: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     """The second largest entry of each row of (N, M) values; 0 if M < 2."""
     return np.partition(values, -2)[:, -2] if values.shape[1] > 1 else np.zeros(len(values))
-
-
-def _connected(linked: NDArray[np.bool_]) -> bool:
-    """Whether a graph is connected; ``linked`` (N, N): whether two nodes have an edge; N ≥ 1."""
-    reached = np.zeros(len(linked), bool)
-    reached[0] = True
-    while True:
-        more = reached | linked[reached].any(0)
-        if (more == reached).all():
-            return bool(reached.all())
-        reached = more

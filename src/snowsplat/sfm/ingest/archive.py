@@ -33,8 +33,7 @@ _TAIL = 22 + 0xFFFF + 76  # bytes: the end of the list, with the longest comment
 def is_zip(path: Path) -> bool:
     """Whether a file is a zip file. Documents and scenes with other suffixes may be zip files too.
 
-    Raises:
-        OSError: the file cannot be read.
+    Raises: OSError: the file cannot be read.
     """
     return path.suffix.lower() == ".zip" and path.is_file() and _head(path).startswith(_ZIP)
 
@@ -53,8 +52,7 @@ def _head(path: Path) -> bytes:
 def files_in(path: Path) -> list[str]:
     """The names of the files in a zip file, with "/". Hidden files are left out.
 
-    Raises:
-        UserError: as `unpack`, as far as the list of files shows it.
+    Raises: UserError: as `unpack`, as far as the list of files shows it.
     """
     with _opened(path) as archive:
         return [name for name, _ in _checked(archive, path)]
@@ -66,9 +64,8 @@ def unpack(path: Path) -> Path:
     If this folder has these files already, it is used as it is. If it has others, the new folder is
     called ``NAME_unpacked``.
 
-    Raises:
-        UserError: the file is damaged, empty or has a password; a file in it has a path outside of
-            the folder; it needs more disk space than there is; or the folder cannot be written.
+    Raises: UserError: the file is damaged, empty or has a password; a file in it has a path outside
+    of the folder; it needs more disk space than there is; or the folder cannot be written.
     """
     with _opened(path) as archive:
         entries = _checked(archive, path)

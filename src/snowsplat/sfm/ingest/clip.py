@@ -62,8 +62,7 @@ def _check_boxes(path: Path) -> None:
     FFmpeg allocates an entry for each declared frame, so a file of a few bytes could make it
     allocate millions. The counts are in boxes at any depth. Boxes of frame data are skipped.
 
-    Raises:
-        ValueError: the file declares more frames than it has bytes.
+    Raises: ValueError: the file declares more frames than it has bytes.
     """
     size = path.stat().st_size
     if size < _BOX_HEADER:
@@ -127,8 +126,7 @@ def film_size(path: Path) -> tuple[int, int] | None:
 def read_clip(path: Path) -> Clip:
     """Read the properties of a video; reads the whole file, but decodes the first frame only.
 
-    Raises:
-        UserError: no frame can be decoded.
+    Raises: UserError: no frame can be decoded.
     """
     import av
 
@@ -230,8 +228,7 @@ def video_stream(container: InputContainer) -> VideoStream:
     Drones and cameras add a cover picture, thumbnails or a small preview as further streams. Some
     programs mark the first stream as the default one, whatever it is.
 
-    Raises:
-        NoVideoError: there is only sound, or only pictures beside it.
+    Raises: NoVideoError: there is only sound, or only pictures beside it.
     """
     from av.stream import Disposition
 

@@ -64,8 +64,7 @@ def find_copies(root: Path, names: Sequence[str]) -> list[Copy]:
 
     Of the photos of one picture, that with a transparent background is used, else the largest one.
 
-    Args:
-        names: files relative to ``root``, with "/".
+    ``names``: files relative to ``root``, with "/".
     """
     same = _Groups(names)
     for pair in _equal_files(root, names):

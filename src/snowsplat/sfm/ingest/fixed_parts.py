@@ -135,9 +135,8 @@ def box_of(crop: Crop, width: int, height: int) -> tuple[int, int, int, int]:
 def find_fixed_parts(copies: NDArray[np.uint8]) -> FixedParts | None:
     """What is fixed to the frame; None if nothing is, or if all photos show nearly the same.
 
-    Args:
-        copies: (N, H, W) grey copies of photos of equal size, at least `MIN_PHOTOS` of them, with
-            the longest side of about `FIXED_SIDE`.
+    ``copies``: (N, H, W) grey copies of photos of equal size, at least `MIN_PHOTOS` of them, with
+    the longest side of about `FIXED_SIDE`.
     """
     if len(copies) < MIN_PHOTOS or min(copies.shape[1:]) < _LEAST_SIDE:
         return None

@@ -159,8 +159,7 @@ def _with_panoramas(photos: list[Photo]) -> list[Photo]:
 def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
     """Whether the frames of a video are 360° panoramas, by the header of the file.
 
-    Raises:
-        UserError: they show all directions, but not as one equirectangular picture.
+    Raises: UserError: they show all directions, but not as one equirectangular picture.
     """
     found = spherical_video(clip.path)
     around = found is not None or options.panoramas

@@ -28,8 +28,7 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
         size: width and height of the copied photo. A mask of another size is scaled. If it is
             larger, a pixel of the result is used if all pixels that it covers are used.
 
-    Raises:
-        UserError: the mask cannot be decoded, or its aspect ratio is not that of the photo.
+    Raises: UserError: the mask cannot be decoded, or its aspect ratio is not that of the photo.
     """
     try:
         with open_image(path) as opened:

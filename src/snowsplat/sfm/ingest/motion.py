@@ -53,9 +53,8 @@ class FrameMotion:
     because blur hardly changes the phases of a small copy. A cut counts as a shift by about an
     eighth of the frame, and so do other changes that are too large to be measured.
 
-    Args:
-        fixed: (H, W) bool, pixels of a frame that do not move with the scene, such as a time stamp;
-            in any size. They are replaced by the mean of the other pixels of their block.
+    ``fixed``: (H, W) bool, pixels of a frame that do not move with the scene, such as a time stamp;
+    in any size. They are replaced by the mean of the other pixels of their block.
     """
 
     def __init__(self, fixed: np.ndarray | None = None) -> None:
@@ -70,9 +69,8 @@ class FrameMotion:
 
         The motion is a fraction of the longest side of a frame. It never decreases.
 
-        Args:
-            grey: (H, W) uint8, a copy of `SHARPNESS_SIDE`. The frames of a video normally have the
-                same size. A change of the size counts as a cut.
+        ``grey``: (H, W) uint8, a copy of `SHARPNESS_SIDE`. The frames of a video normally have the
+        same size. A change of the size counts as a cut.
         """
         height, width = grey.shape
         factor = max(1, min(max(grey.shape) // _MOTION_SIDE, min(grey.shape) // _BLOCK))

@@ -117,12 +117,10 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDAr
 def spherical_video(path: Path) -> str | None:
     """Whether the header of an mp4 file says that its frames show all directions.
 
-    Returns:
-        None: it is an ordinary video. Empty: its frames are panoramas of all directions. Otherwise,
-        why they are not, as text for users.
+    Returns: None: it is an ordinary video. Empty: its frames are panoramas of all directions.
+    Otherwise, why they are not, as text for users.
 
-    Raises:
-        OSError: the file cannot be read.
+    Raises: OSError: the file cannot be read.
     """
     header = _header(path)
     at = header.find(b"sv3d")

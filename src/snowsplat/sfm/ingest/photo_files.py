@@ -96,8 +96,7 @@ class Header:
 def read_header(path: Path) -> Header:
     """Read the header of a photo, without decoding it.
 
-    Raises:
-        Unusable: the format is unknown, or the photo is damaged, too small, or stitched.
+    Raises: Unusable: the format is unknown, or the photo is damaged, too small, or stitched.
     """
     try:
         with open_image(path, header_only=True) as image:
@@ -182,8 +181,7 @@ def open_image(path: Path, *, header_only: bool = False, page: int = 0) -> Image
 def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Image.Image:
     """The photo, upright and resized: mode L, RGB or, with transparent pixels, RGBA.
 
-    Raises:
-        Unusable: the photo is damaged.
+    Raises: Unusable: the photo is damaged.
     """
     try:
         with open_image(path, page=page) as opened:

@@ -48,8 +48,7 @@ def set_fixed_parts_aside(
     Returns:
         The photos, in the same order, and a line for the user about each group with fixed parts.
 
-    Raises:
-        OSError: a file cannot be read or written.
+    Raises: OSError: a file cannot be read or written.
     """
     groups: dict[tuple[object, ...], list[Photo]] = {}
     for photo in photos:

@@ -81,8 +81,7 @@ def fine_detail(grey: np.ndarray, side: int) -> tuple[float, float]:
     This share does not depend on the contrast. It hardly depends on the content, because images of
     real scenes have detail at all scales, unless defocus or motion blur removes it.
 
-    Returns:
-        The share of the vertical and that of the horizontal gradient.
+    Returns: The share of the vertical and that of the horizontal gradient.
     """
     small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
     if min(small.shape) < 8:

@@ -326,8 +326,7 @@ def _unpacked(path: Path) -> Path:
 def kind_of_file(path: Path) -> Literal["photo", "video"]:
     """The kind of a file that was given as an input; it is determined by the content.
 
-    Raises:
-        UserError: neither photo nor video, or the file cannot be read.
+    Raises: UserError: neither photo nor video, or the file cannot be read.
     """
     try:
         with open(path, "rb") as file:

@@ -83,8 +83,7 @@ def orientation(
         photos: with the metadata; photos that are not in the model are ignored.
         marker: the result of `scale_of_markers`.
 
-    Raises:
-        ValueError: the model has no cameras.
+    Raises: ValueError: the model has no cameras.
     """
     cameras = read_cameras(model)
     by_name = {photo.name: photo for photo in photos}

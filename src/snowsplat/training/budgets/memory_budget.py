@@ -141,9 +141,8 @@ def plan_memory(
         budget: bytes; None: no limit.
         present: number of Gaussians of a resumed training run; they are not removed.
 
-    Raises:
-        SettingError: ``memory`` is too little for photos of this size, or for the Gaussians that
-            are present.
+    Raises: SettingError: ``memory`` is too little for photos of this size, or for the Gaussians
+    that are present.
     """
     sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
     largest, median = sizes[-1], sizes[len(sizes) // 2]

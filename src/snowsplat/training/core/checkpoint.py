@@ -81,9 +81,8 @@ def remove_old(folder: Path | str, step: int, *, keep: int = 2) -> None:
 def load(path: Path | str) -> Checkpoint:
     """Read a checkpoint and verify its checksums.
 
-    Raises:
-        UserError: the file is missing, truncated, damaged, not finite, not a checkpoint, or has
-            another version.
+    Raises: UserError: the file is missing, truncated, damaged, not finite, not a checkpoint, or has
+    another version.
     """
     path = Path(path)
     try:
@@ -95,8 +94,7 @@ def load(path: Path | str) -> Checkpoint:
 def latest(folder: Path | str) -> Checkpoint | None:
     """The newest valid checkpoint of ``folder``, or None. Warns about each newer, damaged one.
 
-    Raises:
-        UserError: a file cannot be read (permissions, open files); it may be valid.
+    Raises: UserError: a file cannot be read (permissions, open files); it may be valid.
     """
     for _, path in files(folder):
         try:

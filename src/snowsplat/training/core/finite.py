@@ -97,11 +97,9 @@ def check_parameters(step: int, gaussians: Gaussians) -> None:
 def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussians) -> None:
     """Check the update of ``step``.
 
-    Args:
-        nonfinite_rows: for each parameter, the number of rows that `ops.adam_step` skipped.
+    ``nonfinite_rows``: for each parameter, the number of rows that `ops.adam_step` skipped.
 
-    Raises:
-        Diverged: rows were skipped.
+    Raises: Diverged: rows were skipped.
     """
     if not any(nonfinite_rows):
         return
@@ -118,11 +116,9 @@ def check_loss(
 ) -> None:
     """Check the loss of ``step``; if it is not finite, find the cause.
 
-    Args:
-        photo: that of ``view``; None if another process has it.
+    ``photo``: that of ``view``; None if another process has it.
 
-    Raises:
-        Diverged: the loss is not finite.
+    Raises: Diverged: the loss is not finite.
     """
     if math.isfinite(loss):
         return

@@ -68,7 +68,13 @@ def _own(run: Run) -> list[str]:
 
 def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
     """See `Run.load_state`."""
-    tensors = {_FORMER_NAMES.get(name, name): tensor for name, tensor in tensors.items()}
+    # Version 0.2 had a part of this name. The other state does not depend on it.
+    former = () if f"{_PART}overfitting" in tensors else ("overfitting.",)
+    tensors = {
+        _FORMER_NAMES.get(name, name): tensor
+        for name, tensor in tensors.items()
+        if not name.startswith(former)
+    }
     own = set(_own(run))
     _check_own(own, {name for name in tensors if name.startswith((_PART, _LOSS, _WITHOUT))})
     # What the user's own parts have saved is checked by themselves.

@@ -120,8 +120,7 @@ class StepRunner:
     def rasterize(self, splats: Splats2D, camera: Camera, background: Tensor) -> RenderOutput:
         """Rasterize with the current capacity; gradients flow to ``splats.packed``.
 
-        Args:
-            background: (3,) colour in 0..1.
+        ``background``: (3,) colour in 0..1.
         """
         splats.packed.requires_grad_()
         if self.abs_grad:
@@ -195,11 +194,9 @@ class StepRunner:
             optimize: queues the step, through `rasterize` and `backward`.
             step, gaussians, views, photos: used for the message of an error.
 
-        Returns:
-            The loss of each view.
+        Returns: The loss of each view.
 
-        Raises:
-            Diverged: a loss is not finite, or the update of the previous step was not.
+        Raises: Diverged: a loss is not finite, or the update of the previous step was not.
         """
         while True:
             optimize()
@@ -226,8 +223,7 @@ class StepRunner:
     def finish(self, step: int, gaussians: Gaussians) -> None:
         """Wait for the device, and check the update of the last step, ``step``.
 
-        Raises:
-            Diverged: the update was not finite.
+        Raises: Diverged: the update was not finite.
         """
         finite.check_updates(step, self._nonfinite_rows.tolist(), gaussians)
 

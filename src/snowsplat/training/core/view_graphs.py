@@ -126,8 +126,7 @@ class ViewGraphs:
 
     def __init__(self, record: Recorder, note: Callable[[str], None]) -> None:
         """
-        Args:
-            note: takes a line for the user.
+        ``note``: takes a line for the user.
         """
         self._record: Recorder | None = record
         self._note = note

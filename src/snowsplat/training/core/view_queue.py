@@ -60,8 +60,7 @@ class ViewQueue:
     def take(self, after: int, step: int) -> list[BatchView]:
         """The views of the steps ``after`` + 1 to ``step``, at the resolution of the last one.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         downscale = self._downscale_at(step)
         ahead = max(LOOKAHEAD, self._batch)

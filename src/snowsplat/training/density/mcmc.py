@@ -169,8 +169,7 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
         opacities: (M,) o.
         copies: (M,) int64 N, including the Gaussian itself; clamped to `MAX_COPIES`.
 
-    Returns:
-        o_new (M,) and the factor (M,) of the scales, √(Σ_new / Σ); dtype of ``opacities``.
+    Returns: o_new (M,) and the factor (M,) of the scales, √(Σ_new / Σ); dtype of ``opacities``.
     """
     copies = copies.clamp(max=MAX_COPIES)
     o = opacities.double().clamp(max=1.0 - 1e-6)

@@ -42,8 +42,7 @@ class Densification(Part):
 
     def __init__(self, late: bool = False) -> None:
         """
-        Args:
-            late: whether no Gaussians are added before the masks of what moves are known.
+        ``late``: whether no Gaussians are added before the masks of what moves are known.
         """
         self.late = late
 
@@ -55,8 +54,7 @@ class Densification(Part):
     def begin(self, run: Run) -> None:
         """Create the state of the density control.
 
-        Raises:
-            SettingError: a setting of the density control is invalid.
+        Raises: SettingError: a setting of the density control is invalid.
         """
         self.control = self.settings.control(
             len(run.gaussians),

@@ -58,8 +58,7 @@ class Exposure(Part):
 
     def __init__(self, setting: str) -> None:
         """
-        Args:
-            setting: "auto" or "on", see ``TrainConfig.exposure``.
+        ``setting``: "auto" or "on", see ``TrainConfig.exposure``.
         """
         self._setting = setting
         # (3,) log-gains, with their gradients, of the views of this process in the present step.
@@ -69,8 +68,7 @@ class Exposure(Part):
     def prepare(self, run: Run) -> None:
         """Compare the photos, unless a state follows. Then `Run.photos` have equal exposures.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         views, first = run.dataset.train, run.shards.rank == 0
         start = ExposureStart(torch.zeros(len(views), 3), None)
@@ -92,8 +90,7 @@ class Exposure(Part):
 
         The gains of the others keep their difference to those of the first photos.
 
-        Args:
-            ev: (N, 3) in EV, see `ev`.
+        ``ev``: (N, 3) in EV, see `ev`.
         """
         known = (math.log(2.0) / GAMMA * ev).to(self.log_gains)
         self.log_gains += (known - self.log_gains[: len(known)]).mean(0)

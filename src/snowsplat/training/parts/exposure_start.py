@@ -83,11 +83,9 @@ class ExposureStart:
 def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
     """Compare the exposures of the training photos.
 
-    Args:
-        images: loads the photos.
+    ``images``: loads the photos.
 
-    Raises:
-        UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged.
     """
     views = dataset.train
     if dataset.points is not None and len(views) > 1:
@@ -173,11 +171,9 @@ def _unlike(logs: Tensor, gains: Tensor | None = None) -> float:
 def log_gains(logs: Tensor) -> Tensor:
     """The log-gains of photos from the colours of points that several photos show.
 
-    Args:
-        logs: (V, P, 3) float64, logs of colours; NaN where the colour is not known.
+    ``logs``: (V, P, 3) float64, logs of colours; NaN where the colour is not known.
 
-    Returns:
-        (V, 3) with mean 0; NaN for photos with too few points.
+    Returns: (V, 3) with mean 0; NaN for photos with too few points.
     """
     known = logs.isfinite()
     known &= known.sum(0) >= 2

@@ -56,8 +56,7 @@ def in_far_regions(
             of the cameras.
         depth: the median depth of the points, in the same unit.
 
-    Returns:
-        (M,) bool.
+    Returns: (M,) bool.
     """
     different, own = cells.unique(return_inverse=True)
     region_of_cell = regions_of(different)
@@ -98,8 +97,7 @@ def _residuals(region: Tensor, photos: Tensor, colors: Tensor, cells: Tensor) ->
         colors: (M, 3).
         cells: (M,) int64, at the radius; -1: the observation is left out.
 
-    Returns:
-        infinite where few colours can be compared.
+    Returns: infinite where few colours can be compared.
     """
     regions, number, used = int(region.max()) + 1, int(photos.max()) + 1, cells >= 0
     # The mean colour of each photo in each cell of each region.

@@ -92,9 +92,8 @@ class Sky:
     def points(self, most: int, background: Sequence[float] | None = None) -> Points:
         """At most ``most`` points, on the CPU.
 
-        Args:
-            background: RGB in 0..1 behind the scene; a sky of this colour, such as the background
-                of rendered images, needs no points.
+        ``background``: RGB in 0..1 behind the scene; a sky of this colour, such as the background
+        of rendered images, needs no points.
         """
         behind = torch.tensor(background or (torch.inf,) * 3) * 255.0
         needed = ((self.colors - behind).abs() > _BACKGROUND).any(1).nonzero()[:, 0]
@@ -133,12 +132,10 @@ def most_sky_points(count: int) -> int:
 def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | None:
     """The directions in which the photos show something very far away.
 
-    Args:
-        distance: of the sky from the middle of the cameras, in world units; 0: `sky_distance`.
+    ``distance``: of the sky from the middle of the cameras, in world units; 0: `sky_distance`.
 
-    Returns:
-        None if the photos hardly show it, or if this cannot be known: without points, or if all
-        photos were taken from almost the same place.
+    Returns: None if the photos hardly show it, or if this cannot be known: without points, or if
+    all photos were taken from almost the same place.
     """
     if dataset.points is None:
         return None

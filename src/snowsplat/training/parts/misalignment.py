@@ -51,8 +51,7 @@ def misalignment(
         background: RGB in 0..1.
         steps: number of steps of the training.
 
-    Raises:
-        UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged.
     """
     if len(views) < _FEWEST_VIEWS or steps < max(_FEWEST_STEPS, _STEPS_PER_VIEW * len(views)):
         return None

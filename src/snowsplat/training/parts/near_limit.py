@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -31,8 +32,8 @@ from snowsplat import ops
 from snowsplat.ops import Frusta
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.frusta import frusta_of
+from snowsplat.scene.geometry import invert_rigid
 from snowsplat.training.parts.part import REMOVED, Part
-from snowsplat.training.parts.unseen_cameras import beside
 from snowsplat.training.starts.source_views import source_views
 
 if TYPE_CHECKING:
@@ -65,8 +66,7 @@ class NearLimit(Part):
 
     def __init__(self, share: float) -> None:
         """
-        Args:
-            share: the limit, relative to the depth of the nearest points.
+        ``share``: the limit, relative to the depth of the nearest points.
         """
         self.share = share
         self._views: Frusta | None = None  # before the limits; None: no limit
@@ -124,8 +124,7 @@ class NearLimit(Part):
 def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:
     """Cameras between each camera and others that show the same points, and on its other side.
 
-    Args:
-        points: (P, 3) in the world frame, a sample of the scene.
+    ``points``: (P, 3) in the world frame, a sample of the scene.
     """
     partners = source_views(cameras, points, _PARTNERS)
     return [
@@ -134,6 +133,22 @@ def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:
         for j in chosen
         for share in _SHARES
     ]
+
+
+def beside(first: Camera, second: Camera, share: float) -> Camera:
+    """The first camera, moved and rotated away from the second one by a share of their difference.
+
+    With a negative share, it moves towards the second one; −1 is the pose of the second camera.
+
+    The rotation is the nearest one to (1 + share) R₁ − share R₂.
+    """
+    a, b = (camera.world_from_cam.to(torch.float64) for camera in (first, second))
+    moved = (1.0 + share) * a - share * b
+    u, _, vt = torch.linalg.svd(moved[:, :3])
+    if torch.det(u @ vt) < 0.0:  # the two directions are almost opposite
+        vt[2] = -vt[2]
+    world_from_cam = torch.cat([u @ vt, moved[:, 3:]], dim=1)
+    return replace(first, cam_from_world=invert_rigid(world_from_cam))
 
 
 def nearest_depth(camera: Camera, points: Tensor) -> float:

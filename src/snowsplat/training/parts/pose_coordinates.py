@@ -108,8 +108,7 @@ class Gauge:
 
     def __init__(self, cameras: Sequence[Camera], units: Tensor, extent: float) -> None:
         """
-        Args:
-            units: (V, 6, 6): P of each camera, on the device of the motions.
+        ``units``: (V, 6, 6): P of each camera, on the device of the motions.
         """
         positions = [camera.position.detach().cpu().double() for camera in cameras]
         motions = gauge_motions(cameras, torch.stack(positions).mean(0), extent)

@@ -128,8 +128,7 @@ class PoseRefinement(Part):
     def between(self, run: Run) -> None:
         """Decide once, after the first part of the training, whether the poses are exact.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         if self._exact != 0.0 or run.step < run.schedule.step_of(BEGIN):
             return

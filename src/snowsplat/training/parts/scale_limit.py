@@ -40,8 +40,7 @@ class ScaleLimit(Part):
 
     def __init__(self, ratio: float) -> None:
         """
-        Args:
-            ratio: largest scale, in units of the distance to the nearest camera.
+        ``ratio``: largest scale, in units of the distance to the nearest camera.
         """
         self.ratio = ratio
 

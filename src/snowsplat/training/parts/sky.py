@@ -35,8 +35,7 @@ class SkyPart(Part):
 
     def __init__(self, distance: float = 0.0) -> None:
         """
-        Args:
-            distance: of the sky from the middle of the cameras, in world units; 0: `sky_distance`.
+        ``distance``: of the sky from the middle of the cameras, in world units; 0: `sky_distance`.
         """
         self.distance = distance
         self.sky: Sky | None = None
@@ -45,8 +44,7 @@ class SkyPart(Part):
     def prepare(self, run: Run) -> None:
         """Find the sky in the photos, unless a state follows, which may correct the photos.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         self._decided = not run.resumed
         if not run.resumed and run.initial is None:

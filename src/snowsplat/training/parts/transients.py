@@ -95,8 +95,7 @@ class Transients(Part):
 
     def __init__(self, mode: AutoOnOff) -> None:
         """
-        Args:
-            mode: "auto": only if something moves in several photos; see ``TrainConfig.transients``.
+        ``mode``: "auto": only if something moves in several photos; see ``TrainConfig.transients``.
         """
         self.mode = self._mode = mode
         self._run: Run
@@ -115,8 +114,7 @@ class Transients(Part):
     def between(self, run: Run) -> None:
         """Compute the masks, after the steps of `MOMENTS`.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         moments = [run.schedule.step_of(moment) for moment in MOMENTS]
         if self._mode == "off" or not run.schedule.contains(run.step, moments):

@@ -68,8 +68,7 @@ class Unexplained(Part):
 
     def __init__(self, after: When) -> None:
         """
-        Args:
-            after: the moment of the decision.
+        ``after``: the moment of the decision.
         """
         self.after = after
         self._decided = False
@@ -82,8 +81,7 @@ class Unexplained(Part):
     def between(self, run: Run) -> None:
         """Decide, at the first step from the moment on.
 
-        Raises:
-            UserError: a photo is missing or damaged.
+        Raises: UserError: a photo is missing or damaged.
         """
         if self._decided or run.step < run.schedule.step_of(self.after):
             return
@@ -149,8 +147,7 @@ def unexplained_views(
         sh_degree: degree of the spherical harmonics in use.
         render: renders the scene.
 
-    Raises:
-        UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged.
     """
     if len(views) < _FEWEST_VIEWS:
         return ()
@@ -178,10 +175,9 @@ def fitted(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[fl
         photo: (H, W, 3) in 0..1.
         mask: (H, W) bool, False for pixels to ignore.
 
-    Returns:
-        The PSNR in dB after the fit, at most 60, and the share of the variance of the photo that
-        the image explains, 0 to 1. Both have their largest value for a photo of one colour, and
-        if the mask leaves no pixel.
+    Returns: The PSNR in dB after the fit, at most 60, and the share of the variance of the photo
+    that the image explains, 0 to 1. Both have their largest value for a photo of one colour, and if
+    the mask leaves no pixel.
     """
     fit = color_fit(image, photo, mask)
     if fit is None:
@@ -215,10 +211,9 @@ def standing_out(
         positions: (V, 3), the camera centres in world units.
         directions: (V, 3), the viewing directions, of length 1.
 
-    Returns:
-        The indices of the views found, ascending. No indices if there are fewer than 10 views, or
-        if more than a quarter of the views stand out: then the scene does not explain the photos in
-        general.
+    Returns: The indices of the views found, ascending. No indices if there are fewer than 10 views,
+    or if more than a quarter of the views stand out: then the scene does not explain the photos in
+    general.
     """
     count = len(psnr)
     if count < _FEWEST_VIEWS:

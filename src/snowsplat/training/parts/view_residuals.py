@@ -125,8 +125,7 @@ def residuals_elsewhere(
     """For each map, the usual residual (h, w) of its places in other views, and the number (h, w)
     of these views. The residual is infinite if there are none.
 
-    Args:
-        ignored: (h, w) bool for each map, cells that do not count in other views.
+    ``ignored``: (h, w) bool for each map, cells that do not count in other views.
     """
     cameras = [cells.places.camera for cells in maps]
     positions = torch.stack([camera.position for camera in cameras])

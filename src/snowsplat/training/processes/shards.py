@@ -61,11 +61,9 @@ class Shards:
     def selection(self, index: Tensor) -> Callable[[Tensor], Tensor]:
         """A function that replaces the rows of all shards by their rows ``index``, in this order.
 
-        Args:
-            index: (M,) int64, rows of all shards; the same in every process.
+        ``index``: (M,) int64, rows of all shards; the same in every process.
 
-        Returns:
-            A function from the old rows of this shard to its new ones.
+        Returns: A function from the old rows of this shard to its new ones.
         """
         return lambda rows: take_rows(rows, index)
 
@@ -80,9 +78,8 @@ class Shards:
     def exchange(self, splats: Sequence[Splats2D]) -> Splats2D | None:
         """The splats of all Gaussians in the view of this process; None if it has no view.
 
-        Args:
-            splats: the splats of this shard in each view of the round, at most one view for each
-                process.
+        ``splats``: the splats of this shard in each view of the round, at most one view for each
+        process.
         """
         return splats[0]
 

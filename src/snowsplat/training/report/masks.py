@@ -31,8 +31,7 @@ def masked(views: Sequence[View], masks: Mapping[str, Image.Image]) -> str:
         views: the training views.
         masks: by the name of the view, of the size of its photo: 0 where something moves.
 
-    Raises:
-        UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged.
     """
     if not masks:
         return ""

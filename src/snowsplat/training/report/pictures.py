@@ -45,8 +45,7 @@ def compared(
 ) -> str:
     """HTML of the views with the lowest and the highest PSNR in ``evaluation``.
 
-    Raises:
-        UserError: a photo is missing or damaged.
+    Raises: UserError: a photo is missing or damaged.
     """
     color = torch.tensor(background, device=gaussians.means.device)
     order = sorted(evaluation.views, key=lambda metrics: metrics.psnr)

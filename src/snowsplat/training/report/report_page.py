@@ -64,8 +64,6 @@ class Trained:
     exposures: tuple[float, ...] = ()
     # The masks of what moves, by the name of the training view; see `Transients.pictures`.
     masks: Mapping[str, Image.Image] = field(default_factory=dict)
-    # Why the training ended before its last planned step; None if it did not.
-    ended_early: str | None = None
     poses: str | None = None  # the line about the camera poses; None if there is nothing to say
     # What is doubtful about the cameras of the dataset, a sentence each.
     doubts: tuple[str, ...] = ()
@@ -94,7 +92,6 @@ def write_training_report(path: Path, trained: Trained) -> None:
             _headline(trained, evaluation, held_out),
             "" if trained.verdict is None else trained.verdict.html("the scene"),
             _cards(trained, evaluation, held_out),
-            _ended_early(trained.ended_early),
             _left_out(trained.left_out),
             masks.masked(trained.dataset.train, trained.masks),
             _poses(trained.poses),
@@ -143,10 +140,6 @@ def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
         (duration(trained.history.seconds), "of training"),
     ]
     return cards(figures)
-
-
-def _ended_early(why: str | None) -> str:
-    return "" if why is None else f"<p>The training {text(why)}.</p>"
 
 
 def _poses(line: str | None) -> str:

@@ -99,13 +99,6 @@ class TrainConfig(Settings):
         "the first masks are known.",
         metavar="{auto,on,off}",
     )
-    stop_overfitting: bool = setting(
-        False,
-        "Whether the training ends earlier if the views between the photos become worse. This "
-        "happens in long training runs with few photos. The dataset needs points.",
-        "off",
-        metavar="{on,off}",
-    )
     exposure: AutoOnOff = setting(
         "off",
         "Whether to learn a gain for each photo and colour channel, for photos with different "
@@ -184,8 +177,7 @@ class TrainConfig(Settings):
         "points",
         "Where the first Gaussians come from. points: the points of the dataset; sweep: depth maps "
         "computed from the photos (plane sweep); depth: the depth maps of the dataset "
-        "(depths/IMG.png); carve: voxels with the same colour in all photos (space carving); "
-        "random: random depths of random pixels. Example: points+sweep.",
+        "(depths/IMG.png); random: random depths of random pixels. Example: points+sweep.",
         allowed="names of starts, such as points+sweep",
         check=check_starts,
         metavar="START[+START…]",
@@ -386,7 +378,6 @@ def parts_of(config: TrainConfig) -> list[Part]:
     from snowsplat.training.parts.depth_supervision import DepthSupervision
     from snowsplat.training.parts.exposure import Exposure
     from snowsplat.training.parts.near_limit import NearLimit
-    from snowsplat.training.parts.overfitting import OverfittingCheck
     from snowsplat.training.parts.pose_refinement import PoseRefinement
     from snowsplat.training.parts.scale_limit import ScaleLimit
     from snowsplat.training.parts.sky import SkyPart
@@ -399,7 +390,6 @@ def parts_of(config: TrainConfig) -> list[Part]:
         (config.exposure != "off", Exposure(config.exposure)),
         (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
         (config.refine_poses, PoseRefinement()),
-        (config.stop_overfitting, OverfittingCheck()),
         (config.transients != "off", Transients(config.transients)),
         (config.depth_weight > 0, DepthSupervision(config.depth_weight)),
         (config.near_limit > 0, NearLimit(config.near_limit)),

@@ -101,9 +101,8 @@ class Settings:
     Attributes:
         prefix: of the names by which `changed` and the flags know the fields: "lr_".
 
-    Raises:
-        SettingError: a value is invalid. The message is one line that names the setting, the value
-            and what is allowed.
+    Raises: SettingError: a value is invalid. The message is one line that names the setting, the
+    value and what is allowed.
     """
 
     prefix: ClassVar[str] = ""
@@ -128,8 +127,7 @@ def declarations(kind: type) -> tuple[tuple[str, Any, Setting], ...]:
 def checked(name: str, value: Any, hint: Any, declared: Setting = _UNDECLARED) -> Any:
     """``value`` as a value of the type ``hint``, within the limits of the declaration.
 
-    Raises:
-        SettingError: it is not valid.
+    Raises: SettingError: it is not valid.
     """
     try:
         value = _typed(value, hint, declared)

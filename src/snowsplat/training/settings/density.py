@@ -253,8 +253,7 @@ _REQUIRED = ("max_gaussians", "abs_grad", "densify_from", "densify_until", "dens
 def check_density(density: Any) -> str | None:
     """What is wrong with the settings of a density control; None: nothing.
 
-    Raises:
-        SettingError: one of the settings that all density controls have is invalid.
+    Raises: SettingError: one of the settings that all density controls have is invalid.
     """
     if isinstance(density, type) or not is_dataclass(density):
         return "is not an object of a dataclass; use e.g. AdaptiveDensity()"

@@ -38,7 +38,6 @@ class _OfPackage:
 STARTS: dict[str, Start] = {
     "points": _OfPackage("dataset_points"),
     "random": _OfPackage("random_points"),
-    "carve": _OfPackage("carved_points"),
     "depth": _OfPackage("depth_points"),
     "sweep": _OfPackage("swept_points"),
 }
@@ -58,6 +57,8 @@ def register_start(name: str, start: Start) -> None:
 def check_starts(names: str) -> str | None:
     """What is wrong with names of starts, joined by "+"; None: nothing."""
     for name in names.split("+"):
+        if name == "carve":
+            return "'carve' was removed; use sweep, which is faster and finds more of the surface"
         if name not in STARTS:
             which = "" if name == names else f" ({name!r})"
             advice = suggestion(name, list(STARTS)) or f"; use one of {', '.join(STARTS)}"

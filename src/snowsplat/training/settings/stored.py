@@ -29,8 +29,7 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
     Settings that an older version did not have get their default. Settings that this version does
     not have are ignored, with a warning, or refused if ``strict``.
 
-    Raises:
-        UserError: the density control is not registered; or the values are damaged.
+    Raises: UserError: the density control is not registered; or the values are damaged.
     """
     if not isinstance(values, dict) or _DENSITY_NAME not in values:
         raise UserError("the configuration: damaged; start the training again")
@@ -46,6 +45,9 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
         "learning_rates": LearningRates,
         "decay": DecayRates,
     }
+    # A resumed training has its first Gaussians already.
+    if not strict and isinstance(start := values.get("init"), str):
+        values["init"] = start.replace("carve", "sweep")
     for part, kind in kinds.items():
         if part in values:
             values[part] = _known(kind, values[part], strict)

@@ -10,14 +10,12 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.image_loader import Photos
-from snowsplat.training.starts.carve import carved_points
 from snowsplat.training.starts.depth import depth_points
 from snowsplat.training.starts.map_views import map_pixels
 from snowsplat.training.starts.random_rays import random_points
 from snowsplat.training.starts.sweep import swept_points
 
 __all__ = [
-    "carved_points",
     "dataset_points",
     "depth_points",
     "map_pixels",

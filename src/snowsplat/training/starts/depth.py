@@ -81,8 +81,7 @@ def aligned_depth_map(
         points: (P, 3) in the world frame; None: the values are z, in units of ``View.depth_unit``.
         longer_side: the maximum size of the result, in pixels.
 
-    Raises:
-        UserError: the map is damaged, or not one of its photo.
+    Raises: UserError: the map is damaged, or not one of its photo.
     """
     if view.depth is None:
         return None

@@ -106,8 +106,7 @@ def thinned(points: Tensor, colors: Tensor, widths: Tensor, count: int) -> Point
 def _voxels(points: Tensor, widths: Tensor, multiple: float) -> tuple[Tensor, int]:
     """The voxel of each point, (P,) int64 in 0..n−1, and their number n.
 
-    Args:
-        multiple: binary logarithm of the side of a voxel in units of ``widths``.
+    ``multiple``: binary logarithm of the side of a voxel in units of ``widths``.
     """
     level = (widths.log2() + multiple).floor()
     cell = (points / torch.exp2(level)[:, None]).floor().to(torch.int64)

@@ -48,8 +48,7 @@ def choose_views(
 ) -> MapViews:
     """Choose the views that get a depth map: all training views, if memory permits.
 
-    Args:
-        longer_side: see `map_size`.
+    ``longer_side``: see `map_size`.
     """
     cameras = [view.camera for view in dataset.train]
     sizes = [map_size(camera.width, camera.height, longer_side) for camera in cameras]

@@ -14,9 +14,8 @@ from snowsplat.scene.camera import Camera
 def point_pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """The pixel positions of points (P, 3) in the world frame, and which are in the image.
 
-    Returns:
-        (P, 2) float32, valid where the second tensor, (P,) bool, is True. Occlusion is not
-        considered.
+    Returns: (P, 2) float32, valid where the second tensor, (P,) bool, is True. Occlusion is not
+    considered.
     """
     pixel, depth = camera.project(points.to(torch.float64))
     size = torch.tensor([camera.width, camera.height])
@@ -37,8 +36,7 @@ def point_colors(
         background: (3,) colour in 0..1 behind transparent pixels.
         downscale: the factor by which the photo is reduced: 1, 2 or 4.
 
-    Raises:
-        UserError: the photo is missing or damaged.
+    Raises: UserError: the photo is missing or damaged.
     """
     photo = images.get(view, downscale).to(torch.device("cpu"))
     pixels, known = point_pixels(view.camera.downscaled(downscale), points)

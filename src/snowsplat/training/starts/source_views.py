@@ -29,9 +29,8 @@ def source_views(cameras: Sequence[Camera], points: Tensor, count: int) -> list[
         points: (P, 3) in the world frame, a sample of the scene. Occlusion is not considered.
         count: the maximum number of source views of a view.
 
-    Returns:
-        Indices into ``cameras``, the best one first. The list of a view is empty if no other view
-        shows the same points.
+    Returns: Indices into ``cameras``, the best one first. The list of a view is empty if no other
+    view shows the same points.
     """
     points = points.to(torch.float64)
     visible, depths, rays = [], [], []
