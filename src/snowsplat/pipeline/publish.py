@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +30,8 @@ class PublishOptions:
         title: the name on the page; None: the name of the scene.
         licence: the licence of the scene, such as "CC BY 4.0".
         url: the address of the folder on the web. Services that show a preview of a link need it.
+        for_editing: the page is not to be looked at: it has all Gaussians, even of a large scene,
+            without what their colours owe to the direction of view.
 
     Raises:
         UserError: the address is not one.
@@ -38,6 +40,7 @@ class PublishOptions:
     title: str | None = None
     licence: str = ""
     url: str = ""
+    for_editing: bool = False
 
     def __post_init__(self) -> None:
         if self.url and not re.fullmatch(r"https?://[^\s\"<>?#]+", self.url):
@@ -65,7 +68,7 @@ def publish(
 ) -> PublishResult:
     """Write a static web site that shows a scene: a page, the viewer, the scene, and a picture.
 
-    A scene of more than 2 million Gaussians is written in levels of detail.
+    A scene of more than 2 million Gaussians is written in levels of detail, except for editing.
 
     Args:
         scene: the output folder of a training run, or a scene file of any format.
@@ -97,7 +100,11 @@ def publish(
         place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
         observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
-    large = len(source.gaussians) > _LARGE
+    if options.for_editing:
+        # Every format leaves out Gaussians that are not finite, also if only these colours are not.
+        usable = source.gaussians.select(source.gaussians.sh_rest.isfinite().flatten(1).all(1))
+        source = replace(source, gaussians=replace(usable, sh_rest=usable.sh_rest[:, :0]))
+    large = len(source.gaussians) > _LARGE and not options.for_editing
     write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):
         write_site(folder, source.ready(), about, url, write)
