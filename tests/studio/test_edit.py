@@ -1,45 +1,17 @@
 """Editing in the page of a finished scene: what is selected, and what the studio stores."""
 
-import base64
 import json
 
 import numpy as np
 import pytest
 import torch
 
-from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
-from snowsplat.pipeline.publish import publish
-from snowsplat.scene.gaussians import Gaussians
-from snowsplat.studio.library import Scene
 from snowsplat.util.files import write_json
 
 from ..browser import Browser, Page
-from .conftest import of_the_command_line, press
-
-N = 301
-
-
-@pytest.fixture
-def finished(library) -> Scene:
-    """A scene of Gaussians in a flat box, as a job leaves it."""
-    scene = library.new("Box", [])
-    box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
-    gaussians = Gaussians.random_in_bounds(box, N, torch.Generator().manual_seed(0), 1)
-    file = scene.made / "box.ply"
-    file.parent.mkdir()
-    write_gaussians(file, gaussians)
-    publish(file, scene.site)
-    scene.change(quality="draft")
-    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": []}
-    result = {"file": file.name, "aligned": False, "reports": {}, **facts}
-    scene.write_state({"outcome": "done", "result": result})
-    return scene
-
-
-def edit_of(removed: np.ndarray, **more) -> dict:
-    bits = np.packbits(removed, bitorder="little").tobytes()
-    return {"count": len(removed), "removed": base64.b64encode(bits).decode(), **more}
+from .conftest import N, edit_of, of_the_command_line, press
 
 
 @pytest.mark.usefixtures("in_process")
@@ -142,12 +114,12 @@ def test_hostile_changes(studio, finished):
 
 def test_a_site_has_no_tools_but_its_page_in_the_studio_has(studio, finished):
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
-    assert 'src="../../../tools.js" data-whole="true" data-edited="false">' in page
+    assert 'src="../../../tools.js" data-page="small" data-edited="false"' in page
     assert "tools.js" not in (finished.site / "index.html").read_text("utf-8")
-    # Editing is for the page that is one file.
+    # Levels of detail are edited in another page.
     (finished.site / "scene.sog").unlink()
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
-    assert 'data-whole="false"' in page
+    assert 'data-page="levels"' in page
 
 
 def counts(page: Page) -> str:

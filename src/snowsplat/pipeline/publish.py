@@ -13,6 +13,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
 from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.viewer.web.panel import Description, made_on
@@ -101,9 +102,9 @@ def publish(
         observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
     if options.for_editing:
-        # Every format leaves out Gaussians that are not finite, also if only these colours are not.
-        usable = source.gaussians.select(source.gaussians.sh_rest.isfinite().flatten(1).all(1))
-        source = replace(source, gaussians=replace(usable, sh_rest=usable.sh_rest[:, :0]))
+        # A Gaussian of which only these colours are not finite is left out, too.
+        usable = source.gaussians.select(source.gaussians.usable_rows())
+        source = replace(source, gaussians=with_sh_degree(usable, 0))
     large = len(source.gaussians) > _LARGE and not options.for_editing
     write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):

@@ -214,14 +214,19 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     async function level(/** @type {number} */ x, /** @type {number} */ y) {
         const point = await surface(x, y);
         if (!point) return;
-        floor.push(point);
+        setFloor([...floor, point]);
         if (floor.length < 3) return draw();
         const turn = levelling(floor.map(placed), presentView().slice(0, 3));
-        floor = [];
+        setFloor([]);
         if (turn) edits.turnBy(turn);
         else tell(say("edit_on_a_line"));
         show();
         draw();
+    }
+
+    function setFloor(/** @type {number[][]} */ points) {
+        floor = points;
+        floorPoints.textContent = points.length ? say("edit_level_points", points.length) : "";
     }
 
     function listNotes() {
@@ -307,7 +312,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         forMeasure.hidden = name !== "measure";
         forNotes.hidden = name !== "note";
         forLevel.hidden = name !== "level";
-        floor = [];
+        setFloor([]);
     }
 
     const forSelection = make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => edits.invert())));
@@ -342,7 +347,8 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         );
         return make("div.snow-turn", {}, make("b", {}, axis), by(-90), fine, by(90));
     });
-    const forLevel = make("div", {}, make("p", {}, say("edit_level_how")), ...turns);
+    const floorPoints = make("p", { role: "status" });
+    const forLevel = make("div.snow-level", {}, make("p", {}, say("edit_level_how")), floorPoints, ...turns);
     const hides = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: change(() => {}) }));
     const remove = button("edit_delete", change(() => edits.delete()));
     const undo = button("edit_undo", change(() => go("undo")));

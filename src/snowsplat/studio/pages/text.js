@@ -142,6 +142,7 @@ const TEXTS = {
     edit_note: ["Annotate", "标注"],
     edit_level: ["Level and turn", "调平与旋转"],
     edit_level_how: ["Click three points of the floor to level the scene, or turn it about an axis; y is up.", "点击地面上的三个点即可调平场景，或绕某个轴旋转；y 轴朝上。"],
+    edit_level_points: ["{0} of 3 points", "已点击 {0} / 3 个点"],
     edit_on_a_line: ["The three points are on a line; click others", "三个点在一条直线上；请点击其他位置"],
     edit_turn: ["Turn about {0} by {1}°", "绕 {0} 轴旋转 {1}°"],
     edit_turn_fine: ["Turn about {0}, finely", "绕 {0} 轴微调"],

@@ -1,0 +1,110 @@
+"""The tools of the editor in the 3D view, by real clicks: the handles of the box, a level floor."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.pipeline.publish import publish
+from snowsplat.scene.gaussians import Gaussians
+
+from ..browser import Browser, Page
+from .conftest import edit_of, press
+
+pytestmark = pytest.mark.browser
+
+TILT = math.radians(20)
+NOTE = {"title": "Corner", "text": "", "view": [0, 2, -8, -1.5, 0.5, 0, 50, 1.5]}
+
+
+def tilted_floor() -> Gaussians:
+    """A floor that rises along x, −y is up, of round Gaussians without gaps."""
+    side = 40
+    x, z = torch.meshgrid(torch.linspace(-3, 3, side), torch.linspace(-3, 3, side), indexing="ij")
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    floor = Gaussians.random_in_bounds(box, side * side, torch.Generator().manual_seed(0), 0)
+    flat = torch.stack(
+        [x.flatten() * math.cos(TILT), -x.flatten() * math.sin(TILT), z.flatten()], 1
+    )
+    floor.means.copy_(flat)
+    floor.log_scales.fill_(math.log(0.08))
+    floor.opacity_logits.fill_(4.0)
+    return floor
+
+
+def tilt_of(gaussians: Gaussians) -> float:
+    """Degrees between the normal of the floor and the y axis."""
+    _, _, axes = torch.linalg.svd(gaussians.means - gaussians.means.mean(0), full_matrices=False)
+    return math.degrees(math.acos(min(1.0, abs(float(axes[2, 1])))))
+
+
+def middle_of(page: Page, handle: int) -> tuple[float, float]:
+    x, y, width, height = page.evaluate(
+        f"(({{ x, y, width, height }}) => [x, y, width, height])"
+        f"(document.querySelectorAll('.snow-handle')[{handle}].getBoundingClientRect())"
+    )
+    return x + width / 2, y + height / 2
+
+
+def faces(page: Page) -> list[float]:
+    return page.evaluate(
+        "[...document.querySelectorAll('.snow-handle')].map(each => Number(each.ariaValueNow))"
+    )
+
+
+def key(page: Page, name: str) -> None:
+    for kind in ("rawKeyDown", "keyUp"):
+        page.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+
+
+@pytest.mark.usefixtures("in_process")
+def test_box_and_level_by_clicks(studio, finished):
+    floor = tilted_floor()
+    file = finished.scene_file()
+    write_gaussians(file, floor)
+    publish(file, finished.site, overwrite=True)
+    address = f"scenes/{finished.name}"
+    nothing = [False] * len(floor)
+    assert studio.ask(f"{address}/edit", "POST", edit_of(nothing, notes=[NOTE]))[0] == 200
+    with Browser(900, 600, frames=4.0) as browser:
+        page = browser.open(f"{studio.server.url}{address}/site/index.html", timeout=60)
+        page.wait_for("!!document.querySelector('.snow-edit')", 120)
+        page.evaluate("document.querySelector('.sse-controlsHintClose')?.click()")
+        press(page, "Edit")
+        press(page, "Box")
+        # x points to the left in the first view: the right handle is that of the lower side.
+        page.wait_for("document.querySelector('.snow-handle').style.transform !== ''")
+        before, (x, y) = faces(page), middle_of(page, 0)
+        page.drag(x, y, x - 60, y)
+        after = faces(page)
+        assert after[0] > before[0] + 0.2
+        assert after[1:] == before[1:]
+        page.wait_for(
+            f"document.querySelector('.snow-handle').getBoundingClientRect().x < {x - 50}"
+        )
+        assert middle_of(page, 0)[0] == pytest.approx(x - 60, abs=1.5)  # it follows the pointer
+        page.evaluate("document.querySelectorAll('.snow-handle')[1].focus()")
+        key(page, "ArrowLeft")
+        step = (before[1] - before[0]) / 100
+        assert faces(page)[1] == pytest.approx(before[1] - step)
+        press(page, "Select what is outside")
+        shown = page.evaluate("document.querySelector('.snow-edit > p').textContent")
+        assert 10 < int(shown.split()[0].replace(",", "")) < len(floor) / 2
+        press(page, "Undo")
+        # Three clicks; the annotation of the viewer follows, before anything is saved.
+        spot = "document.querySelector('.sse-annotation-hotspot').style.transform"
+        place = page.evaluate(spot)
+        press(page, "Level and turn")
+        dots = "document.querySelector('.snow-level [role=status]').textContent"
+        for i, (column, row) in enumerate(((530, 330), (640, 350), (560, 400))):
+            page.click(column, row)
+            page.wait_for(f"{dots} === '{i + 1} of 3 points'" if i < 2 else f"{dots} === ''", 60)
+        page.wait_for(f"{spot} !== {json.dumps(place)}")
+        page.evaluate("window.old = true")
+        press(page, "Save")
+        page.wait_for("!window.old && !!document.querySelector('.snow-edit')", 180)
+        assert not page.errors
+    assert tilt_of(floor) == pytest.approx(20, abs=0.1)
+    assert tilt_of(read_gaussians(finished.scene_file())) < 2
