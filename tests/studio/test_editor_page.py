@@ -48,6 +48,19 @@ def middle_of(page: Page, handle: int) -> tuple[float, float]:
     return x + width / 2, y + height / 2
 
 
+def place_of(page: Page, across: float, z: float) -> tuple[float, float]:
+    """Where the window shows a place of the floor."""
+    x, y = page.evaluate(
+        "(() => { const { root } = window.sse.viewer.app;"
+        "const point = root.findByName('gsplat').getPosition().clone()"
+        f".set({across * math.cos(TILT)}, {-across * math.sin(TILT)}, {z});"
+        "root.findByName('gsplat').getWorldTransform().transformPoint(point, point);"
+        "const { x, y } = root.findByName('camera').camera.worldToScreen(point);"
+        "return [x, y]; })()"
+    )
+    return x, y
+
+
 def faces(page: Page) -> list[float]:
     return page.evaluate(
         "[...document.querySelectorAll('.snow-handle')].map(each => Number(each.ariaValueNow))"
@@ -98,8 +111,8 @@ def test_box_and_level_by_clicks(studio, finished):
         place = page.evaluate(spot)
         press(page, "Level and turn")
         dots = "document.querySelector('.snow-level [role=status]').textContent"
-        for i, (column, row) in enumerate(((530, 330), (640, 350), (560, 400))):
-            page.click(column, row)
+        for i, place in enumerate(((0.8, -1.0), (2.4, 0.0), (0.8, 1.6))):
+            page.click(*place_of(page, *place))
             page.wait_for(f"{dots} === '{i + 1} of 3 points'" if i < 2 else f"{dots} === ''", 60)
         page.wait_for(f"{spot} !== {json.dumps(place)}")
         page.evaluate("window.old = true")
