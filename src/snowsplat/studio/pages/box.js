@@ -37,7 +37,7 @@ export function addBox(centers, canvas, model) {
         const label = say(side ? "edit_to" : "edit_from", name);
         const first = sides[side][axis];
         const slider = /** @type {HTMLInputElement} */ (
-            make("input", { type: "range", step: "any", input: () => move(side, axis, Number(slider.value)) })
+            make("input", { type: "range", step: "any", "aria-label": label, title: label, input: () => move(side, axis, Number(slider.value)) })
         );
         slider.min = String(first - (side ? 1 : BEYOND) * spans[axis]);
         slider.max = String(first + (side ? BEYOND : 1) * spans[axis]);
@@ -74,13 +74,13 @@ export function addBox(centers, canvas, model) {
             handle.ariaValueText = value.toPrecision(3);
         }
         show();
-        return { axis, side, handle, slider, label, show };
+        return { axis, side, handle, slider, show };
     }
 
     const handles = make("div.snow-handles", { hidden: true }, ...faces.map(face => face.handle));
     return {
         handles,
-        sliders: faces.map(({ slider, label }) => make("label", {}, label, slider)),
+        sliders: AXES.map((name, k) => make("div.snow-sides", {}, make("b", {}, name), ...faces.filter(face => face.axis === k).map(face => face.slider))),
         /** A byte per Gaussian: whether its centre is outside. */
         outside: () => {
             const [a, b] = sides.map(inScene);
