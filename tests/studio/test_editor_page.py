@@ -1,6 +1,5 @@
 """The tools of the editor in the 3D view, by real clicks: the handles of the box, a level floor."""
 
-import json
 import math
 
 import pytest
@@ -17,6 +16,18 @@ pytestmark = pytest.mark.browser
 
 TILT = math.radians(20)
 NOTE = {"title": "Corner", "text": "", "view": [0, 2, -8, -1.5, 0.5, 0, 50, 1.5]}
+
+# Where the window shows the place of the annotation, and where its marker is.
+_NOTE_PLACE = (
+    "(({ annotations: [note], app: { root } }) => {"
+    "const point = root.getPosition().clone().set(...note.position);"
+    "const { x, y } = root.findByName('camera').camera.worldToScreen(point);"
+    "return [x, y]; })(window.sse.viewer)"
+)
+_MARKER = (
+    "document.querySelector('.sse-annotation-hotspot').style.transform"
+    ".match(/[-\\d.]+/g).slice(0, 2).map(Number)"
+)
 
 
 def tilted_floor() -> Gaussians:
@@ -107,14 +118,15 @@ def test_box_and_level_by_clicks(studio, finished):
         assert 10 < int(shown.split()[0].replace(",", "")) < len(floor) / 2
         press(page, "Undo")
         # Three clicks; the annotation of the viewer follows, before anything is saved.
-        spot = "document.querySelector('.sse-annotation-hotspot').style.transform"
-        place = page.evaluate(spot)
+        place = page.evaluate(_NOTE_PLACE)
         press(page, "Level and turn")
         dots = "document.querySelector('.snow-level [role=status]').textContent"
         for i, place in enumerate(((0.8, -1.0), (2.4, 0.0), (0.8, 1.6))):
             page.click(*place_of(page, *place))
             page.wait_for(f"{dots} === '{i + 1} of 3 points'" if i < 2 else f"{dots} === ''", 60)
-        page.wait_for(f"{spot} !== {json.dumps(place)}")
+        assert math.dist(page.evaluate(_NOTE_PLACE), place) > 20
+        x, y = page.evaluate(_NOTE_PLACE)
+        page.wait_for(f"(([x, y]) => Math.hypot(x - {x}, y - {y}) < 2)({_MARKER})")
         page.evaluate("window.old = true")
         press(page, "Save")
         page.wait_for("!window.old && !!document.querySelector('.snow-edit')", 180)
