@@ -1,20 +1,29 @@
-// Answers what `tests/studio/test_edit.py` asks about selection.js and turning.js: an array of calls of Selection.
+// Answers what `tests/studio` asks about the modules of the editor: an array of calls of Edits, and places.
 import { readFileSync } from "node:fs";
+import { Edits } from "../../src/snowsplat/studio/pages/edits.js";
+import { along, outside, project, within } from "../../src/snowsplat/studio/pages/selection.js";
+import { levelling, turned } from "../../src/snowsplat/studio/pages/turning.js";
 
-const read = name => readFileSync(new URL(`../../src/snowsplat/studio/pages/${name}`, import.meta.url), "utf-8");
-const address = source => `data:text/javascript;base64,${Buffer.from(source).toString("base64")}`;
-const turning = address(read("turning.js"));
-const { Selection, within, outside } = await import(address(read("selection.js").replace("./turning.js", turning)));
-const { levelling, turned } = await import(turning);
-
-const { count, calls, centers, matrix, shape, width, height, box, floor, eye } = JSON.parse(readFileSync(0, "utf-8"));
-const selection = new Selection(count);
-const turns = [];
-const states = calls.map(([name, ...values]) => {
-    selection[name](...values);
-    turns.push(selection.turn);
-    return [...selection.state];
+const { count, calls, centers, matrix, shape, width, height, box, floor, eye, drags = [] } = JSON.parse(readFileSync(0, "utf-8"));
+const edits = new Edits(count);
+const steps = calls.map(([name, ...values]) => {
+    edits[name](...values);
+    return { ...edits.present, state: [...edits.present.state] };
 });
 const places = Float32Array.from(centers);
-const found = [...within(places, matrix, Uint8Array.from(shape), width, height)];
-console.log(JSON.stringify({ states, deleted: selection.deleted(), found, outside: [...outside(places, ...box)], turns, level: floor.map(point => turned(levelling(floor, eye), point, eye)) }));
+console.log(
+    JSON.stringify({
+        steps,
+        deleted: edits.deleted(),
+        counts: edits.counts(),
+        found: [...within(places, matrix, Uint8Array.from(shape), width, height)],
+        outside: [...outside(places, ...box)],
+        level: floor.map(point => turned(levelling(floor, eye), point, eye)),
+        // The place is in pixels, or that of another point of the axis.
+        drags: drags.map(({ point, axis, length, place, to }) => {
+            const moved = [...point];
+            moved[axis] = to;
+            return along(matrix, point, axis, length, place ?? project(matrix, moved, width, height), width, height);
+        }),
+    }),
+);

@@ -1,13 +1,16 @@
 """`film`: the keys of a page are in the world of the scene, and the preview is what is rendered."""
 
+from dataclasses import replace
+
 import av
 import pytest
 import torch
 
-from snowsplat.pipeline.film import film, film_preview
+from snowsplat.pipeline.film import film, film_preview, write_keys
 from snowsplat.pipeline.output import page_film
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.pipeline.videos import VideoSize, cameras_along
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.geometry import Similarity
 from snowsplat.util.errors import UserError
@@ -64,9 +67,40 @@ def test_films_that_are_not_possible(tmp_path):
         {"keys": KEYS, "seconds": 0.0},
         {"keys": KEYS, "seconds": 1e9},
         {"keys": KEYS, "size": "8000x8000"},
+        {"keys": KEYS, "speeds": (1.0,)},
+        {"keys": KEYS, "speeds": (1.0, 0.0, 1.0)},
+        {"keys": KEYS, "speeds": (1.0, float("nan"), 1.0)},
     ):
-        with pytest.raises(ValueError, match="key|seconds|sizes"):
+        with pytest.raises(ValueError, match="key|seconds|sizes|speed"):
             PageFilm(**wrong)
     scene = write_scene(tmp_path, with_cameras=False)
     with pytest.raises(UserError, match="needs two that differ"):
         film_preview(scene, PageFilm([KEYS[0], KEYS[0]]))
+
+
+def test_the_speeds_are_those_of_the_command_line(tmp_path):
+    """In the preview, and in the file of keys, which `render` follows."""
+    scene = write_scene(tmp_path, with_cameras=False)
+    plan = PageFilm(KEYS, seconds=5.0, size="1080x1080", loop=True, speeds=(1.0, 0.2, 1.0))
+    write_keys(scene, plan, tmp_path / "keys.json")
+    gaussians = load_viewable(scene).gaussians
+    size = VideoSize.parse(plan.size)
+    path = cameras_along(str(tmp_path / "keys.json"), gaussians, None, 50, size)
+    shown = torch.tensor(film_preview(scene, plan), dtype=torch.float64)[:, :3]
+    change = viewing_frame(gaussians, [])[0] or Similarity.identity()
+    rendered = torch.stack([change.apply(camera.position) for camera in path])
+    rendered *= torch.tensor([-1.0, -1.0, 1.0])
+    assert torch.allclose(rendered, shown, atol=1e-4)
+    even = replace(plan, speeds=())
+    near = [
+        int(
+            (
+                (torch.tensor(film_preview(scene, each))[:, :3] - torch.tensor(KEYS[1][:3])).norm(
+                    dim=1
+                )
+                < 2
+            ).sum()
+        )
+        for each in (plan, even)
+    ]
+    assert near[0] > 1.5 * near[1]

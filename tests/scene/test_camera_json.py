@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.camera_json import read_cameras, write_cameras
+from snowsplat.scene.camera_json import read_cameras, read_speeds, write_cameras
 from snowsplat.scene.geometry import look_at
 from snowsplat.util.errors import UserError
 
@@ -130,3 +130,16 @@ def test_invalid_lists_are_rejected(tmp_path):
         path.write_text(json.dumps([entry]))
         with pytest.raises(UserError, match="camera 0 is damaged"):
             read_cameras(path)
+
+
+def test_speeds(tmp_path):
+    file = tmp_path / "list.json"
+    write_cameras(file, [("a", camera(0.0)), ("b", camera(1.0))])
+    assert read_speeds(file) == [1, 1]
+    entries = json.loads(file.read_text())
+    file.write_text(json.dumps([entries[0] | {"speed": 0.5}, entries[1]]))
+    assert read_speeds(file) == [0.5, 1]
+    for wrong in (0, -1.0, "2", None, True, [1], 10**400):
+        file.write_text(json.dumps([entries[0], entries[1] | {"speed": wrong}]))
+        with pytest.raises(UserError, match="camera 1: its speed is not between"):
+            read_speeds(file)

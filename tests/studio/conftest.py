@@ -1,5 +1,6 @@
 """A library, and a studio that serves it."""
 
+import base64
 import http.client
 import io
 import json
@@ -11,15 +12,17 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 import torch
 from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import write_gaussians
 from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.pipeline.publish import publish
 from snowsplat.studio import job, worker
 from snowsplat.studio.app import POLICY, studio_app
-from snowsplat.studio.library import Library
+from snowsplat.studio.library import Library, Scene
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.server import WebServer
 
@@ -55,6 +58,15 @@ def of_the_command_line(folder: Path, step: int = 5) -> Path:
     box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
     write_gaussians(file, gaussians_in_box(box, 50, torch.Generator().manual_seed(0), 1))
     return file
+
+
+N = 301  # Gaussians of the scene `finished`
+
+
+def edit_of(removed: np.ndarray, **more) -> dict:
+    """What a page sends: ``removed`` has a value for each of its Gaussians."""
+    bits = np.packbits(removed, bitorder="little").tobytes()
+    return {"count": len(removed), "removed": base64.b64encode(bits).decode(), **more}
 
 
 def press(page: Page, text: str) -> None:
@@ -120,3 +132,20 @@ def holder(monkeypatch, tmp_path) -> None:
     script = tmp_path / "holder.py"
     script.write_text(HOLDER)
     monkeypatch.setattr(job, "_WORKER", [sys.executable, str(script)])
+
+
+@pytest.fixture
+def finished(library) -> Scene:
+    """A scene of Gaussians in a flat box, as a job leaves it."""
+    scene = library.new("Box", [])
+    box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
+    gaussians = gaussians_in_box(box, N, torch.Generator().manual_seed(0), 1)
+    file = scene.made / "box.ply"
+    file.parent.mkdir()
+    write_gaussians(file, gaussians)
+    publish(file, scene.site)
+    scene.change(quality="draft")
+    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": []}
+    result = {"file": file.name, "aligned": False, "reports": {}, **facts}
+    scene.write_state({"outcome": "done", "result": result})
+    return scene

@@ -1,48 +1,17 @@
 """Editing in the page of a finished scene: what is selected, and what the studio stores."""
 
-import base64
 import json
-import shutil
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from tests.gaussians import gaussians_in_box
 
-from snowsplat.formats import read_gaussians, write_gaussians
+from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
-from snowsplat.pipeline.publish import publish
-from snowsplat.studio.library import Scene
 from snowsplat.util.files import write_json
 
 from ..browser import Browser, Page
-from .conftest import of_the_command_line, press
-
-N = 301
-
-
-@pytest.fixture
-def finished(library) -> Scene:
-    """A scene of Gaussians in a flat box, as a job leaves it."""
-    scene = library.new("Box", [])
-    box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
-    gaussians = gaussians_in_box(box, N, torch.Generator().manual_seed(0), 1)
-    file = scene.made / "box.ply"
-    file.parent.mkdir()
-    write_gaussians(file, gaussians)
-    publish(file, scene.site)
-    scene.change(quality="draft")
-    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": []}
-    result = {"file": file.name, "aligned": False, "reports": {}, **facts}
-    scene.write_state({"outcome": "done", "result": result})
-    return scene
-
-
-def edit_of(removed: np.ndarray, **more) -> dict:
-    bits = np.packbits(removed, bitorder="little").tobytes()
-    return {"count": len(removed), "removed": base64.b64encode(bits).decode(), **more}
+from .conftest import N, edit_of, of_the_command_line, press
 
 
 @pytest.mark.usefixtures("in_process")
@@ -145,93 +114,12 @@ def test_hostile_changes(studio, finished):
 
 def test_a_site_has_no_tools_but_its_page_in_the_studio_has(studio, finished):
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
-    assert 'src="../../../tools.js" data-whole="true" data-edited="false">' in page
+    assert 'src="../../../tools.js" data-page="small" data-edited="false"' in page
     assert "tools.js" not in (finished.site / "index.html").read_text("utf-8")
-    # Editing is for the page that is one file.
+    # Levels of detail are edited in another page.
     (finished.site / "scene.sog").unlink()
     page = studio.ask(f"scenes/{finished.name}/site/index.html")[1].decode()
-    assert 'data-whole="false"' in page
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
-def test_undo_returns_the_same_bytes():
-    random = np.random.default_rng(0)
-    count = 77
-    found = [random.integers(0, 2, count).tolist() for _ in range(3)]
-    half = [0.5**0.5, 0.0, 0.5**0.5, 0.0]  # 90° about y
-    floor, eye = [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 2.0]], [-1.0, 3.0, 0.5]
-    calls = [
-        ["select", found[0], "replace"],
-        ["select", found[1], "add"],
-        ["delete"],
-        ["select", found[2], "replace"],
-        ["invert"],
-        ["select", found[0], "remove"],
-        *[["undo"]] * 6,
-        *[["redo"]] * 6,
-        ["undo"],
-        ["select", found[0], "remove"],  # the same as before: the future is another one
-        ["redo"],
-        ["turnBy", half],
-        ["turnBy", half],
-        ["undo"],
-        ["undo"],
-        ["redo"],
-    ]
-    centers = random.normal(size=(count, 3))
-    matrix = random.normal(size=(4, 4))
-    shape = random.integers(0, 2, (6, 8))
-    box = [[-0.5, -1.0, -0.2], [1.0, 0.4, 2.0]]
-    asked = {
-        "count": count,
-        "calls": calls,
-        "centers": centers.reshape(-1).tolist(),
-        "matrix": matrix.T.reshape(-1).tolist(),
-        "shape": shape.reshape(-1).tolist(),
-        "width": 8,
-        "height": 6,
-        "box": box,
-        "floor": floor,
-        "eye": eye,
-    }
-    script = Path(__file__).parents[1] / "node" / "selection.mjs"
-    answer = json.loads(
-        subprocess.run(
-            ["node", script], input=json.dumps(asked), capture_output=True, text=True, check=True
-        ).stdout
-    )
-    states = answer["states"]
-    a, b, c = (np.array(each) for each in found)
-    deleted = a | b
-    assert states[0] == a.tolist()
-    assert states[1] == deleted.tolist()
-    assert states[2] == (2 * deleted).tolist()
-    assert states[3] == np.where(deleted, 2, c).tolist()
-    assert states[4] == np.where(deleted, 2, 1 - c).tolist()
-    assert states[5] == np.where(deleted, 2, (1 - c) & (1 - a)).tolist() == states[4]
-    # The last call changed nothing: it is no step. So the sixth undo has nothing left.
-    assert states[6:12] == [*states[3::-1], [0] * count, [0] * count]
-    assert states[12:18] == [*states[:5], states[4]]
-    assert states[18:21] == [states[3], states[3], states[4]]
-    assert states[21:] == 5 * [states[4]]
-    straight, once, twice = answer["turns"][20:23]
-    assert (straight, once) == ([1, 0, 0, 0], half)
-    assert np.allclose(twice, [0, 0, 1, 0])
-    assert answer["turns"][23:] == [once, straight, once]  # the same bits
-    level = np.array(answer["level"])
-    assert np.ptp(level[:, 1]) < 1e-12
-    assert level[0, 1] < eye[1]  # the eye is above
-    bits = np.frombuffer(base64.b64decode(answer["deleted"]), np.uint8)
-    assert np.unpackbits(bits, bitorder="little")[:count].tolist() == deleted.tolist()
-    clip = np.float32(centers) @ matrix[:, :3].T + matrix[:, 3]
-    column, row = (clip[:, 0] / clip[:, 3] + 1) * 4, (1 - clip[:, 1] / clip[:, 3]) * 3
-    inside = (clip[:, 3] > 0) & (column >= 0) & (column < 8) & (row >= 0) & (row < 6)
-    expected = [
-        int(i and shape[int(r), int(c)]) for i, r, c in zip(inside, row, column, strict=True)
-    ]
-    assert answer["found"] == expected
-    beyond = (np.float32(centers) < box[0]) | (np.float32(centers) > box[1])
-    assert answer["outside"] == beyond.any(1).astype(int).tolist()
+    assert 'data-page="levels"' in page
 
 
 def counts(page: Page) -> str:

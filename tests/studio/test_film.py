@@ -31,6 +31,7 @@ def test_a_film_is_rendered_and_sent(studio, monkeypatch):
             status, answer = studio.ask(path, "POST", wrong)
             assert (status, "\n" in answer["error"]) == (400, False)
     plan = {"keys": KEYS, "seconds": 0.1, "size": "64x36", "ease": True, "loop": False}
+    plan["speeds"] = [0.5, 1.0]
     monkeypatch.setattr(page_film, "SIZES", ("64x36",))
     started = []
     monkeypatch.setattr(job, "start", lambda scene, task: started.append((scene.name, task)))

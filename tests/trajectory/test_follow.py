@@ -156,3 +156,24 @@ def test_equal_keys_count_once_and_a_single_key_is_rejected():
     path = key_path([one, one, two, two], 10, 3.0)
     assert all(bool(camera.cam_from_world.isfinite().all()) for camera in path)
     assert len(key_path([one, two], 1, 3.0)) == 1
+
+
+def test_a_key_has_a_speed():
+    keys = [
+        camera_at((x, 0.0, 0.0), torch.tensor([x, 0.0, 5.0]).double()) for x in (-1.0, 0.0, 1.0)
+    ]
+    even = key_path(keys, 201, 3.0)
+    same = key_path(keys, 201, 3.0, speeds=[2.0, 2.0, 2.0])
+    assert torch.allclose(positions(even), positions(same), atol=1e-12)
+    path = key_path(keys, 2001, 3.0, speeds=[1.0, 4.0, 1.0])
+    passed = speeds(path, closed=False)
+    assert float(passed[1000] / passed[0]) == pytest.approx(4.0, rel=0.02)
+    half = int((positions(path)[:, 0] + 0.5).abs().argmin())  # half of the way, in equal ratios
+    assert float(passed[half] / passed[0]) == pytest.approx(2.0, rel=0.02)
+    # A loop: the first key, which is also the last one, is slow.
+    around = ring(6, 3.0, 3.0)
+    path = key_path([*around, around[0]], 1200, 3.0, speeds=[0.25, 1, 1, 1, 1, 1, 0.25])
+    passed = speeds(path, closed=True)
+    opposite = int((positions(path) - around[3].position).norm(dim=1).argmin())
+    assert float(passed[0] / passed[opposite]) == pytest.approx(0.25, rel=0.03)
+    assert float(passed[-1] / passed[opposite]) == pytest.approx(0.25, rel=0.03)

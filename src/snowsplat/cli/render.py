@@ -71,7 +71,8 @@ class Render(SceneFlags, Reports):
     """Render a video along this camera path. training: a smooth curve along the cameras of the
     photos; ellipse: around the point that these cameras look at; spiral: for scenes whose cameras
     look in one direction; FILE: a smooth curve through the cameras in a file with the format of
-    OUT/cameras.json, as a loop if the first and the last camera are equal."""
+    OUT/cameras.json, as a loop if the first and the last camera are equal; a camera may have a
+    "speed" relative to the others, 0.5 for half of it."""
     seconds: Annotated[float | None, flag("F", default="10")] = None
     """Length of the video in seconds."""
     fps: Annotated[float | None, flag("F", default="30")] = None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.ply import write_ply
@@ -20,7 +21,7 @@ from snowsplat.pipeline.output.edit_record import (
     write_record,
 )
 from snowsplat.pipeline.output.scene_source import load_viewable, moved_origin
-from snowsplat.scene.edit import transform
+from snowsplat.scene.edit import transform, with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 from snowsplat.util.errors import UserError
@@ -55,8 +56,10 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     scene = Path(scene)
     source = load_viewable(scene)
     frame = source.frame()
-    moved = transform(source.gaussians, frame)
-    rows = _rows_of_page(scene, moved, Path(site))
+    # The largest part of the Gaussians, their colours, is not copied.
+    moved = transform(with_sh_degree(source.gaussians, 0), frame)
+    usable = source.gaussians.usable_rows()
+    rows = _rows_of_page(scene, moved, usable, Path(site))
     if len(rows) != changes.count:
         raise OtherScene(f"the page has {changes.count} Gaussians, the scene has {len(rows)}")
     removed = np.zeros(len(source.gaussians), bool)
@@ -66,7 +69,8 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         removed |= _hidden(moved, changes.hidden)
     if removed.all():
         raise UserError("nothing would be left of the scene; keep some of it")
-    kept = source.gaussians.select(torch.from_numpy(~removed))
+    kept = source.gaussians
+    kept.select_(torch.from_numpy(~removed))
     before = read_record(scene) or EditRecord(scene.name, 0)
     change, turn = replace(Similarity.identity(), scale=changes.scale), before.turn
     if changes.turn is not None:
@@ -132,15 +136,16 @@ def _hidden(gaussians: Gaussians, limits: tuple[float, float, float, float, floa
     return (far | large).numpy()
 
 
-def _rows_of_page(scene: Path, gaussians: Gaussians, site: Path) -> np.ndarray:
-    """(N,) the rows of a scene, in the frame of its page, in the order of the page.
+def _rows_of_page(scene: Path, gaussians: Gaussians, usable: Tensor, site: Path) -> np.ndarray:
+    """(N,) the ``usable`` rows of a scene, in the frame of its page, in the order of the page.
 
     The file of the page is in the order of a space-filling curve. The order is computed again, and
     the positions in the file must be those of the rows.
     """
-    arrays = GaussianArrays.from_gaussians(gaussians)
-    rows = order_in_sog(scene, arrays)
-    shown, expected = (_logs(a) for a in (read_sog(site / SCENE).means, arrays.means[rows]))
+    arrays = GaussianArrays.from_gaussians(gaussians.select(usable))
+    order = order_in_sog(scene, arrays)
+    rows = usable.nonzero()[:, 0].numpy()[order]
+    shown, expected = (_logs(a) for a in (read_sog(site / SCENE).means, arrays.means[order]))
     if shown.shape == expected.shape and len(rows):
         step = np.ptp(expected, axis=0) / 65535
         if (np.abs(shown - expected) <= 0.51 * step + _ROUNDING * np.abs(expected)).all():

@@ -17,8 +17,9 @@ from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_source import change_of, load_viewable
 from snowsplat.pipeline.videos import VideoOptions, render_video
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.camera_json import write_cameras
+from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.geometry import Similarity
+from snowsplat.util.files import write_json
 from snowsplat.viewer.web.panel import view_numbers, view_of_page
 
 _PREVIEW = 10.0  # cameras per second
@@ -55,8 +56,11 @@ def film(
 
 def write_keys(scene: Path | str, plan: PageFilm, keys: Path | str) -> None:
     """Write the keys of a film as a camera list in the world of the scene; see `film`."""
-    cameras, _, _ = _keys(Path(scene), plan)
-    write_cameras(Path(keys), ((str(i), camera) for i, camera in enumerate(cameras)))
+    cameras, speeds, _, _ = _keys(Path(scene), plan)
+    entries = entries_of((str(i), camera) for i, camera in enumerate(cameras))
+    for entry, speed in zip(entries, speeds, strict=True):
+        entry["speed"] = speed
+    write_json(Path(keys), entries)
 
 
 def page_frames(scene: Path | str) -> list[Similarity]:
@@ -91,21 +95,26 @@ def film_preview(scene: Path | str, plan: PageFilm) -> list[list[float]]:
 
     Raises: UserError: see `film`.
     """
-    cameras, means, change = _keys(Path(scene), plan)
+    cameras, speeds, means, change = _keys(Path(scene), plan)
     distance = trajectory.viewing_distance(cameras, means)
     count = max(2, min(_MOST, round(plan.seconds * _PREVIEW)))
-    path = trajectory.key_path(cameras, count, distance, ease=plan.ease)
+    path = trajectory.key_path(cameras, count, distance, ease=plan.ease, speeds=speeds)
     return [_in_page(camera.transformed(change)) for camera in path]
 
 
-def _keys(scene: Path, plan: PageFilm) -> tuple[Sequence[Camera], Tensor, Similarity]:
-    """The key cameras in the world of the scene, its means (N, 3), and the change to the page."""
+def _keys(
+    scene: Path, plan: PageFilm
+) -> tuple[Sequence[Camera], Sequence[float], Tensor, Similarity]:
+    """The key cameras in the world of the scene and their speeds, its means (N, 3), and the change
+    to the page."""
     source = load_viewable(scene)
     change = source.frame()
     back = change.inverse()
     cameras = [view_of_page(key).camera(*plan.pixels()).transformed(back) for key in plan.keys]
-    closed = cameras[:1] if plan.loop else []
-    return [*cameras, *closed], source.gaussians.means, change
+    speeds = plan.speeds or (1.0,) * len(cameras)
+    if plan.loop:
+        cameras, speeds = [*cameras, cameras[0]], (*speeds, speeds[0])
+    return cameras, speeds, source.gaussians.means, change
 
 
 def _in_page(camera: Camera) -> list[float]:

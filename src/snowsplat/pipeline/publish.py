@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
 from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.viewer.web.panel import Description, made_on
@@ -30,6 +31,8 @@ class PublishOptions:
         title: the name on the page; None: the name of the scene.
         licence: the licence of the scene, such as "CC BY 4.0".
         url: the address of the folder on the web. Services that show a preview of a link need it.
+        for_editing: the page is not to be looked at: it has all Gaussians, even of a large scene,
+            without what their colours owe to the direction of view.
 
     Raises:
         UserError: the address is not one.
@@ -38,6 +41,7 @@ class PublishOptions:
     title: str | None = None
     licence: str = ""
     url: str = ""
+    for_editing: bool = False
 
     def __post_init__(self) -> None:
         if self.url and not re.fullmatch(r"https?://[^\s\"<>?#]+", self.url):
@@ -65,7 +69,7 @@ def publish(
 ) -> PublishResult:
     """Write a static web site that shows a scene: a page, the viewer, the scene, and a picture.
 
-    A scene of more than 2 million Gaussians is written in levels of detail.
+    A scene of more than 2 million Gaussians is written in levels of detail, except for editing.
 
     Args:
         scene: the output folder of a training run, or a scene file of any format.
@@ -97,7 +101,11 @@ def publish(
         place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
         observer.note(f"the page does not know the place of the scene, the origin {place}")
     folder.mkdir(parents=True, exist_ok=True)
-    large = len(source.gaussians) > _LARGE
+    if options.for_editing:
+        # A Gaussian of which only these colours are not finite is left out, too.
+        usable = source.gaussians.select(source.gaussians.usable_rows())
+        source = replace(source, gaussians=with_sh_degree(usable, 0))
+    large = len(source.gaussians) > _LARGE and not options.for_editing
     write = partial(_write_levels, observer) if large else write_one_file
     with observer.waiting("writing"):
         write_site(folder, source.ready(), about, url, write)

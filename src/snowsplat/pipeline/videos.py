@@ -22,7 +22,7 @@ from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, index_in
 from snowsplat.pipeline.output.scene_source import seen_by_cameras
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.camera_json import read_cameras
+from snowsplat.scene.camera_json import read_cameras, read_speeds
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.orientation import scene_up
 from snowsplat.scene.panorama import PanoramaRenderer, level_pose
@@ -278,7 +278,8 @@ def cameras_along(
         _, keys = read_cameras(Path(path))
         keys = _in_frame_of(gaussians, keys)
         distance = trajectory.viewing_distance(keys, gaussians.means)
-        cameras = trajectory.key_path(keys, frames, distance, ease=ease)
+        speeds = read_speeds(Path(path))
+        cameras = trajectory.key_path(keys, frames, distance, ease=ease, speeds=speeds)
     elif trained is not None:
         names, given = trained
         distance = trajectory.viewing_distance(given, gaussians.means)

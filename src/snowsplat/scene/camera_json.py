@@ -85,6 +85,21 @@ def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:
     return names, cameras
 
 
+def read_speeds(path: Path) -> list[float]:
+    """The speed of a film at each camera of a list that `read_cameras` has read, relative to the
+    others: the field "speed", 1 if there is none.
+
+    Raises:
+        UserError: a speed is no number, or not between 1e-6 and 1e6.
+    """
+    speeds = [entry.get("speed", 1.0) for entry in read_json(path)]
+    for i, speed in enumerate(speeds):
+        is_number = isinstance(speed, int | float) and not isinstance(speed, bool)
+        if not (is_number and 1e-6 < speed < 1e6):
+            raise UserError(f"{path}: camera {i}: its speed is not between 1e-6 and 1e6; use 1")
+    return speeds
+
+
 def _camera(entry: dict[str, Any]) -> Camera:
     width, height = int(entry["width"]), int(entry["height"])
     position = torch.tensor(entry["position"], dtype=torch.float64).reshape(3)

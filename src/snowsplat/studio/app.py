@@ -18,6 +18,7 @@
     GET  /scenes/NAME/film/file       the film
     POST /scenes/NAME/edit            stores what was changed in the viewer; DELETE takes it back
     GET  /scenes/NAME/site/…, /made/… the scene in the viewer, its reports
+    POST /scenes/NAME/whole           the page that edits a scene with levels; GET /whole/…
     GET  /scenes/NAME/live/…          the page of the running training, with its WebSocket
 
 Answers are JSON; an error is ``{"error": …}``, one line for people.
@@ -87,12 +88,12 @@ _REPORT_POLICY = (
     "img-src 'self' data:; frame-ancestors 'self'"
 )
 
-# The page of a scene gets tools: a film and, except for levels of detail, editing. They come before
-# the script of the page, which looks for them.
+# The page of a scene gets tools: a film, and editing. They come before the script of the page,
+# which looks for them. Levels of detail are edited in a page of their own, with all Gaussians.
 _TOOLS = (
     '<link rel="stylesheet" href="../../../tools.css" />'
-    '<script type="module" src="../../../tools.js" data-whole="{whole}" data-edited="{edited}">'
-    "</script>"
+    '<script type="module" src="../../../tools.js" data-page="{page}" data-edited="{edited}" '
+    'data-version="{version}"></script>'
 )
 
 _Answer = Callable[[Request, Scene], Awaitable[Any]]
@@ -148,6 +149,8 @@ class _Studio:
             ("/edit", "POST", self._edit),
             ("/edit", "DELETE", self._undo),
             ("/site/{path:path}", "GET", self._site),
+            ("/whole", "POST", self._write_whole),
+            ("/whole/{path:path}", "GET", self._whole),
             ("/made/{path:path}", "GET", self._made),
             ("/live/{path:path}", "GET", self._live),
         ]
@@ -287,6 +290,7 @@ class _Studio:
         if self._locks[scene.name, "edit"].locked():
             raise UserError("an edit of the scene is being stored; start again in a moment")
         async with self._locks[scene.name, "start"]:
+            await _film_has_read(scene)
             if not job.is_running(scene):
                 title = safe_title(str(wanted.get("title") or scene.job.title))
                 scene.change(title=title, quality=quality, minutes=minutes)
@@ -338,7 +342,8 @@ class _Studio:
 
     async def _render_film(self, request: Request, scene: Scene) -> Any:
         plan = await _planned(request)
-        async with self._locks[scene.name, "film"]:
+        async with self._locks[scene.name, "edit"], self._locks[scene.name, "film"]:
+            _check_version(request, scene)
             if not job.is_running(scene, "film"):
                 write_json(scene.plan, asdict(plan))
                 scene.write_state({}, "film")
@@ -351,7 +356,8 @@ class _Studio:
 
     async def _film_path(self, request: Request, scene: Scene) -> Any:
         plan = await _planned(request)
-        async with self._locks[scene.name, "film"]:
+        async with self._locks[scene.name, "edit"], self._locks[scene.name, "film"]:
+            _check_version(request, scene)
             if job.is_running(scene, "film"):
                 raise UserError("a film is being rendered; wait until it ends, or stop it")
             write_json(scene.plan, asdict(plan))
@@ -369,21 +375,35 @@ class _Studio:
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then edit it")
         async with self._locks[scene.name, "edit"]:
+            _check_version(request, scene)
+            await _film_has_read(scene)
             write_json(scene.edits, asdict(changes))
             return await asyncio.to_thread(job.work, "edit", scene.folder)
 
     async def _undo(self, request: Request, scene: Scene) -> Any:
         async with self._locks[scene.name, "edit"]:
+            _check_version(request, scene)
+            await _film_has_read(scene)
             return await asyncio.to_thread(job.work, "undo", scene.folder)
 
     async def _site(self, request: Request, scene: Scene) -> Any:
+        kind = "small" if (scene.site / "scene.sog").is_file() else "levels"
+        return await self._with_tools(request, scene, scene.site, kind)
+
+    async def _write_whole(self, request: Request, scene: Scene) -> Any:
+        async with self._locks[scene.name, "edit"]:
+            return await asyncio.to_thread(job.work, "whole", scene.folder)
+
+    async def _whole(self, request: Request, scene: Scene) -> Any:
+        return await self._with_tools(request, scene, scene.whole, "whole")
+
+    async def _with_tools(self, request: Request, scene: Scene, site: Path, kind: str) -> Any:
         path = request.path_params["path"] or "index.html"
-        file = _inside(scene.site, path)
+        file = _inside(site, path)
         if path == "index.html" and is_file(file):
             page = await asyncio.to_thread(file.read_text, "utf-8")
-            facts = (scene.site / "scene.sog").is_file(), bool(_edited(scene))
-            whole, edited = (str(fact).lower() for fact in facts)
-            head = _TOOLS.format(whole=whole, edited=edited)
+            edited = str(bool(_edited(scene))).lower()
+            head = _TOOLS.format(page=kind, edited=edited, version=_version(scene))
             text = page.replace("</head>", f"{head}</head>", 1)
             return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
         return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
@@ -462,6 +482,24 @@ def _edited(scene: Scene) -> float:
     """When the scene that is shown was edited, in seconds; 0 if it was not."""
     file = scene.scene_file()
     return file.stat().st_mtime if file and read_record(file) else 0
+
+
+def _version(scene: Scene) -> str:
+    """Names the scene that is shown; each edit changes it."""
+    file = scene.scene_file()
+    return str(file.stat().st_mtime_ns) if file else ""
+
+
+def _check_version(request: Request, scene: Scene) -> None:
+    """Raises UserError: the page shows the scene before an edit, whose world is another one."""
+    if request.query_params.get("version", _version(scene)) != _version(scene):
+        raise UserError("the scene was changed in another page; open this page anew")
+
+
+async def _film_has_read(scene: Scene) -> None:
+    """Wait until a film that has started has read the scene: it shows the scene as it was then."""
+    while job.is_running(scene, "film") and "now" not in scene.state("film"):
+        await asyncio.sleep(0.1)
 
 
 async def _planned(request: Request) -> PageFilm:

@@ -6,6 +6,7 @@ A scene NAME has:
     NAME/photos/     what was uploaded
     NAME/made/       the output folder of `snowsplat make`
     NAME/site/       the web site of the scene
+    NAME/whole/      a page for editing, if the site has levels of detail
     NAME/exports/    its files in other formats
     NAME/edit.json   what was changed in its page last
     NAME/film.json   the plan of its film; film_cameras.json and film.mp4 are the film
@@ -90,6 +91,7 @@ class Scene:
         self.made = folder if self.found else folder / "made"
         self.photos = kept / "photos"
         self.site = kept / "site"
+        self.whole = kept / "whole"
         self.exports = kept / "exports"
         self.edits = kept / "edit.json"
         self.map = kept / "map.svg"
@@ -190,7 +192,7 @@ class Scene:
                 f"{self.folder}: made in a terminal; it may have other files, so remove it there"
             )
         # The job is last: until then, the scene is listed and can be removed again.
-        for folder in (self.made, self.site, self.exports):
+        for folder in (self.made, self.site, self.whole, self.exports):
             if folder.is_symlink():
                 folder.unlink()
             elif folder.exists():

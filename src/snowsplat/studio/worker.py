@@ -6,6 +6,7 @@
     python -m snowsplat.studio survey FOLDER        what its photos are, and the time needed
     python -m snowsplat.studio export FOLDER KIND   a file in another format
     python -m snowsplat.studio show FOLDER          the site of a scene, anew
+    python -m snowsplat.studio whole FOLDER         the page that edits a scene with levels
     python -m snowsplat.studio edit FOLDER          what was changed in the page of a scene
     python -m snowsplat.studio undo FOLDER          the scene as it was made
 
@@ -55,6 +56,8 @@ from snowsplat.util.files import atomic_path, write_json, write_text
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.util.stages import Outcome
+from snowsplat.viewer.web.publication import PAGE
+from snowsplat.viewer.web.publication import SCENE as SITE_SCENE
 
 _PAUSE = 1.0  # seconds between two files of the state
 _CURVE = 400  # points of the curve of the loss
@@ -272,9 +275,10 @@ def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
     else:
         changes = from_json(PageEdit, read_json(scene.edits))
         try:
-            file = edit(file, scene.site, changes)
+            has_levels = not (scene.site / SITE_SCENE).is_file()
+            file = edit(file, scene.whole if has_levels else scene.site, changes)
         except OtherScene as error:  # an earlier process was killed before it wrote the page
-            publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
+            show_scene(scene)
             raise UserError(f"{error}. Open the page anew, then edit it") from None
         if changes.title:
             scene.change(title=safe_title(changes.title))
@@ -292,7 +296,8 @@ def show_scene(scene: Scene) -> dict[str, Any]:
     Raises: UserError: the scene is not finished.
     """
     file = _finished(scene)
-    shutil.rmtree(scene.exports, ignore_errors=True)  # they have another title, or other Gaussians
+    for folder in (scene.exports, scene.whole):  # they have another title, or other Gaussians
+        shutil.rmtree(folder, ignore_errors=True)
     scene.site.mkdir(parents=True, exist_ok=True)
     site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
     state = scene.state()
@@ -301,6 +306,18 @@ def show_scene(scene: Scene) -> dict[str, Any]:
     state["result"] |= {"gaussians": site.gaussians, "bytes": file.stat().st_size}
     scene.write_state(state)
     return {"file": file.name}
+
+
+def show_whole(scene: Scene) -> dict[str, Any]:
+    """Write the page that edits a scene whose site has levels of detail, unless it is there.
+
+    Raises: UserError: the scene is not finished.
+    """
+    file, page = _finished(scene), scene.whole / PAGE
+    if not is_file(page) or page.stat().st_mtime_ns < file.stat().st_mtime_ns:
+        options = PublishOptions(scene.job.title, for_editing=True)
+        publish(file, scene.whole, options, overwrite=True)
+    return {}
 
 
 def _found(scene: Scene) -> dict[str, Any]:
@@ -339,6 +356,8 @@ def _printed(scene: Scene, words: list[str]) -> int:
             answer = export(scene, words[1])
         elif words[0] == "show":
             answer = show_scene(scene)
+        elif words[0] == "whole":
+            answer = show_whole(scene)
         elif words[0] == "preview":
             answer = {"path": film_preview(_finished(scene), _plan(scene))}
         else:

@@ -43,7 +43,12 @@ def training_path(
 
 
 def key_path(
-    cameras: Sequence[Camera], frames: int, distance: float, *, ease: bool = False
+    cameras: Sequence[Camera],
+    frames: int,
+    distance: float,
+    *,
+    ease: bool = False,
+    speeds: Sequence[float] | None = None,
 ) -> list[Camera]:
     """A smooth path through key cameras, in their order and with their fields of view.
 
@@ -51,15 +56,18 @@ def key_path(
     have the image size of the first camera. ``distance``: world units from the cameras to what they
     see. ``ease``: slow at the start and at the end, instead of a constant speed.
 
+    ``speeds``: one for each key, above 0, relative to each other, because ``frames`` is the
+    duration. Between two keys, the speed changes in equal ratios. None: all are equal.
+
     Raises:
         UserError: fewer than two keys differ.
     """
     lens = cameras[0]
     logs = [[math.log(camera.fx / camera.width)] for camera in cameras]
     zooms = torch.tensor(logs, dtype=torch.float64)
-    return _path(
-        lens, positions_of(cameras), rotations_of(cameras), zooms, frames, distance, ease=ease
-    )
+    keys = positions_of(cameras), rotations_of(cameras), zooms
+    given = None if speeds is None else torch.tensor(speeds, dtype=torch.float64)
+    return _path(lens, *keys, frames, distance, ease=ease, speeds=given)
 
 
 def _same_roll(rotations: Tensor, up: Tensor) -> Tensor:
@@ -85,8 +93,9 @@ def _path(
     smoothing: float = 0.0,
     *,
     ease: bool = False,
+    speeds: Tensor | None = None,
 ) -> list[Camera]:
-    """Frames along a spline, at equal distances in terms of `_steps`.
+    """Frames along a spline, at equal distances in terms of `_steps`, unless ``speeds`` differ.
 
     Rotations are interpolated as a spline of quaternions whose signs agree, which is normalised
     afterwards. The result has a continuous second derivative. It is close to the shortest rotation,
@@ -101,10 +110,12 @@ def _path(
         distance: world units from the cameras to what they see.
         smoothing: see `Spline`.
         ease: the way is 3t² − 2t³ of the time t in 0..1: the speed at both ends is 0.
+        speeds: (K,) relative speeds at the cameras; None: they are equal.
     """
     quats = quat_from_rotation(rotations)
     differ = torch.cat([torch.tensor([True]), _steps(positions, quats, distance) > 1e-6])
     positions, quats, zooms = positions[differ], quats[differ], zooms[differ]
+    speeds = None if speeds is None else speeds[differ]
     if len(positions) < 2:
         raise UserError(
             "all cameras have the same position and direction; a video needs two that differ"
@@ -117,6 +128,7 @@ def _path(
     steps = (steps / steps.mean()).clamp_min(0.05)
     times = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
     start, end = 0.0, float(times[-1])
+    keys = times
     if closed:  # repeat the loop before and after, so that the ends of the spline have no effect
         times = torch.cat([times[:-1] - end, times[:-1], times + end])
         positions, quats, zooms = (
@@ -128,11 +140,14 @@ def _path(
 
     dense = torch.linspace(start, end, SAMPLES_PER_FRAME * max(frames, 50), dtype=torch.float64)
     rows = spline(dense)
-    length = torch.cat([rows.new_zeros(1), _steps(rows[:, :3], rows[:, 3:7], distance).cumsum(0)])
+    passed = _steps(rows[:, :3], rows[:, 3:7], distance)
+    if speeds is not None:  # what passes is time, not the way
+        passed = passed / interpolate(0.5 * (dense[1:] + dense[:-1]), keys, speeds.log()).exp()
+    passed = torch.cat([rows.new_zeros(1), passed.cumsum(0)])
     shares = torch.arange(frames, dtype=torch.float64) / max(1, frames if closed else frames - 1)
     if ease:
         shares = shares.square() * (3 - 2 * shares)
-    at = spline(interpolate(shares * length[-1], length, dense))
+    at = spline(interpolate(shares * passed[-1], passed, dense))
     return [_camera(lens, *row.split([3, 4, 1])) for row in at]
 
 

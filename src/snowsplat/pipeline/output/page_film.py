@@ -14,6 +14,7 @@ from snowsplat.pipeline.output.edit_record import is_view
 SIZES = ("1920x1080", "1080x1920", "1080x1080")
 _MOST_KEYS = 200
 _LONGEST = 600.0  # seconds
+_SLOWEST, _FASTEST = 0.1, 10.0
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class PageFilm:
         size: one of `SIZES`.
         ease: slow at the start and at the end.
         loop: from the last key back to the first one; it needs at least three keys.
+        speeds: of the camera at each key, relative to each other; see `trajectory.key_path`. Empty:
+            all are equal.
 
     Raises: ValueError: a value is not possible.
     """
@@ -36,6 +39,7 @@ class PageFilm:
     size: str = SIZES[0]
     ease: bool = False
     loop: bool = False
+    speeds: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         least = 3 if self.loop else 2
@@ -43,6 +47,10 @@ class PageFilm:
             raise ValueError(f"a film needs {least} to {_MOST_KEYS} keys")
         if not all(is_view(key) and all(map(math.isfinite, key)) for key in self.keys):
             raise ValueError("a key is no view")
+        if self.speeds and len(self.speeds) != len(self.keys):
+            raise ValueError(f"{len(self.speeds)} speeds are not those of {len(self.keys)} keys")
+        if not all(_SLOWEST <= speed <= _FASTEST for speed in self.speeds):
+            raise ValueError(f"the speeds are from {_SLOWEST:g} to {_FASTEST:g}")
         if not 0 < self.seconds <= _LONGEST:
             raise ValueError(f"a film has at most {_LONGEST:g} seconds")
         if self.size not in SIZES:

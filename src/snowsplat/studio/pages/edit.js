@@ -1,8 +1,11 @@
 // Tools for editing in the page of a finished scene; see tools.js. "Save" sends what was changed to
 // the studio.
 
+import { addBox } from "./box.js";
+import { DELETED, Edits, SELECTED } from "./edits.js";
 import { ask, make, Refused } from "./page.js";
-import { bounds, DELETED, outside, project, SELECTED, Selection, times, within } from "./selection.js";
+import { painter } from "./painting.js";
+import { project, times, within } from "./selection.js";
 import { say } from "./text.js";
 import { about, inverse, levelling, product, turned, UNTURNED } from "./turning.js";
 
@@ -10,35 +13,6 @@ const BRUSH = 24; // its radius at first, in CSS pixels
 const AXES = ["x", "y", "z"];
 const FINE = 15; // degrees to both sides of a slider
 const MOST_NOTES = 25; // the limit of the viewer
-// The engine copies the Gaussians into a buffer before it draws them; this code changes the copies.
-const STREAM = "snowState";
-const R8U = 33; // PIXELFORMAT_R8U of the engine: a byte per Gaussian
-const OF_INSTANCE = 1; // GSPLAT_STREAM_INSTANCE
-
-/** The code of the sliders of the page under other names, and ours, which calls it. */
-function shader(/** @type {{glsl: string, wgsl: string}} */ sliders) {
-    const renamed = (/** @type {string} */ code) => code.replaceAll("modifySplat", "hideSplat");
-    return {
-        glsl: `${renamed(sliders.glsl)}
-void modifySplatCenter(inout vec3 center) {}
-void modifySplatRotationScale(vec3 center, vec3 modified, inout vec4 rotation, inout vec3 scale) {
-    hideSplatRotationScale(center, modified, rotation, scale);
-    if (loadSnowState().r == ${DELETED}u) scale = vec3(0.0);
-}
-void modifySplatColor(vec3 center, inout vec4 color) {
-    if (loadSnowState().r == ${SELECTED}u) color.xyz = mix(color.xyz, vec3(1.0, 0.4, 0.0), 0.65);
-}`,
-        wgsl: `${renamed(sliders.wgsl)}
-fn modifySplatCenter(center: ptr<function, vec3f>) {}
-fn modifySplatRotationScale(center: vec3f, modified: vec3f, rotation: ptr<function, vec4f>, scale: ptr<function, vec3f>) {
-    hideSplatRotationScale(center, modified, rotation, scale);
-    if (loadSnowState().r == ${DELETED}u) { *scale = vec3f(0.0); }
-}
-fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
-    if (loadSnowState().r == ${SELECTED}u) { *color = vec4f(mix((*color).xyz, vec3f(1.0, 0.4, 0.0), 0.65), (*color).w); }
-}`,
-    };
-}
 
 /** The centres of the Gaussians (N, 3), when the scene has loaded. */
 export async function centersOf(/** @type {any} */ app) {
@@ -52,76 +26,78 @@ export async function centersOf(/** @type {any} */ app) {
  * @param {any} page see panel.js
  * @param {any} picker of the viewer: finds the surface at a place of the window
  * @param {Float32Array} centers (N, 3)
+ * @param {string} version of the scene that the page shows
  * @param {boolean} isEdited whether the scene was edited before
+ * @param {boolean} isWhole whether the page is only for editing; another one shows levels of detail
  */
-export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers, isEdited) {
-    const { app } = viewer;
+export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presentView }, picker, centers, version, isEdited, isWhole) {
+    const { app, annotations } = viewer;
     const entity = app.root.findByName("gsplat");
-    const selection = new Selection(centers.length / 3);
+    const markers = app.root.findByName("annotations"); // of the viewer; null if there are none
+    const views = annotations.map((/** @type {any} */ { camera: { initial } }) => [...initial.position, ...initial.target, initial.fov, scene.aspect]);
+    const noted = annotations.map((/** @type {any} */ { title, text }, /** @type {number} */ i) => ({ title, text, view: views[i] }));
+    const edits = new Edits(centers.length / 3, noted);
     let tool = "";
     let mode = "replace";
-    let scale = 1; // of the scene that is saved, relative to the present one
-    /** @type {number[] | null} */
-    let start = null;
     /** @type {number[][]} */
     let measured = []; // at most two points
     /** @type {number[][]} */
     let floor = []; // at most two points
     /** @type {number[][]} */
     let stroke = []; // points of the window, CSS pixels
-    /** @type {{title: string, text: string, view: number[]}[]} */
-    let notes = viewer.annotations.map((/** @type {any} */ { title, text, camera: { initial } }) => {
-        return { title, text, view: [...initial.position, ...initial.target, initial.fov, scene.aspect] };
-    });
-    const notesBefore = JSON.stringify(notes);
     let saving = false;
-    const [low, high] = bounds(centers);
-    const box = [[...low], [...high]];
 
     // The scene turns about its middle, as the sliders of the page measure from there. Points that are
     // kept are those of the world before the scene is turned.
     const middle = scene.subject.slice(0, 3);
-    const placed = (/** @type {number[]} */ point) => turned(selection.turn, point, middle);
-    const unplaced = (/** @type {number[]} */ point) => turned(inverse(selection.turn), point, middle);
-    const isTurned = () => Math.abs(selection.turn[0]) < 1 - 1e-12;
-    /** Shows the scene as it is turned, and further. */
+    const placed = (/** @type {number[]} */ point) => turned(edits.present.turn, point, middle);
+    const unplaced = (/** @type {number[]} */ point) => turned(inverse(edits.present.turn), point, middle);
+    const isTurned = () => Math.abs(edits.present.turn[0]) < 1 - 1e-12;
+    /** Shows the scene, and the annotations of the viewer, as they are turned, and further. */
     function place(/** @type {number[]} */ further) {
-        const turn = product(further, selection.turn);
+        const turn = product(further, edits.present.turn);
         const [w, x, y, z] = product(turn, [0, 0, 0, 1]); // the viewer has turned it by 180°
+        const origin = turned(turn, [0, 0, 0], middle);
         entity.setLocalRotation(x, y, z, w);
-        entity.setLocalPosition(...turned(turn, [0, 0, 0], middle));
-        viewer.app.renderNextFrame = true;
+        entity.setLocalPosition(...origin);
+        markers?.setLocalRotation(turn[1], turn[2], turn[3], turn[0]);
+        markers?.setLocalPosition(...origin);
+        views.forEach((/** @type {number[]} */ view, /** @type {number} */ i) => {
+            const [position, target] = [view.slice(0, 3), view.slice(3, 6)].map(point => turned(turn, point, middle));
+            Object.assign(annotations[i], { position: target });
+            Object.assign(annotations[i].camera.initial, { position, target });
+        });
+        app.renderNextFrame = true;
     }
 
     // The picture
 
-    const { resource } = app.assets.get(entity.gsplat.asset);
-    let shown = selection.state;
+    const paint = painter(app, hiding);
+    let { state: painted, notes: listed } = edits.present;
+    let marked = [centers.length / 3, 0, 0];
     function show() {
-        const { gsplat } = entity;
+        const { state, scale, notes } = edits.present;
         place(UNTURNED);
-        if (shown !== selection.state) {
-            resource.format.addExtraStreams([{ name: STREAM, format: R8U, storage: OF_INSTANCE }]);
-            const texture = gsplat.getInstanceTexture(STREAM);
-            const bytes = texture.lock();
-            bytes.fill(0);
-            bytes.set((shown = selection.state));
-            texture.unlock();
-            hiding.use(shader(hiding.code)); // also copies the Gaussians again
+        if (painted !== state) {
+            paint((painted = state));
+            marked = edits.counts();
         }
-        const [selected, deleted] = [selection.count(SELECTED), selection.count(DELETED)];
-        counts.textContent = say("edit_counts", selected.toLocaleString(), deleted.toLocaleString());
-        remove.disabled = !selected;
-        undo.disabled = !selection.past.length;
-        redo.disabled = !selection.future.length;
+        if (listed !== notes) listNotes();
+        counts.textContent = say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
+        remove.disabled = !marked[SELECTED];
+        undo.disabled = !edits.past.length;
+        redo.disabled = !edits.future.length;
         size.textContent = scale === 1 ? "" : say("edit_size", scale.toPrecision(4));
         save.disabled = saving || !isChanged();
-        viewer.app.renderNextFrame = true;
+        tellDistance();
+        app.renderNextFrame = true;
     }
     const hidden = () => (hides.checked ? hiding.limits() : null);
-    const haveNotesChanged = () => JSON.stringify(notes) !== notesBefore;
-    const isChanged = () =>
-        Boolean(start || scale !== 1 || isTurned() || title.value.trim() !== scene.title || selection.count(DELETED) || hidden() || haveNotesChanged());
+    const haveNotesChanged = () => JSON.stringify(edits.present.notes) !== JSON.stringify(noted);
+    const isChanged = () => {
+        const { start, scale } = edits.present;
+        return Boolean(start || scale !== 1 || isTurned() || title.value.trim() !== scene.title || marked[DELETED] || hidden() || haveNotesChanged());
+    };
     const change = (/** @type {(event?: any) => void} */ run) => (/** @type {any} */ event = undefined) => {
         run(event);
         show();
@@ -131,9 +107,10 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
 
     const overlay = /** @type {HTMLCanvasElement} */ (make("canvas.snow-overlay", { hidden: true }));
     const drawing = /** @type {CanvasRenderingContext2D} */ (overlay.getContext("2d"));
-    canvas.after(overlay);
     const world = () => times(camera.projectionMatrix.data, camera.viewMatrix.data);
     const model = () => times(world(), entity.getWorldTransform().data);
+    const box = addBox(centers, canvas, model);
+    canvas.after(overlay, box.handles);
 
     /** Draws the stroke as a rectangle, an area or a line. */
     function trace(/** @type {CanvasRenderingContext2D} */ context) {
@@ -161,9 +138,9 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
             drawing.fillStyle = drawing.strokeStyle = "#ffb45466";
             trace(drawing);
         }
-        if (tool === "note") notes.forEach(({ view }, i) => mark(placed(view.slice(3, 6)), String(i + 1)));
+        if (tool === "note") listed.forEach(({ view }, i) => mark(placed(view.slice(3, 6)), String(i + 1)));
         if (tool === "level") floor.forEach((point, i) => mark(placed(point), String(i + 1)));
-        if (tool === "box") lines(model(), edges(), width, height);
+        if (tool === "box") lines(model(), box.edges(), width, height), box.place();
         if (tool === "measure") {
             const points = measured.map(placed);
             lines(world(), points.length === 2 ? [points] : [], width, height);
@@ -197,23 +174,6 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         drawing.stroke();
     }
 
-    /** The twelve edges of the box, in short pieces, since those behind the camera are not drawn. */
-    function edges() {
-        const pairs = [];
-        const pieces = 16;
-        for (let axis = 0; axis < 3; axis++) {
-            for (let side = 0; side < 4; side++) {
-                const point = (/** @type {number} */ share) =>
-                    AXES.map((_, k) => {
-                        if (k === axis) return box[0][k] + share * (box[1][k] - box[0][k]);
-                        return box[(side >> Number((k + 3 - axis) % 3 === 1)) & 1][k];
-                    });
-                for (let i = 0; i < pieces; i++) pairs.push([point(i / pieces), point((i + 1) / pieces)]);
-            }
-        }
-        return pairs;
-    }
-
     function selectStroke(/** @type {PointerEvent} */ event) {
         const { clientWidth: width, clientHeight: height } = canvas;
         const context = /** @type {CanvasRenderingContext2D} */ (Object.assign(document.createElement("canvas"), { width, height }).getContext("2d"));
@@ -221,7 +181,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         const pixels = context.getImageData(0, 0, width, height).data;
         const shape = new Uint8Array(width * height);
         for (let i = 0; i < shape.length; i++) shape[i] = pixels[4 * i + 3];
-        selection.select(within(centers, model(), shape, width, height), event.shiftKey ? "add" : event.altKey ? "remove" : mode);
+        edits.select(within(centers, model(), shape, width, height), event.shiftKey ? "add" : event.altKey ? "remove" : mode);
         stroke = [];
         show();
     }
@@ -242,10 +202,11 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
 
     async function annotate(/** @type {number} */ x, /** @type {number} */ y) {
         const point = await surface(x, y);
+        const { notes } = edits.present;
         if (!point || notes.length >= MOST_NOTES) return;
         const view = presentView();
-        notes.push({ title: say("edit_note_new", notes.length + 1), text: "", view: [...unplaced(view.slice(0, 3)), ...point, view[6], scene.aspect] });
-        listNotes();
+        const note = { title: say("edit_note_new", notes.length + 1), text: "", view: [...unplaced(view.slice(0, 3)), ...point, view[6], scene.aspect] };
+        edits.change({ notes: [...notes, note] });
         show();
     }
 
@@ -253,26 +214,33 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     async function level(/** @type {number} */ x, /** @type {number} */ y) {
         const point = await surface(x, y);
         if (!point) return;
-        floor.push(point);
+        setFloor([...floor, point]);
         if (floor.length < 3) return draw();
         const turn = levelling(floor.map(placed), presentView().slice(0, 3));
-        floor = [];
-        if (turn) selection.turnBy(turn);
+        setFloor([]);
+        if (turn) edits.turnBy(turn);
         else tell(say("edit_on_a_line"));
         show();
         draw();
     }
 
+    function setFloor(/** @type {number[][]} */ points) {
+        floor = points;
+        floorPoints.textContent = points.length ? say("edit_level_points", points.length) : "";
+    }
+
     function listNotes() {
-        const field = (/** @type {any} */ note, /** @type {"title" | "text"} */ key, /** @type {number} */ most) =>
-            make("input", { type: "text", maxlength: most, value: note[key], "aria-label": say(`edit_note_${key}`), placeholder: say(`edit_note_${key}`),
-                input: change((/** @type {any} */ event) => (note[key] = event.target.value)) });
-        const drop = (/** @type {any} */ note) => change(() => {
-            notes = notes.filter(each => each !== note);
-            listNotes();
-        });
+        listed = edits.present.notes;
+        const replaced = (/** @type {number} */ i, /** @type {any} */ changes) => edits.present.notes.map((note, k) => (k === i ? { ...note, ...changes } : note));
+        const field = (/** @type {number} */ i, /** @type {"title" | "text"} */ key, /** @type {number} */ most) =>
+            make("input", { type: "text", maxlength: most, value: listed[i][key], "aria-label": say(`edit_note_${key}`), placeholder: say(`edit_note_${key}`),
+                input: change((/** @type {any} */ event) => {
+                    edits.change({ notes: replaced(i, { [key]: event.target.value }) }, `${key} ${i}`);
+                    listed = edits.present.notes; // the field has the text already
+                }) });
+        const drop = (/** @type {number} */ i) => change(() => edits.change({ notes: edits.present.notes.filter((_, k) => k !== i) }));
         noteList.replaceChildren(
-            ...notes.map((note, i) => make("div.snow-buttons", {}, make("b", {}, String(i + 1)), field(note, "title", 60), field(note, "text", 280), button("film_remove", drop(note)))),
+            ...listed.map((_, i) => make("div.snow-buttons", {}, make("b", {}, String(i + 1)), field(i, "title", 60), field(i, "text", 280), button("film_remove", drop(i)))),
         );
         draw();
     }
@@ -281,13 +249,13 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     function distance() {
         if (measured.length < 2) return 0;
         const [a, b] = measured;
-        return (scale * Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2])) / scene.scale;
+        return (edits.present.scale * Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2])) / scene.scale;
     }
 
     function tellDistance() {
         const found = distance();
         // Set scale makes a unit of the scene that is saved a metre.
-        const metres = scale === 1 ? scene.metres : 1;
+        const metres = edits.present.scale === 1 ? scene.metres : 1;
         const length = metres ? `${(metres * found).toPrecision(4)} m` : found.toPrecision(4);
         measure_.textContent = found ? say("edit_distance", length) : say("edit_two_points");
         rescale.disabled = !found;
@@ -336,38 +304,27 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         tool = name;
         tools.mark(name);
         overlay.hidden = !name;
-        // The box is moved by sliders, and the camera by the window.
+        // The box is moved by its handles, and the camera by the window.
         overlay.style.pointerEvents = name === "box" ? "none" : "auto";
+        forSelection.hidden = ["measure", "note", "level"].includes(name);
         forBrush.hidden = name !== "brush";
-        forBox.hidden = name !== "box";
+        forBox.hidden = box.handles.hidden = name !== "box";
         forMeasure.hidden = name !== "measure";
         forNotes.hidden = name !== "note";
         forLevel.hidden = name !== "level";
-        floor = [];
+        setFloor([]);
     }
 
+    const forSelection = make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => edits.invert())));
     const radius = /** @type {HTMLInputElement} */ (make("input", { type: "range", min: 4, max: 120, value: BRUSH }));
     const forBrush = make("label", {}, say("edit_radius"), radius);
-    const sides = AXES.flatMap((axis, k) =>
-        [0, 1].map(side => {
-            const input = (/** @type {any} */ event) => {
-                box[side][k] = Number(event.target.value);
-                box[1 - side][k] = side ? Math.min(box[0][k], box[1][k]) : Math.max(box[0][k], box[1][k]);
-                const other = /** @type {HTMLInputElement} */ (forBox.querySelectorAll("input")[2 * k + 1 - side]);
-                other.value = String(box[1 - side][k]);
-            };
-            const label = say(side ? "edit_to" : "edit_from", axis);
-            return make("label", {}, label, make("input", { type: "range", min: low[k], max: high[k], step: "any", value: box[side][k], input }));
-        }),
-    );
-    const forBox = make("div", {}, ...sides, button("edit_outside", change(() => selection.select(outside(centers, box[0], box[1]), mode))));
+    const forBox = make("div", {}, make("p", {}, say("edit_box_how")), ...box.sliders, button("edit_outside", change(() => edits.select(box.outside(), mode))));
     const measure_ = make("span", { role: "status" }, say("edit_two_points"));
     const truth = /** @type {HTMLInputElement} */ (make("input", { type: "number", min: 0, step: "any", "aria-label": say("edit_truth"), placeholder: say("edit_truth") }));
     const rescale = button("edit_rescale", () => {
         const wanted = Number(truth.value);
         if (!(wanted > 0)) return truth.focus();
-        scale *= wanted / distance();
-        tellDistance();
+        edits.change({ scale: (edits.present.scale * wanted) / distance() });
         show();
     });
     rescale.disabled = true;
@@ -377,29 +334,34 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     const forNotes = make("div", {}, make("p", {}, say("edit_note_how")), noteList);
     const turns = AXES.map((axis, k) => {
         const by = (/** @type {number} */ degrees) =>
-            make("button", { type: "button", "aria-label": say("edit_turn", axis, degrees), click: change(() => selection.turnBy(about(k, degrees))) }, `${degrees > 0 ? "+" : "−"}90°`);
+            make("button", { type: "button", "aria-label": say("edit_turn", axis, degrees), click: change(() => edits.turnBy(about(k, degrees))) }, `${degrees > 0 ? "+" : "−"}90°`);
         const fine = /** @type {HTMLInputElement} */ (
             make("input", {
                 type: "range", min: -FINE, max: FINE, step: "any", value: 0, "aria-label": say("edit_turn_fine", axis),
                 input: () => place(about(k, Number(fine.value))),
                 change: change(() => {
-                    if (Number(fine.value)) selection.turnBy(about(k, Number(fine.value)));
+                    if (Number(fine.value)) edits.turnBy(about(k, Number(fine.value)));
                     fine.value = "0";
                 }),
             })
         );
         return make("div.snow-turn", {}, make("b", {}, axis), by(-90), fine, by(90));
     });
-    const forLevel = make("div", {}, make("p", {}, say("edit_level_how")), ...turns);
+    const floorPoints = make("p", { role: "status" });
+    const forLevel = make("div.snow-level", {}, make("p", {}, say("edit_level_how")), floorPoints, ...turns);
     const hides = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: change(() => {}) }));
-    const remove = button("edit_delete", change(() => selection.delete()));
-    const undo = button("edit_undo", change(() => selection.undo()));
-    const redo = button("edit_redo", change(() => selection.redo()));
+    const remove = button("edit_delete", change(() => edits.delete()));
+    const undo = button("edit_undo", change(() => go("undo")));
+    const redo = button("edit_redo", change(() => go("redo")));
+    function go(/** @type {"undo" | "redo"} */ way) {
+        edits[way]();
+        tell("");
+    }
     const counts = make("p", { role: "status" });
     const title = /** @type {HTMLInputElement} */ (make("input", { type: "text", maxlength: 80, value: scene.title, "aria-label": say("title_label"), input: change(() => {}) }));
     const view = button("edit_start", change(() => {
         const seen = presentView();
-        start = [...unplaced(seen.slice(0, 3)), ...unplaced(seen.slice(3, 6)), seen[6], scene.aspect];
+        edits.change({ start: [...unplaced(seen.slice(0, 3)), ...unplaced(seen.slice(3, 6)), seen[6], scene.aspect] });
         tell(say("edit_start_set"));
     }));
     const told = make("p", { role: "status" });
@@ -411,10 +373,10 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         show();
         tell(say("edit_saving"));
         try {
-            await ask("../edit", method, body);
+            await ask(`../edit?version=${version}`, method, body);
             removeEventListener("beforeunload", keep);
             // The page of the studio shows the scene in a frame; it has other figures now, too.
-            if (parent === window) location.reload();
+            if (parent === window) location.replace("../site/index.html");
             else parent.document.dispatchEvent(new Event("edited"));
         } catch (error) {
             tell(error instanceof Refused ? error.message : say("offline"));
@@ -424,16 +386,17 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     }
     const save = button("edit_save", () => {
         const changed = title.value.trim();
+        const { state, scale, start, notes, turn } = edits.present;
         if (notes.some(note => !note.title.trim())) return tell(say("edit_note_untitled"));
         send("POST", {
-            count: selection.state.length,
-            removed: selection.deleted(),
+            count: state.length,
+            removed: edits.deleted(),
             scale,
             title: changed === scene.title ? "" : changed,
             start,
             hidden: hidden(),
             notes: haveNotesChanged() ? notes : null,
-            turn: isTurned() ? selection.turn : null,
+            turn: isTurned() ? turn : null,
         });
     });
     const back = button("edit_back", () => {
@@ -449,7 +412,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
         "div.snow-edit.snow-tools.snow-card",
         { hidden: true },
         row(...tools.buttons),
-        make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => selection.invert()))),
+        forSelection,
         forBrush,
         forBox,
         forMeasure,
@@ -480,6 +443,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
     listNotes();
     modes.mark(mode);
     show();
+    if (isWhole) open.click();
 
     const isField = (/** @type {Event} */ event) => event.target instanceof HTMLInputElement && ["text", "number"].includes(event.target.type);
     // Keys in fields are not for the camera.
@@ -493,9 +457,9 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
             if (content.hidden || saving || isField(event)) return;
             const command = event.ctrlKey || event.metaKey;
             const key = event.key.toLowerCase();
-            if (command && key === "z") change(() => (event.shiftKey ? selection.redo() : selection.undo()))();
-            else if (command && key === "y") change(() => selection.redo())();
-            else if (key === "delete" || key === "backspace") change(() => selection.delete())();
+            if (command && key === "z") change(() => go(event.shiftKey ? "redo" : "undo"))();
+            else if (command && key === "y") change(() => go("redo"))();
+            else if (key === "delete" || key === "backspace") change(() => edits.delete())();
             else if (key === "escape" && tool) choose("");
             else return;
             event.preventDefault();

@@ -6,6 +6,7 @@ import { say } from "./text.js";
 
 const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
 const TURN = 8; // keys of a turn around the target
+const FASTEST = 3; // the speeds at a key are from 1/8 to 8, in steps of the square root of 2
 const ADDRESS = "../film"; // relative to the page
 
 /**
@@ -31,9 +32,15 @@ export function cameraAt(path, share) {
     return path[before].map((value, i) => value + (at - before) * (path[before + 1][i] - value));
 }
 
-/** @param {any} page see panel.js */
-export function addFilm({ viewer, scene, camera, canvas, panel, presentView, flyTo }) {
-    /** @type {number[][]} */
+/** A speed, for people. */
+const times = (/** @type {number} */ speed) => `×${Number(speed.toPrecision(2))}`;
+
+/**
+ * @param {any} page see panel.js
+ * @param {string} version of the scene that the page shows: keys are in its frame
+ */
+export function addFilm({ viewer, scene, camera, canvas, panel, presentView, flyTo }, version) {
+    /** @type {{view: number[], speed: number}[]} */
     let keys = [];
     let chosen = -1; // the key that was added or shown last
     /** @type {number[][] | null} */
@@ -57,7 +64,16 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     );
     const ease = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", checked: true, change: changed }));
     const loop = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: changed }));
-    const plan = () => ({ keys, seconds: Number(seconds.value), size: size.value, ease: ease.checked, loop: loop.checked });
+    // Its speeds are relative to each other, as the seconds are the length of the film.
+    const speed = /** @type {HTMLInputElement} */ (
+        make("input", { type: "range", min: -FASTEST, max: FASTEST, step: 0.5, value: 0, input: () => setSpeed(), change: changed })
+    );
+    function setSpeed() {
+        keys[chosen].speed = 2 ** Number(speed.value);
+        draw();
+    }
+    const speedText = make("span");
+    const plan = () => ({ keys: keys.map(key => key.view), speeds: keys.map(key => key.speed), seconds: Number(seconds.value), size: size.value, ease: ease.checked, loop: loop.checked });
     const canPlay = () => keys.length >= (loop.checked ? 3 : 2) && Number(seconds.value) > 0;
 
     function changed() {
@@ -72,12 +88,18 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
                 const show = () => {
                     stopPreview();
                     chosen = i;
-                    flyTo(key.slice(0, 7));
+                    flyTo(key.view.slice(0, 7));
                     draw();
                 };
-                return make("button", { type: "button", "aria-label": say("film_key", i + 1), "aria-current": i === chosen && "true", click: show }, String(i + 1));
+                const label = say("film_key", i + 1) + (key.speed === 1 ? "" : `, ${say("film_speed")} ${times(key.speed)}`);
+                return make("button", { type: "button", "aria-label": label, "aria-current": i === chosen && "true", click: show }, String(i + 1), key.speed !== 1 && make("small", {}, times(key.speed)));
             }),
         );
+        speedOfKey.hidden = chosen < 0;
+        if (chosen >= 0) {
+            speed.value = String(Math.log2(keys[chosen].speed));
+            speedText.textContent = `${say("film_key", chosen + 1)}: ${say("film_speed")} ${times(keys[chosen].speed)}`;
+        }
         empty.hidden = keys.length > 0;
         replace.disabled = remove.disabled = chosen < 0;
         play.disabled = render.disabled = position.disabled = !canPlay();
@@ -88,12 +110,12 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
 
     const view = () => [...presentView(), scene.aspect];
     const add = button("film_add", () => {
-        keys.splice(chosen + 1, 0, view());
+        keys.splice(chosen + 1, 0, { view: view(), speed: 1 });
         chosen += 1;
         changed();
     });
     const replace = button("film_replace", () => {
-        keys[chosen] = view();
+        keys[chosen].view = view();
         changed();
     });
     const remove = button("film_remove", () => {
@@ -102,7 +124,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         changed();
     });
     const turn = button("film_turn", () => {
-        keys = around(view(), TURN);
+        keys = around(view(), TURN).map(each => ({ view: each, speed: 1 }));
         chosen = TURN - 1;
         loop.checked = true;
         ease.checked = false;
@@ -110,6 +132,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     });
     const line = make("div.snow-keys", { role: "group", "aria-label": say("film_line") });
     const empty = make("p", {}, say("film_empty"));
+    const speedOfKey = make("label.snow-speed", {}, speedText, speed);
 
     // The preview
 
@@ -123,7 +146,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         if (path) return;
         tell(say("preparing"));
         const asked = JSON.stringify(plan());
-        const found = await ask(`${ADDRESS}/path`, "POST", plan());
+        const found = await ask(`${ADDRESS}/path?version=${version}`, "POST", plan());
         tell("");
         if (asked === JSON.stringify(plan())) path = found.path;
     }
@@ -194,7 +217,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     const result = make("div");
     const render = button("film_render", action(async () => {
         stopPreview();
-        await ask(ADDRESS, "POST", plan()).catch(fail);
+        await ask(`${ADDRESS}?version=${version}`, "POST", plan()).catch(fail);
         await look();
         setTimeout(draw);
     }));
@@ -225,7 +248,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
             result.append(make("p", {}, download), command(now.command));
         }
         if (!keys.length && now.plan) {
-            ({ keys } = now.plan);
+            keys = now.plan.keys.map((/** @type {number[]} */ each, /** @type {number} */ i) => ({ view: each, speed: now.plan.speeds[i] ?? 1 }));
             chosen = keys.length - 1;
             seconds.value = now.plan.seconds;
             size.value = now.plan.size;
@@ -244,6 +267,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         row(add, replace, remove, turn),
         empty,
         line,
+        speedOfKey,
         make("label", {}, say("film_seconds"), seconds),
         make("label", {}, say("film_size"), size),
         make("label.snow-check", {}, ease, say("film_ease")),

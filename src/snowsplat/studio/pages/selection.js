@@ -1,12 +1,7 @@
-// Which Gaussians are selected or deleted: a byte per Gaussian; how the scene is turned, a quaternion
-// wxyz; and what undoes a change. Matrices are column by column, as the engine has them.
+// Which Gaussians are in a shape of the window, or outside a box. Matrices are column by column, as the
+// engine has them.
 
-import { product, UNTURNED } from "./turning.js";
-
-export const SELECTED = 1;
-export const DELETED = 2;
-
-const STEPS = 40; // that can be undone
+const SHORT = 8;
 
 /** The product of two matrices of 16 numbers. */
 export function times(/** @type {ArrayLike<number>} */ a, /** @type {ArrayLike<number>} */ b) {
@@ -81,85 +76,26 @@ export function bounds(/** @type {Float32Array} */ centers) {
     return [sides.map(side => side[0]), sides.map(side => side[1])];
 }
 
-export class Selection {
-    /** @param {number} count of Gaussians */
-    constructor(count) {
-        /** @type {Uint8Array} */
-        this.state = new Uint8Array(count);
-        this.turn = UNTURNED;
-        /** @type {[Uint8Array, number[]][]} */
-        this.past = [];
-        /** @type {[Uint8Array, number[]][]} */
-        this.future = [];
-    }
-
-    /** Changes the state; a change of nothing is no step. */
-    #change(/** @type {(byte: number, i: number) => number} */ changed) {
-        const next = this.state.map(changed);
-        if (!next.every((byte, i) => byte === this.state[i])) this.#step(next, this.turn);
-    }
-
-    #step(/** @type {Uint8Array} */ state, /** @type {number[]} */ turn) {
-        this.past.push([this.state, this.turn]);
-        if (this.past.length > STEPS) this.past.shift();
-        this.future.length = 0;
-        [this.state, this.turn] = [state, turn];
-    }
-
-    /** Turns the scene further. */
-    turnBy(/** @type {number[]} */ quaternion) {
-        this.#step(this.state, product(quaternion, this.turn));
-    }
-
-    /**
-     * Selects what was found. What is deleted is never selected.
-     * @param {Uint8Array} found a byte per Gaussian
-     * @param {string} mode "replace", "add" or "remove"
-     */
-    select(found, mode) {
-        this.#change((byte, i) => {
-            if (byte === DELETED) return byte;
-            if (mode === "replace") return found[i];
-            return found[i] ? Number(mode === "add") : byte;
-        });
-    }
-
-    invert() {
-        this.#change(byte => (byte === DELETED ? byte : byte ^ SELECTED));
-    }
-
-    delete() {
-        this.#change(byte => (byte === SELECTED ? DELETED : byte));
-    }
-
-    undo() {
-        this.#go(this.past, this.future);
-    }
-
-    redo() {
-        this.#go(this.future, this.past);
-    }
-
-    #go(/** @type {[Uint8Array, number[]][]} */ from, /** @type {[Uint8Array, number[]][]} */ to) {
-        const next = from.pop();
-        if (!next) return;
-        to.push([this.state, this.turn]);
-        [this.state, this.turn] = next;
-    }
-
-    /** @param {number} value SELECTED or DELETED */
-    count(value) {
-        return this.state.reduce((sum, byte) => sum + Number(byte === value), 0);
-    }
-
-    /** A bit per Gaussian, the lowest bit of a byte first: whether it is deleted. In base64. */
-    deleted() {
-        const bytes = new Uint8Array(Math.ceil(this.state.length / 8));
-        this.state.forEach((byte, i) => {
-            if (byte === DELETED) bytes[i >> 3] |= 1 << (i & 7);
-        });
-        let text = "";
-        for (let at = 0; at < bytes.length; at += 1 << 14) text += String.fromCharCode(...bytes.subarray(at, at + (1 << 14)));
-        return btoa(text);
-    }
+/**
+ * How far a point must move along an axis, so that it is seen nearest to a place of the window; null if
+ * no such distance is known: the axis is seen from its end, or the place is beyond its vanishing point.
+ * @param {ArrayLike<number>} m the clip space from the space of the point
+ * @param {number[]} point
+ * @param {number} axis 0, 1 or 2
+ * @param {number} length along the axis, which is seen from its end if these are fewer than `SHORT` pixels
+ * @param {number[]} place pixels
+ * @param {number} width
+ * @param {number} height
+ */
+export function along(m, point, axis, length, [column, row], width, height) {
+    const [x, y, w] = project(m, point, width, height);
+    // The numerators of column and row, and their denominator, change by these for each unit.
+    const further = m[4 * axis + 3];
+    const across = 0.5 * width * (m[4 * axis] + further);
+    const down = 0.5 * height * (further - m[4 * axis + 1]);
+    const [dx, dy] = [(across - x * further) / w, (down - y * further) / w]; // pixels per unit
+    const speed = Math.hypot(dx, dy);
+    const moved = (dx * (column - x) + dy * (row - y)) / speed;
+    const left = speed * w - moved * further;
+    return w > 0 && speed * length > SHORT && left > 1e-3 * speed * w ? (moved * w) / left : null;
 }

@@ -3,9 +3,10 @@
 
 import { addEditor, centersOf } from "./edit.js";
 import { addFilm } from "./film.js";
-import { chosenLanguage, speak } from "./text.js";
+import { ask, make, Refused } from "./page.js";
+import { chosenLanguage, say, speak } from "./text.js";
 
-const { whole, edited } = /** @type {HTMLElement} */ (document.querySelector("script[data-whole]")).dataset;
+const { page: kind, edited, version } = /** @type {HTMLElement} */ (document.querySelector("script[data-page]")).dataset;
 
 function addTools(/** @type {any} */ page) {
     const { app, events, state } = page.viewer;
@@ -13,12 +14,31 @@ function addTools(/** @type {any} */ page) {
     let picker;
     events.once("picker:ready", (/** @type {any} */ ready) => (picker = ready));
     const begin = async () => {
-        addFilm(page);
-        // Levels of detail cannot be edited.
-        if (whole === "true") addEditor(page, picker, await centersOf(app), edited === "true");
+        addFilm(page, version ?? "");
+        if (kind === "levels") addWholePage(page.panel);
+        else addEditor(page, picker, await centersOf(app), version ?? "", edited === "true", kind === "whole");
     };
     if (state.loaded) begin();
     else events.once("loaded:changed", begin);
+}
+
+/** Levels of detail have parts of the scene only. A button writes a page with the whole scene. */
+function addWholePage(/** @type {HTMLElement} */ panel) {
+    const told = make("p", { role: "status" });
+    const open = /** @type {HTMLButtonElement} */ (make("button", { type: "button" }, say("edit")));
+    open.addEventListener("click", async () => {
+        open.disabled = true;
+        told.textContent = say("edit_whole");
+        try {
+            await ask("../whole", "POST");
+            location.href = "../whole/index.html";
+        } catch (error) {
+            told.textContent = error instanceof Refused ? error.message : say("offline");
+            open.disabled = false;
+        }
+    });
+    panel.querySelector(".snow-copied")?.before(open);
+    panel.querySelector(".snow-card")?.append(told);
 }
 
 speak(chosenLanguage());
