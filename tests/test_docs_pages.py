@@ -1,6 +1,7 @@
 """Pages as files: what a plain Markdown renderer shows of them."""
 
 import importlib.util
+import itertools
 import re
 import sys
 from pathlib import Path
@@ -93,6 +94,20 @@ def test_every_figure_is_a_described_image_in_both_languages():
     assert shown["zh/learn"] >= files
 
 
+@pytest.mark.parametrize("folder", ["learn", "zh/learn"])
+def test_each_page_of_the_course_ends_with_the_next_one(folder):
+    index = (DOCS / folder / "index.md").read_text(encoding="utf-8")
+    toctree = re.search(r"<!-- toctree\n((?:.+\n)+?)-->", index)
+    assert toctree is not None
+    names = toctree[1].split()
+    assert len(names) >= 18
+    for name, following in itertools.pairwise(names):
+        page, target = (DOCS / folder / f"{each}.md" for each in (name, following))
+        title = target.read_text(encoding="utf-8").split("# ", 1)[1].split("\n", 1)[0]
+        last = page.read_text(encoding="utf-8").rstrip().rsplit("\n\n", 1)[1]
+        assert f"[{title}]({following}.md)" in " ".join(last.split()), page
+
+
 def slugs(page: Path) -> set[str]:
     """The anchors of the headings of a page, as GitHub and the site make them."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
@@ -108,6 +123,8 @@ def test_links_lead_to_files_and_headings_of_the_repository():
         for target, anchor in LINK.findall(text):
             file = (page.parent / target).resolve() if target else page
             assert file.exists(), f"{page}: {target}"
+            included = file.suffix == ".md" and file.read_text("utf-8").startswith("```{include}")
+            assert not included, f"{page}: {target} is on the site only; link to the included file"
             # Headings that a directive makes are on the site only.
             if anchor and "```{" not in file.read_text(encoding="utf-8"):
                 assert anchor in slugs(file), f"{page}: {target}#{anchor}"

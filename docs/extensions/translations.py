@@ -25,6 +25,7 @@ _DOCS = Path(__file__).resolve().parents[1]
 TRANSLATED = (
     "installation.md",
     "quick-start.md",
+    "guides/globe.md",
     "guides/gpu.md",
     "guides/images-and-videos.md",
     "guides/memory.md",

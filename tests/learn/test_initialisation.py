@@ -490,7 +490,12 @@ def test_the_probabilities_of_the_page():
     assert f"In {refill['shared']} of them, one target" in text
     assert f"{none['failed']} fits fail, {none['with_dead']} of them with a dead" in text
     found = [percent("targets", k=k, gaussians=k) for k in (1, 4, 8)]
-    assert "{} of the fits find one target, {} four, and {} eight".format(*found) in text
+    assert (
+        "{} of the fits succeed for one target, {} for four targets, and {} for eight".format(
+            *found
+        )
+        in text
+    )
     assert f"find eight targets in {percent('targets', k=8, gaussians=16)} of the fits" in text
     for optimizer in ("gradient descent", "Adam"):
         few, many = (percent("gaussians", optimizer=optimizer, gaussians=n) for n in (6, 18))

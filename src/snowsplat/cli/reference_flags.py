@@ -50,7 +50,7 @@ def _refused(spellings: str, note: str, values: int | Literal["+"] = 1) -> Refer
 
 
 _PAGE = "there is a page only with --view; snowsplat watch OUT shows a running training"
-_NO_DEPTH = "there is no depth regularisation"
+_DEPTH = "--depth-weight compares the depth with the depth maps in DATASET/depths"
 _ONE_CAUSE = "a kernel that fails ends the run with its message"
 
 # The flags that train.py and render.py share.
@@ -108,10 +108,9 @@ PROGRAMS: dict[str, tuple[str, tuple[ReferenceFlag, ...]]] = {
             ),
             _refused(
                 "--depths -d",
-                f"{_NO_DEPTH}; use --init depth+points, which starts with the depth maps in "
-                "DATASET/depths",
+                f"use --init depth+points, which starts with the depth maps; {_DEPTH}",
             ),
-            _ignored("--depth_l1_weight_init --depth_l1_weight_final", _NO_DEPTH, 1),
+            _ignored("--depth_l1_weight_init --depth_l1_weight_final", _DEPTH, 1),
             _becomes("--ip", "--host", _PAGE, 1, "--view"),
             _becomes("--port", "--port", _PAGE, 1, "--view"),
             _ignored("--disable_viewer", _PAGE),

@@ -154,6 +154,17 @@ def test_the_picture_is_that_of_the_video(page):
 
 
 @pytest.mark.browser
+def test_a_browser_in_chinese_shows_chinese_texts(tmp_path):
+    write_page(tmp_path / "globe.html", Arrangement(gaussians(1), True), "桌子")
+    with Browser(SIDE, SIDE) as browser:
+        page = browser.open((tmp_path / "globe.html").as_uri(), language="zh-CN")
+        texts = page.evaluate("[document.title, document.body.innerText].join(' ')")
+        assert not page.errors
+    assert re.search("桌子 - 雪花球 .*摇晃手机。.*摇晃.*复原", texts, re.DOTALL)
+    assert not re.search("[a-z]", texts)
+
+
+@pytest.mark.browser
 def test_the_picture_of_an_antialiased_scene(tmp_path):
     """Gaussians of about the size of a pixel are as opaque as in the video."""
     scene = gaussians()

@@ -286,11 +286,23 @@ class Globe {
     }
 }
 
+// The texts of the page in Chinese, for a browser in Chinese.
+const chinese = navigator.language.toLowerCase().startsWith("zh");
+if (chinese) {
+    document.documentElement.lang = "zh-CN";
+    document.title = `${about.name} - 雪花球`;
+    element("view").setAttribute("aria-label", `雪花球中的场景：${about.name}`);
+    element("hint").textContent = "拖动可以转动雪花球，快速拖动可以摇晃它；在手机上，也可以摇晃手机。";
+    for (const [id, text, title] of [["shake", "摇晃", "空格键"], ["remember", "复原", "回车键"]]) {
+        Object.assign(element(id), { textContent: text, title });
+    }
+}
+
 try {
     window.snowGlobe = new Globe();
 } catch (error) {
     const line = document.createElement("p");
-    line.textContent = "This page needs a browser with WebGL 2.";
+    line.textContent = chinese ? "这个网页需要支持 WebGL 2 的浏览器。" : "This page needs a browser with WebGL 2.";
     document.body.append(line);
     throw error;
 }
