@@ -126,8 +126,8 @@ def _project_rows(
     RS = _rotation_matrices(quats) * log_scales.exp()[:, None, :]
 
     # J, the affine approximation of the projection at the centre (Zwicker et al. 2001). It is
-    # unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin around
-    # it. (M, 2, 3)
+    # unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin
+    # around it. (M, 2, 3)
     x_margin, y_margin = JACOBIAN_MARGIN * view.width, JACOBIAN_MARGIN * view.height
     tx = (fx * x / z).clamp(-(cx + x_margin), view.width - cx + x_margin) / fx
     ty = (fy * y / z).clamp(-(cy + y_margin), view.height - cy + y_margin) / fy
