@@ -3,8 +3,9 @@
     python experiments/cholesky.py
 
 trains the same Gaussians with three parameterisations of the covariance, for several learning rates
-and seeds, and prints the PSNR of held-out photos. The scene is that of `snowsplat demo`, which is
-made first if it does not exist. docs/learn/covariance.md describes the result.
+and seeds, and prints the PSNR of held-out photos. The scene is that of `snowsplat demo` with
+all photos; its dataset is made first if it does not exist. docs/learn/covariance.md describes the
+result.
 
 Everything else is equal: the number of Gaussians is fixed, colours do not depend on the view, and
 all other learning rates are those of the recipe `classic`. The seed selects the initial points, the
@@ -30,11 +31,13 @@ from snowsplat.data.image_loader import ImageLoader
 from snowsplat.data.load import load_dataset
 from snowsplat.ops.reference import LOW_PASS
 from snowsplat.ops.splats import Splats2D
-from snowsplat.pipeline.demo import demo
+from snowsplat.pipeline.observer import SILENT
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.sh_constants import SH_C0
+from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
+from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.training.settings.recipes import recipe
 
 DOWNSCALE = 4
@@ -223,14 +226,16 @@ def chosen(results: list[Result]) -> list[Result]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("build/learn/demo"))
+    parser.add_argument("--data", type=Path, default=Path("build/learn"))
     parser.add_argument("--gaussians", type=int, default=4000)
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".json"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    made = demo(options.data).made
-    dataset = load_dataset(made.dataset_report.parent)
+    photos, folder = options.data / "photos", options.data / "dataset"
+    write_synthetic_photos(photos)
+    make_dataset([photos], folder, DatasetOptions(), SILENT)
+    dataset = load_dataset(folder)
     results = []
     for name in SHAPES:
         own: list[Result] = []

@@ -73,6 +73,13 @@ def test_the_limits():
         assert float(image[0, 0, 0]) == pytest.approx(expected)
 
 
+def test_the_splat_that_would_end_the_pixel_is_left_out():
+    """What remains can be nearly 1%, and the background gets it."""
+    alphas = np.array([0.5, 0.981, 0.99, 0.2])  # T: 0.5, 0.0095, 0.000095
+    image, _, _ = reference.rasterize(splats_with(alphas, np.ones((4, 3))), 1, 1)
+    assert 1 - float(image[0, 0, 0]) == pytest.approx(0.0095)
+
+
 def test_the_profile_of_a_cloud():
     """1 − exp(−κ G) has the maximum o for κ = −ln(1 − o), and is near o G for small κ."""
     g = np.linspace(0, 1, 11)

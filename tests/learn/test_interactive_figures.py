@@ -97,6 +97,14 @@ def place(page: Page, figure: str, selector: str) -> tuple[float, float]:
     return x, y
 
 
+def touch(page: Page, *places: tuple[float, float]) -> None:
+    """Drag a finger along some places."""
+    kinds = ["touchStart", *["touchMove"] * (len(places) - 1), "touchEnd"]
+    for kind, points in zip(kinds, [*([place] for place in places), []], strict=True):
+        found = [{"x": x, "y": y} for x, y in points]
+        page.call("Input.dispatchTouchEvent", type=kind, touchPoints=found)
+
+
 def test_they_fit_on_a_phone_and_speak_the_language_of_the_page(page, browser, tmp_path):
     assert page.evaluate("document.documentElement.scrollWidth <= 390")
     file = tmp_path / "zh.html"
@@ -147,9 +155,7 @@ def test_projection(page):
     assert float(data(page, "projection", "share")) == pytest.approx(exact, abs=0.04)
     x, y = place(page, "projection", "[data-handle=centre]")
     scale = page.evaluate(part("projection", "svg") + ".getBoundingClientRect().width") / 330
-    for kind, dy in (("touchStart", 0), ("touchMove", 50), ("touchMove", 110), ("touchEnd", None)):
-        points = [] if dy is None else [{"x": x, "y": y + dy * scale}]
-        page.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+    touch(page, (x, y), (x, y + 50 * scale), (x, y + 110 * scale))
     put(page, "projection", "size", 0.8)
     assert float(data(page, "projection", "share")) < exact - 0.1
     status = page.evaluate(part("projection", ".status") + ".textContent")
@@ -178,7 +184,15 @@ def test_harmonics(page):
     basis = reference.sh_basis(directions, 3)
     expected = 4 * math.pi * (basis * colour[:, None]).mean(0)
     np.testing.assert_allclose(values, expected, atol=0.02)
+    # The sphere turns by a key and by touch.
+    shown = part("harmonics", "canvas") + ".toDataURL()"
+    pictures = [page.evaluate(shown)]
     keys(page, "harmonics", "canvas", "ArrowLeft")
+    pictures.append(page.evaluate(shown))
+    x, y = place(page, "harmonics", "canvas")
+    touch(page, (x, y), (x + 20, y), (x + 40, y + 10))
+    pictures.append(page.evaluate(shown))
+    assert len(set(pictures)) == 3
 
 
 def test_blending(page):

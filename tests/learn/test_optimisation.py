@@ -93,6 +93,13 @@ def test_the_step_does_not_depend_on_the_size_of_the_gradient():
     assert steps == pytest.approx([1, 1, 1])
 
 
+def test_steps_are_longer_after_averages_of_zero_at_a_late_step():
+    """A constant gradient, with m = v = 0 where the correction has become 1: up to 6.6 rates."""
+    steps = [(1 - 0.9**k) / math.sqrt(1 - 0.999**k) for k in range(1, 4000)]
+    assert max(steps) == pytest.approx(6.6, abs=0.05)
+    assert steps[-1] == pytest.approx(1, abs=0.02)
+
+
 def test_the_rate_of_the_positions():
     rates, schedule = LearningRates(means_steps=1.0), Schedule(1000)
     for step in (0, 250, 500, 1000):

@@ -45,6 +45,9 @@ def test_the_integrals_of_the_page():
         (lambda v: v[:, 0] ** 4, 4 * math.pi / 5),
         (lambda v: v[:, 0] ** 2 * v[:, 1] ** 2, 4 * math.pi / 15),
         (lambda v: (v[:, 0] ** 2 - v[:, 1] ** 2) ** 2, 16 * math.pi / 15),
+        (lambda v: v[:, 0] ** 6, 4 * math.pi / 7),
+        (lambda v: v[:, 0] ** 4 * v[:, 1] ** 2, 4 * math.pi / 35),
+        (lambda v: v.prod(dim=1) ** 2, 4 * math.pi / 105),
     ):
         assert 4 * math.pi * float(sphere_mean(function)) == pytest.approx(expected, rel=1e-7)
 

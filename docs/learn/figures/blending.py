@@ -70,17 +70,17 @@ def real() -> None:
     splats = project(scene.trained(), view)
     order = splats.depths.argsort(stable=True)
     for name, count, words in (
-        ("step-1", 10_000, "first 10,000 splats"),
-        ("step-10", 60_000, "first 60,000 splats"),
+        ("step-1", 10_000, "the first 10,000 splats"),
+        ("step-10", 60_000, "the first 60,000 splats"),
         ("step-all", len(order), f"all {len(order):,} splats"),
     ):
         rows = order[:count].sort().values
         part = Splats2D(splats.packed[rows], None, splats.channels)
         image, alpha, _ = ops.rasterize(part, view.width, view.height)
         panel = Drawing(300, 247, margins=(0, 24, 0, 0))
-        panel.title(words)
+        panel.title(words.removeprefix("the "))
         panel.picture(scene.pixels(image), (0, 0), (1, 1), quality=75)
-        panel.save(f"blending-{name}", f"The scene with the {words}")
+        panel.save(f"blending-{name}", f"The scene with {words}")
     counts = ops.count_blended(splats, view.width, view.height)
     print("blended splats per pixel:", float(counts.mean()), float(counts.max()))
     panel = Drawing(300, 247, margins=(0, 24, 0, 0))

@@ -9,9 +9,8 @@ from pathlib import Path
 import torch
 
 import scene
-from snowsplat import Gaussians, read_gaussians
+from snowsplat import Gaussians
 from snowsplat.ops import reference
-from snowsplat.pipeline.demo import demo
 from snowsplat.scene.render import project
 
 FILE = Path(__file__).resolve().parents[2] / "static" / "interactive" / "tiles-data.js"
@@ -46,8 +45,7 @@ def splats(gaussians: Gaussians) -> list[list[float]]:
 
 
 def main() -> None:
-    made = demo(scene.BUILD / "demo").made
-    rows = splats(read_gaussians(made.scene))
+    rows = splats(scene.trained())
     lines = ",\n".join(json.dumps(row) for row in rows)
     FILE.write_text(
         "// Made by docs/learn/figures/interactive_tiles.py: splats of a part of a real scene.\n"

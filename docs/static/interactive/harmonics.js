@@ -47,10 +47,15 @@
         event.preventDefault();
         rotate(way[0] * 0.15, way[1] * 0.15);
       });
-      canvas.addEventListener("pointerdown", event => canvas.setPointerCapture(event.pointerId));
+      let [x, y] = [0, 0]; // not movementX: browsers disagree about its unit, and about touch
+      canvas.addEventListener("pointerdown", event => {
+        canvas.setPointerCapture(event.pointerId);
+        [x, y] = [event.clientX, event.clientY];
+      });
       canvas.addEventListener("pointermove", event => {
-        if (canvas.hasPointerCapture(event.pointerId))
-          rotate(event.movementX / 60, event.movementY / 60);
+        if (!canvas.hasPointerCapture(event.pointerId)) return;
+        rotate((event.clientX - x) / 60, (event.clientY - y) / 60);
+        [x, y] = [event.clientX, event.clientY];
       });
       return canvas;
     });

@@ -4,7 +4,7 @@ import torch
 def first_log_scales(points):
     distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
     nearest = distances.sort(dim=1).values[:, 1:4]
-    return nearest.square().mean(dim=1).sqrt().log()
+    return nearest.mean(dim=1).log()
 
 
 def adam(p, g, m, v, step, rate, betas=(0.9, 0.999), eps=1e-15):

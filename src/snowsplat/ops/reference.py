@@ -49,7 +49,7 @@ from snowsplat.util.native_layout import TILE
 
 LOW_PASS = 0.3  # pixels²: blurs every splat, so that it covers at least one pixel centre
 MIP_LOW_PASS = 0.1  # pixels²: the same for antialiased scenes, about the area of a pixel
-ALPHA_MIN = 1 / 255  # smaller contributions do not change an 8-bit image and are skipped
+ALPHA_MIN = 1 / 255  # smaller contributions, below one level of an 8-bit image, are skipped
 ALPHA_MAX = 0.99  # so that 1 − α, and with it the transmittance, is never 0
 TRANSMITTANCE_MIN = 1e-4  # a splat that would make T lower, and those behind it, are not blended
 JACOBIAN_MARGIN = 0.15  # fraction of the image size; J is clamped beyond this margin
@@ -125,8 +125,8 @@ def _project_rows(
     # Σ = R S Sᵀ Rᵀ (eq. 6), represented by its factor R S. (M, 3, 3)
     RS = _rotation_matrices(quats) * log_scales.exp()[:, None, :]
 
-    # J, the affine approximation of the projection at the centre (Zwicker et al. 2001, eq. 29). It
-    # is unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin
+    # J, the affine approximation of the projection at the centre (Zwicker et al. 2001). It is
+    # unbounded far outside of the image, so x/z and y/z are clamped to the image and a margin
     # around it. (M, 2, 3)
     x_margin, y_margin = JACOBIAN_MARGIN * view.width, JACOBIAN_MARGIN * view.height
     tx = (fx * x / z).clamp(-(cx + x_margin), view.width - cx + x_margin) / fx
