@@ -136,7 +136,7 @@ ISA := isa and not (emulated or gpu or nightly)
 # The tests of kernels that other instruction sets do not repeat: threads and the loops over long images
 # are the same for each of them; and on each, results and gradients are compared with those of the reference,
 # so finite differences would only test the reference again.
-SAME := test_determinism or number_of_threads or long_images or \
+SAME := test_determinism or number_of_threads or in_parallel or long_images or \
     (finite_differences and (test_photometric or test_project or test_rasterize))
 # Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
 SANITIZED := emulated-float32 or sanitizers_find
