@@ -52,6 +52,11 @@ test: lint
 dev:
 	@$(MAKE) --no-print-directory -j2 native $(ENVIRONMENT)
 
+# uv downloads and unpacks several packages at once, in a third of the time of pip. It does not know what is set
+# for pip, such as a mirror: where uv cannot install, pip does.
+UV := UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 .venv/bin/python -m uv pip install --quiet --python .venv/bin/python
+install = $(UV) $(1) 2>/dev/null || .venv/bin/python -m pip install --no-compile $(1)
+
 # The part of the environment that compiles: the pinned tools among the packages for development.
 COMPILING := cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
 .venv/.tools: pyproject.toml | compiler
@@ -60,25 +65,25 @@ COMPILING := cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
 	@$(BOOTSTRAP) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(NO_VENV)" >&2; exit 1; }
 	$(BOOTSTRAP) -m venv .venv
 	.venv/bin/python -m pip install --quiet --upgrade pip
+	-@.venv/bin/python -m pip install --quiet --only-binary=:all: uv
 	sed -nE '/^dev = /,/^]/ s/^ *"(($(COMPILING))==.*)",$$/\1/p' pyproject.toml >.venv/tools.txt
-	.venv/bin/python -m pip install --quiet --no-compile --requirement .venv/tools.txt
+	$(call install,--requirement .venv/tools.txt)
 	@touch $@
 
-# Without an NVIDIA driver, the CPU build of PyTorch: it needs none of the CUDA libraries (2.4 GB of 3.2 GB). pip
-# takes the default build after all if the index of the CPU build cannot be reached; with TORCH_BACKEND= at once.
+# Without an NVIDIA driver, the CPU build of PyTorch: it needs none of the CUDA libraries (2.4 GB of 3.2 GB). The
+# default build is taken if the index of the CPU build cannot be reached; with TORCH_BACKEND= at once.
 TORCH_BACKEND ?= cpu
 NO_INDEX := snowsplat: the CPU build of PyTorch cannot be had here; the default build is installed
 HAS_DRIVER := import ctypes, sys; sys.platform == "linux" and ctypes.CDLL("libcuda.so.1")
 
 # The editable installation builds nothing: `make native` installs the libraries into src/. Python
 # compiles the modules that it imports; most of those of torch are never imported.
+CHECKOUT := --no-build-isolation --editable '.[dev,docs]' \
+    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
 .venv/.installed: .venv/.tools
-	@$(if $(TORCH_BACKEND),$(BOOTSTRAP) -c '$(HAS_DRIVER)' 2>/dev/null || { \
-	    .venv/bin/python -m pip install --quiet uv && UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 .venv/bin/python -m uv \
-	    pip install --quiet --python .venv/bin/python --torch-backend=$(TORCH_BACKEND) torch 2>/dev/null; } || \
-	    echo "$(NO_INDEX)" >&2)
-	.venv/bin/python -m pip install --no-compile --no-build-isolation --editable '.[dev,docs]' \
-	    --config-settings=wheel.cmake=false --config-settings=editable.mode=inplace
+	@$(if $(TORCH_BACKEND),$(BOOTSTRAP) -c '$(HAS_DRIVER)' 2>/dev/null || \
+	    $(UV) --torch-backend=$(TORCH_BACKEND) torch 2>/dev/null || echo "$(NO_INDEX)" >&2)
+	$(call install,$(CHECKOUT))
 	@touch $@
 
 compiler:
@@ -131,7 +136,7 @@ ISA := isa and not (emulated or gpu or nightly)
 # The tests of kernels that other instruction sets do not repeat: threads and the loops over long images
 # are the same for each of them; and on each, results and gradients are compared with those of the reference,
 # so finite differences would only test the reference again.
-SAME := test_determinism or number_of_threads or long_images or \
+SAME := test_determinism or number_of_threads or in_parallel or long_images or \
     (finite_differences and (test_photometric or test_project or test_rasterize))
 # Under sanitizers, one precision is enough: both have the same source. One test is about the sanitizers.
 SANITIZED := emulated-float32 or sanitizers_find

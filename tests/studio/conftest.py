@@ -4,12 +4,14 @@ import base64
 import http.client
 import io
 import json
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import IO, Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -26,6 +28,7 @@ from snowsplat.studio.library import Library, Scene
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.server import WebServer
 
+from .. import fork_server
 from ..browser import Page
 
 #: A worker that only holds the lock of a job, and saves when it is asked to end.
@@ -124,6 +127,22 @@ def in_process(monkeypatch) -> None:
         return answer
 
     monkeypatch.setattr(job, "work", work)
+
+
+@pytest.fixture
+def forked(monkeypatch) -> None:
+    """The processes of the worker are forks of one that has imported torch."""
+
+    def start(command: list[str], stdout: IO[bytes], **_: Any) -> fork_server.Process:
+        return fork_server.popen(*command[1:], stdout=stdout.fileno(), stderr=subprocess.STDOUT)
+
+    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[bytes]:
+        done = fork_server.run(*command[1:])
+        out, err = done.stdout.encode(), done.stderr.encode()
+        return subprocess.CompletedProcess(command, done.returncode, out, err)
+
+    of_forks = SimpleNamespace(Popen=start, run=run, DEVNULL=subprocess.DEVNULL)
+    monkeypatch.setattr(job, "subprocess", of_forks)
 
 
 @pytest.fixture

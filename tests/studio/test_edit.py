@@ -127,7 +127,7 @@ def counts(page: Page) -> str:
 
 
 @pytest.mark.browser
-def test_lasso_delete_undo_delete_save(studio, finished):
+def test_lasso_delete_undo_delete_save(studio, forked, finished):
     """The saved file has exactly the others."""
     address = f"{studio.server.url}scenes/{finished.name}/site/index.html"
     with Browser(900, 600, frames=4.0) as browser:

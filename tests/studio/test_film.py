@@ -83,7 +83,7 @@ def test_a_turn_is_level_and_keeps_its_distance():
 
 
 @pytest.mark.browser
-def test_a_turn_in_the_page(studio):
+def test_a_turn_in_the_page(studio, forked):
     """Its keys, the preview, and what is sent to the studio."""
     of_the_command_line(studio.library.folder / "tour")
     assert studio.ask("scenes/tour/open", "POST", {})[0] == 200

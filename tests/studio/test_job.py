@@ -86,7 +86,7 @@ def test_a_job_of_another_computer_is_not_stopped(library, holder):
     started.wait()
 
 
-def test_errors_of_the_worker_are_one_line(library, tmp_path):
+def test_errors_of_the_worker_are_one_line(library, forked, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     scene = library.new("a", [empty])
@@ -102,8 +102,8 @@ def test_errors_of_the_worker_are_one_line(library, tmp_path):
     assert "\n" not in state["error"]
 
 
-def test_what_the_photos_are(library, tmp_path):
-    """In a zip file, which is unpacked; again, it is the same."""
+def test_what_the_photos_are(library, request):
+    """In a zip file, which is unpacked; again, it is the same. The first process is a new one."""
     scene = library.new("a", [])
     scene.photos.mkdir()
     with zipfile.ZipFile(scene.photos / "tour.zip", "w") as archive:
@@ -116,6 +116,7 @@ def test_what_the_photos_are(library, tmp_path):
         found = job.work("survey", scene.folder)
         assert (found["count"], found["facts"]["photos"]) == (3, 3)
         assert 0 < found["seconds"]["draft"] < found["seconds"]["best"]
+        request.getfixturevalue("forked")
 
 
 def test_poses_that_are_given_take_no_time(library, tmp_path, monkeypatch):

@@ -44,7 +44,7 @@ def status(page: Page) -> str:
     return page.evaluate("document.querySelector('.status')?.dataset.status ?? ''")
 
 
-def test_from_photos_to_a_file(studio, tmp_path, monkeypatch):
+def test_from_photos_to_a_file(studio, forked, tmp_path, monkeypatch):
     """The browser is closed and the job is killed on the way; nothing is lost."""
     monkeypatch.setattr(job, "_WORKER", [sys.executable, "-c", _HURRIED])
     photos = scenes.write_photos(tmp_path / "Häuser am See", 9)
