@@ -48,8 +48,8 @@ _RELATIVE = 1.0
 #: The share of the steps after which the maps are compared with the scene, and then used.
 _FROM = 0.3
 #: A map contradicts the scene if its mean cosine to the surfaces is less than this share of that of
-#: their mean direction: a wall that is seen from the front would be 26 degrees wrong.
-_LEAST_COSINE = 0.9
+#: their mean direction: a wall would be 45 degrees wrong.
+_LEAST_COSINE = 0.7
 #: They are compared at this fraction of their size: normals of a larger surface are more exact.
 _COARSE = 4
 #: A mean of normals is one of a surface if it is at least so long.
