@@ -1,6 +1,8 @@
-"""PSNR and depth error of a room, with and without depth maps in the loss.
+"""PSNR and depth error of a room, with and without depth and normal maps in the loss.
 
     python benchmarks/depth.py -o out/depth --maps none true scaled wrong
+    python benchmarks/depth.py -o out/depth --maps none --normals none true noisy wrong \\
+        --set depth_weight=0.2
     python benchmarks/depth.py -o out/depth --maps none --set depth_weight=0.2 surfaces=True
 
 Ray-traced photos of a still life in a room, with the true poses and noisy points as structure from
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import itertools
 import json
 import resource
 import shutil
@@ -18,6 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
+from torch.nn.functional import interpolate, normalize
 
 from snowsplat import Trainer, load_dataset, recipe
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
@@ -31,6 +36,7 @@ from snowsplat.synthetic.still_life import still_life
 #: Points per photo, and their error relative to the depth.
 POINTS, POINT_ERROR = 60, 0.004
 KINDS = ("none", "true", "scaled", "wrong")
+NORMALS = ("none", "true", "noisy", "wrong")
 
 
 def write_room(folder: Path, views: int, width: int, height: int) -> None:
@@ -84,6 +90,37 @@ def write_maps(folder: Path, kind: str) -> None:
         np.save(folder / "depths" / file.name, z.astype(np.float32))
 
 
+def write_normals(folder: Path, kind: str, lens: float) -> None:
+    """``normals/`` of the true depths, with y up and z towards the camera, as PNG of 8 bits.
+
+    As they are; as a network estimates them (blurred noise of 12 degrees); or half of them those of
+    other photos.
+    """
+    shutil.rmtree(folder / "normals", ignore_errors=True)
+    if kind == "none":
+        return
+    (folder / "normals").mkdir()
+    files = sorted((folder / "truth").iterdir())
+    random = torch.Generator().manual_seed(1)
+    pose = torch.eye(4, dtype=torch.float64)[:3]
+    for i, file in enumerate(files):
+        other = kind == "wrong" and i % 2
+        z = torch.from_numpy(np.load(files[(i + len(files) // 2) % len(files)] if other else file))
+        height, width = z.shape
+        camera = Camera(width, height, lens, lens, width / 2, height / 2, pose)
+        normals = normals_of_depth(z, camera).nan_to_num(nan=0.0)
+        if kind == "noisy":
+            coarse = torch.randn(1, 3, height // 16, width // 16, generator=random)
+            noise = interpolate(coarse, (height, width), mode="bicubic")[0]
+            shown = normals.any(0)
+            normals = normalize(normals + 0.21 * noise, dim=0) * shown
+        if other:
+            normals = normals.flip(2)
+        colors = 0.5 + 0.5 * normals * torch.tensor([1.0, -1.0, -1.0])[:, None, None]
+        pixels = (255.0 * colors).round().to(torch.uint8).permute(1, 2, 0).contiguous()
+        Image.fromarray(pixels.numpy()).save(folder / "normals" / f"{file.stem}.png")
+
+
 def errors(trainer: Trainer, folder: Path) -> dict[str, float]:
     """Median and mean relative depth error, and angles in degrees, of the held-out views."""
     depth, angle = [], []
@@ -110,20 +147,23 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
     parser.add_argument("--maps", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--normals", nargs="+", choices=NORMALS, default=("none",))
     parser.add_argument("--iterations", type=int, default=800)
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE")
     args = parser.parse_args()
     settings = {name: ast.literal_eval(value) for name, value in (s.split("=") for s in args.set)}
     room = args.output / "room"
     write_room(room, args.views, *args.size)
-    for kind in args.maps:
+    for kind, normals in itertools.product(args.maps, args.normals):
         write_maps(room, kind)
+        write_normals(room, normals, phone_lens(*args.size, (0.0, 0.0, 0.0, 0.0)).focal)
         config = recipe("default", iterations=args.iterations, few_passes=0.0, **settings)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         trainer = Trainer(load_dataset(room), config, note=lambda line: print("  ", line))
         trainer.run()
         seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
-        found = {"maps": kind, **settings, "psnr": trainer.evaluate().psnr, "cpu_s": seconds}
+        found = {"maps": kind, "normals": normals, **settings}
+        found |= {"psnr": trainer.evaluate().psnr, "cpu_s": seconds}
         found |= errors(trainer, room)
         print(json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}))
 

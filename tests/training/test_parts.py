@@ -351,7 +351,7 @@ def test_parts_of_names_each_option():
         surfaces=True,
     )
     assert [part.name for part in parts_of(everything)] == [
-        "exposure", "unexplained", "poses", "transients", "depth", "near_limit",
-        "sky", "density", "decay", "scale_limit", "smoothing", "surfaces",
+        "exposure", "unexplained", "poses", "transients", "depth", "normals",
+        "near_limit", "sky", "density", "decay", "scale_limit", "smoothing", "surfaces",
     ]  # fmt: skip
     assert [part.name for part in parts_of(recipe("paper"))] == ["density", "decay"]

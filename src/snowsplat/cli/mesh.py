@@ -46,5 +46,5 @@ class Mesh(SurfaceFlags):
             )
         count = len(surface.mesh.faces)
         self.tell(target, surface, f"{count:,} of {surface.found:,} triangles")
-        print(next_step("for points instead", "points", scene, "-o", target.with_suffix(".laz")))
+        print(next_step("for points instead", "points", scene, "-o", target.with_suffix(".ply")))
         return 0

@@ -91,6 +91,7 @@ class View:
     depth: Path | None = None  # a depth map of the image, of any size; see `read_depth_file`
     depth_unit: float = 1.0  # world units per unit of the depth map, if the dataset has no points
     depth_confidence: Path | None = None  # a map of the same size; 0: the depth is not used
+    normals: Path | None = None  # a normal map of the image, of any size; see `read_normal_file`
 
 
 @dataclass
@@ -153,6 +154,7 @@ class PosedImage:
     depth: Path | None = None  # as `View.depth`
     depth_unit: float = 1.0  # as `View.depth_unit`
     depth_confidence: Path | None = None  # as `View.depth_confidence`
+    normals: Path | None = None  # as `View.normals`
     frame: str | None = None  # images of one frame of a rig, taken at one time, share this name
     lens: LensModel | None = None  # of a distorted photo; ``camera`` then has its pose and size
 

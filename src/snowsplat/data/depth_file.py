@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.data.image_file import MOST_PIXELS, TOO_LARGE, open_image, reason_of
+from snowsplat.data.map_file import read_map
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import is_file
 
 #: What the values of a depth map are. "z": the coordinate along the optical axis. "distance": the
 #: length of the ray. "disparity": inverse depth, up to an unknown factor.
 DepthKind = Literal["z", "distance", "disparity"]
-#: Suffixes of the files that `read_depth_file` reads.
-DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 #: Largest depth of a disparity map without a range, in units of the smallest depth.
 FARTHEST = 20.0
 # Names of the channels of EXR files, in the order of preference.
@@ -34,28 +32,7 @@ def read_depth_file(path: Path) -> np.ndarray:
     Raises:
         UserError: the file is missing, damaged, not a map of one channel, or has no known suffix.
     """
-    if not is_file(path):
-        raise UserError(f"{path}: no such depth map")
-    suffix = path.suffix.lower()
-    if suffix not in DEPTH_SUFFIXES:
-        raise UserError(f"{path}: unknown kind of depth map; use {', '.join(DEPTH_SUFFIXES)}")
-    try:
-        if suffix == ".npy":
-            values = _read_npy(path)
-        elif suffix == ".exr":
-            values = _read_exr(path)
-        else:
-            with open_image(path, ("PNG", "TIFF")) as image:
-                if image.mode == "P":
-                    raise ValueError("it has a palette of colours; save grey values")
-                values = np.asarray(image)
-    except UserError:
-        raise
-    except Exception as error:  # each of these libraries raises many kinds of exceptions
-        raise UserError(
-            f"{path}: cannot be read as a depth map ({reason_of(error)}); export it again"
-        ) from None
-    values = np.squeeze(values)
+    values = np.squeeze(read_map(path, "depth map", _channel))
     if values.ndim == 3 and values.shape[2] in (3, 4) and _is_grey(values):
         values = values[..., 0]
     if values.ndim != 2 or values.dtype.kind not in "fiub":
@@ -64,6 +41,14 @@ def read_depth_file(path: Path) -> np.ndarray:
             "one number per pixel"
         )
     return np.ascontiguousarray(values, np.float32)
+
+
+def _channel(channels: Mapping[str, Any]) -> np.ndarray:
+    """The depth among the channels of an EXR file."""
+    for name in _EXR_CHANNELS:
+        if name in channels:
+            return np.asarray(channels[name])
+    raise KeyError(_EXR_CHANNELS[0])
 
 
 def to_z(
@@ -133,30 +118,3 @@ def _ray_lengths(width: int, height: int, camera: Camera) -> Tensor:
 
 def _is_grey(values: np.ndarray) -> bool:
     return bool((values[..., :1] == values[..., :3]).all())
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    values = np.load(path, mmap_mode="r", allow_pickle=False)
-    if values.size > MOST_PIXELS:
-        raise ValueError(TOO_LARGE)
-    return np.array(values)
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    try:
-        import OpenEXR
-    except ImportError:
-        raise UserError(
-            f"{path}: EXR files need a package; run pip install OpenEXR, or convert it to NPY"
-        ) from None
-    with OpenEXR.File(str(path), header_only=True) as header:
-        box = header.header()["dataWindow"]
-        width, height = (int(high - low) + 1 for low, high in zip(*box, strict=True))
-        if width * height > MOST_PIXELS:
-            raise ValueError(TOO_LARGE)
-    with OpenEXR.File(str(path)) as file:
-        channels = file.channels()
-        for name in _EXR_CHANNELS:
-            if name in channels:
-                return np.array(channels[name].pixels)
-        raise ValueError(f"no channel {_EXR_CHANNELS[0]}, but {', '.join(channels)}")

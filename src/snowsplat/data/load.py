@@ -13,7 +13,6 @@ import torch
 from snowsplat.data.colmap import find_models, find_models_below, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
-from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.files.masks import with_masks
 from snowsplat.data.files.photos import photos_below
 from snowsplat.data.imports import Export, find_export, read_export
@@ -21,6 +20,7 @@ from snowsplat.data.imports.projects import advice
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
+from snowsplat.data.map_file import MAP_SUFFIXES
 from snowsplat.data.near import near_of
 from snowsplat.data.place import moved_to_origin
 from snowsplat.data.placement import read_placement
@@ -63,7 +63,8 @@ def load_dataset(
         path: a folder with a COLMAP model (``sparse/0`` …, binary or text) and images; a folder
             with ``transforms.json`` or ``transforms_train.json``; or such a JSON file; or the
             export of another program, see `snowsplat.data.imports`. The folder may contain depth
-            maps of the images, ``depths/IMG.png`` (or TIFF, NPY, EXR).
+            and normal maps of the images, ``depths/IMG.png`` and ``normals/IMG.png`` (or TIFF, NPY,
+            EXR).
         images: name of the folder of images.
         resolution: 1, 2, 4 or 8 divides the image size; the folders ``images_2`` … are used if
             they are complete. Any other number is a width in pixels to which wider images are
@@ -167,7 +168,7 @@ def read_files(
     posed, points, description, metres = _read(root, images)
     posed, points, origin = moved_to_origin(posed, points)
     folder = root.parent if root.is_file() else root
-    posed = with_masks(folder, _with_depth_maps(folder / "depths", posed))
+    posed = with_masks(folder, _with_maps(folder, posed))
     posed = _with_smaller_copies(posed, resolution)
     headers = [read_header(image.path) for image in posed]
     sizes = _file_sizes(posed, headers)
@@ -258,18 +259,20 @@ def poses_in(root: Path) -> Path | None:
     return (cameras or [*poses.models, *poses.transforms][0]).relative_to(root)
 
 
-def _with_depth_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
-    """The same images, with ``IMG.png`` or ``IMG.jpg.png`` of the folder, or a file of another
-    format, as depth map of ``IMG.jpg``."""
-    if not folder.is_dir():
-        return posed
-    found = []
-    for image in posed:
-        stems = (str(Path(image.file).with_suffix("")), image.file)
-        names = (folder / (stem + suffix) for stem in stems for suffix in DEPTH_SUFFIXES)
-        depth = image.depth or next((name for name in names if is_file(name)), None)
-        found.append(replace(image, depth=depth))
-    return found
+def _with_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
+    """The same images, with ``depths/IMG.png`` and ``normals/IMG.png`` of the folder, or
+    ``IMG.jpg.png``, or files of other formats, as maps of ``IMG.jpg``."""
+    if (depths := folder / "depths").is_dir():
+        posed = [replace(image, depth=image.depth or _map_of(image, depths)) for image in posed]
+    if (normals := folder / "normals").is_dir():
+        posed = [replace(image, normals=_map_of(image, normals)) for image in posed]
+    return posed
+
+
+def _map_of(image: PosedImage, folder: Path) -> Path | None:
+    stems = (str(Path(image.file).with_suffix("")), image.file)
+    names = (folder / (stem + suffix) for stem in stems for suffix in MAP_SUFFIXES)
+    return next((name for name in names if is_file(name)), None)
 
 
 def _with_smaller_copies(posed: list[PosedImage], resolution: int | None) -> list[PosedImage]:
@@ -406,14 +409,14 @@ def _views(
             mask = ImageSource(image.mask, width, height, sideways)
         source = ImageSource(image.path, width, height, sideways, header.width * header.height)
         camera = image.camera.scaled(width, height)
-        yield View(image.name, camera, source, mask, *_depth_of(image))
+        yield View(image.name, camera, source, mask, *_maps_of(image))
         return
     for view in _pinhole_views(image, image.lens, circles.get(image.lens)):
         yield _lens_view(image, view, header, size, resolution)
 
 
-def _depth_of(image: PosedImage) -> tuple[Path | None, float, Path | None]:
-    return image.depth, image.depth_unit, image.depth_confidence
+def _maps_of(image: PosedImage) -> tuple[Path | None, float, Path | None, Path | None]:
+    return image.depth, image.depth_unit, image.depth_confidence, image.normals
 
 
 def _pinhole_views(
@@ -472,7 +475,7 @@ def _lens_view(
     elif view.partial:
         mask = replace(source, blank=True)
     name = f"{image.name}/{view.name}" if view.name else image.name
-    return View(name, camera, source, mask, *_depth_of(image))
+    return View(name, camera, source, mask, *_maps_of(image))
 
 
 def _final_size(

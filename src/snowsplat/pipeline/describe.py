@@ -234,6 +234,7 @@ def _dataset(path: Path) -> dict[str, Any]:
         "focal_length_pixels": _rounded([focal[0], focal[-1]]),
         "masks": sum(view.mask is not None for view in views),
         "depth_maps": sum(view.depth is not None for view in views),
+        "normal_maps": sum(view.normals is not None for view in views),
         "points": 0 if dataset.points is None else len(dataset.points),
         "extent": float(f"{dataset.extent:.5g}"),
         **({"origin": list(dataset.origin)} if any(dataset.origin) else {}),

@@ -29,6 +29,12 @@ def normals_of_depth(depth: Tensor, camera: Camera) -> Tensor:
     return pad(normals * squares.rsqrt(), (1, 1, 1, 1))
 
 
+def surrounded(shown: Tensor) -> Tensor:
+    """(H, W) bool: the pixels that are shown with all eight around them; False at the border."""
+    rows = shown[:, :-2] & shown[:, 1:-1] & shown[:, 2:]
+    return pad(rows[:-2] & rows[1:-1] & rows[2:], (1, 1, 1, 1))
+
+
 def rays_of(camera: Camera, like: Tensor) -> Tensor:
     """(3, H, W): the rays through the pixels, in the camera frame, with z = 1; of the dtype and on
     the device of ``like``.

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from snowsplat.data.depth_file import DEPTH_SUFFIXES
 from snowsplat.data.imports.lenses import Intrinsics, perspective
 from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot, is_photo
 from snowsplat.data.imports.values import (
@@ -27,6 +26,7 @@ from snowsplat.data.imports.values import (
     numbers,
     table,
 )
+from snowsplat.data.map_file import MAP_SUFFIXES
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
@@ -90,7 +90,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         lens = perspective(where, width, height, intrinsics)
         rotation = rotation_from_quat(torch.from_numpy(pose[[3, 0, 1, 2]])).numpy()
         cam = from_opengl(where, np.column_stack([rotation, pose[4:]]))
-        names = (path.parent / "depth" / f"{file.stem}{suffix}" for suffix in DEPTH_SUFFIXES)
+        names = (path.parent / "depth" / f"{file.stem}{suffix}" for suffix in MAP_SUFFIXES)
         depth = next((name for name in names if is_file(name)), None)
         compressed |= depth is None and is_file(file.with_suffix(".depth"))
         photo = file.relative_to(photos.root).as_posix()

@@ -66,12 +66,12 @@ def resampled(
 
 
 def nearest(values: np.ndarray, view: LensView, width: int, height: int) -> np.ndarray:
-    """(height, width) float32: a map (H, W) of a photo, such as its depth, seen by a view.
+    """(height, width, …) float32: a map (H, W, …) of a photo, such as its depth, seen by a view.
 
     Nearest values, because a mean of two surfaces is on neither. NaN where the photo shows nothing.
     """
     scale = np.array([values.shape[1] / view.lens.width, values.shape[0] / view.lens.height])
-    made = np.full((height, width), np.nan, np.float32)
+    made = np.full((height, width, *values.shape[2:]), np.nan, np.float32)
     for rows, position in view.strips(width, height):
         shown = view.covered(position) & np.isfinite(position).all(-1)
         column, row = np.floor(position[shown] * scale).astype(np.int64).T

@@ -27,7 +27,7 @@ _LENS_ERROR = 0.1
 def write_block_dataset(
     folder: Path, posed: Iterable[PosedImage], points: Points | None, origin: Origin
 ) -> None:
-    """Write a COLMAP model of some views and points, and link their photos, masks and depth maps.
+    """Write a COLMAP model of some views and points, and link their photos, masks and maps.
 
     The links are relative symbolic links; without the permission to create them, hard links; on
     another drive, copies. ``cp -rL`` or ``rsync -L`` copies the dataset to another computer.
@@ -66,6 +66,8 @@ def write_block_dataset(
         # A COLMAP dataset cannot state a unit; without points, the maps would be misunderstood.
         if image.depth is not None and (image.depth_unit == 1.0 or points is not None):
             _link(image.depth, folder / "depths" / f"{name}{image.depth.suffix}")
+        if image.normals is not None:
+            _link(image.normals, folder / "normals" / f"{name}{image.normals.suffix}")
     if worst > _LENS_ERROR:
         logger.warning(
             "%s: the lens distortion has terms that COLMAP's models do not have: an error of up to "

@@ -96,10 +96,10 @@ class DepthSupervision(Part):
             reason = f"; {unused} contradict the points or show too few of them" if unused else ""
             reason = f"; {damaged}" if damaged else reason
             run.note(f"depth maps: {len(self._maps)} of {len(views)} photos{reason}")
-        else:
+        elif not any(view.normals for view in views):
             run.note(
                 "depth maps: no photo has one, so depth_weight has no effect; add them as "
-                "depths/IMG.png for the photo IMG.jpg (PNG, TIFF, NPY or EXR)"
+                "depths/IMG.png for the photo IMG.jpg, or normals/IMG.png (PNG, TIFF, NPY or EXR)"
             )
 
     def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:

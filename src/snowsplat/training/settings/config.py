@@ -161,8 +161,9 @@ class TrainConfig(Settings):
     )
     depth_weight: float = setting(
         0.0,
-        "Weight of the depth maps of the dataset (depths/IMG.png) in the loss; 0: they are not "
-        "used. A map has any unit, and one that contradicts the points or the photos is left out.",
+        "Weight of the depth maps (depths/IMG.png) and normal maps (normals/IMG.png) of the "
+        "dataset in the loss; 0: they are not used. Depths have any unit, normals are in the frame "
+        "of the camera. A map that contradicts the points or the photos is left out.",
         "0",
         least=0.0,
         metavar="F",
@@ -378,6 +379,7 @@ def parts_of(config: TrainConfig) -> list[Part]:
     from snowsplat.training.parts.depth_supervision import DepthSupervision
     from snowsplat.training.parts.exposure import Exposure
     from snowsplat.training.parts.near_limit import NearLimit
+    from snowsplat.training.parts.normal_supervision import NormalSupervision
     from snowsplat.training.parts.pose_refinement import PoseRefinement
     from snowsplat.training.parts.scale_limit import ScaleLimit
     from snowsplat.training.parts.sky import SkyPart
@@ -392,6 +394,7 @@ def parts_of(config: TrainConfig) -> list[Part]:
         (config.refine_poses, PoseRefinement()),
         (config.transients != "off", Transients(config.transients)),
         (config.depth_weight > 0, DepthSupervision(config.depth_weight)),
+        (config.depth_weight > 0, NormalSupervision(config.depth_weight)),
         (config.near_limit > 0, NearLimit(config.near_limit)),
         (config.sky, SkyPart(config.sky_distance)),
         (True, Densification(late=config.transients == "on")),

@@ -16,7 +16,13 @@ from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
 from snowsplat.data.image_loader import Photos
 from snowsplat.data.lens.resample import nearest
 from snowsplat.scene.camera import Camera
-from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, map_size, photo_for_map
+from snowsplat.training.starts.depth_map import (
+    LONGER_SIDE,
+    DepthMap,
+    check_aspect,
+    map_size,
+    photo_for_map,
+)
 from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.photos import usable_pixels
@@ -27,8 +33,6 @@ logger = logging.getLogger(__name__)
 #: A map is used if the median error of its disparities is at most the first share of the disparity,
 #: or the second share of the error of a map of one depth.
 _SMALL_ERROR, _LARGEST_ERROR = 0.02, 0.5
-#: The largest difference between the aspect ratios of a map and its photo, relative.
-_ASPECT_TOLERANCE = 0.03
 _KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity")
 
 
@@ -92,14 +96,8 @@ def aligned_depth_map(
             values[confidence == 0] = np.nan
         if not (values > 0).any():  # too dark, or too far away for the sensor
             return None
-    height, width = values.shape
+    check_aspect(view.depth, values.shape, view)
     camera, part = view.camera, view.image.view
-    photo = camera if part is None else part.lens
-    if abs(width * photo.height / (height * photo.width) - 1.0) > _ASPECT_TOLERANCE:
-        raise UserError(
-            f"{view.depth}: has {width}x{height} pixels, but its photo has {photo.width}x"
-            f"{photo.height}; use a depth map of the whole photo"
-        )
     width, height = map_size(camera.width, camera.height, longer_side)
     camera = camera.scaled(width, height)
     if part is None:

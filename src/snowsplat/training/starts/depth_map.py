@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,9 +14,12 @@ from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo
+from snowsplat.util.errors import UserError
 
 #: Photos are reduced so that their longer side has at most this number of pixels.
 LONGER_SIDE = 640
+#: The largest difference between the aspect ratios of a map and its photo, relative.
+_ASPECT_TOLERANCE = 0.03
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,18 @@ def map_size(width: int, height: int, longer_side: int = LONGER_SIDE) -> tuple[i
     """Width and height of the depth map of a view of this size, in pixels."""
     scale = min(1.0, longer_side / max(width, height))
     return max(1, round(scale * width)), max(1, round(scale * height))
+
+
+def check_aspect(file: Path, shape: tuple[int, ...], view: View) -> None:
+    """Raises UserError: a map of this shape, (H, W, …), is not one of the whole photo of a view."""
+    part = view.image.view
+    photo = view.camera if part is None else part.lens
+    height, width = shape[:2]
+    if abs(width * photo.height / (height * photo.width) - 1.0) > _ASPECT_TOLERANCE:
+        raise UserError(
+            f"{file}: has {width}x{height} pixels, but its photo has {photo.width}x{photo.height}; "
+            "use a map of the whole photo"
+        )
 
 
 def photo_for_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> LoadedImage:

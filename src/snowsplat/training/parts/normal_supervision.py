@@ -1,0 +1,244 @@
+"""`NormalSupervision`: the surfaces of the scene have the normals that maps of the dataset state.
+
+Networks estimate the normals of a photo more exactly than its depth. With N the normal of the map
+in a pixel and N_d that of the rendered depth (`normals_of_depth`), the loss is the mean of
+
+    w · c · log(1 + a / c),  a = 1 − N · N_d,  c = 1 − cos 15°
+
+(Cauchy's robust loss of the angle): small angles count like their squares, and the pull of a large
+one falls, so a part of a map that is wrong is outvoted by the photos. The weight w is the cosine
+between N_d and the ray: the edges of the depth map look like steep surfaces.
+
+Programs disagree about the axes of normal maps: y up or down, z towards the scene or the camera.
+After a share of the steps, all maps are compared with the scene, which they have not influenced yet
+(`_FROM`). The signs of the axes are those that agree with most of it, for all maps together. A map
+that then fits the scene worse than a single direction would is not used.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from snowsplat import ops
+from snowsplat.data.dataset import View
+from snowsplat.data.image_loader import Photos
+from snowsplat.data.lens.resample import nearest
+from snowsplat.data.normal_file import read_normal_file
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.render import RenderOutput, project
+from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
+from snowsplat.training.parts.part import Part
+from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
+from snowsplat.training.starts.photos import usable_pixels
+from snowsplat.util.errors import UserError
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.batch import BatchView
+    from snowsplat.training.core.run import Run
+
+#: c: the value of a at which a pixel has half the pull of its square.
+_RESIDUAL = 1.0 - math.cos(math.radians(15.0))
+#: The loss relative to that of the depth maps, with the same ``weight``.
+_RELATIVE = 1.0
+#: The share of the steps after which the maps are compared with the scene, and then used.
+_FROM = 0.3
+#: A map contradicts the scene if its mean cosine to the surfaces is less than this share of that of
+#: their mean direction: a wall would be 45 degrees wrong.
+_LEAST_COSINE = 0.7
+#: They are compared at this fraction of their size: normals of a larger surface are more exact.
+_COARSE = 4
+#: A mean of normals is one of a surface if it is at least so long.
+_SAME = 0.7
+#: All maps together have at most this number of pixels, of three bytes.
+_MOST_PIXELS = 21_000_000
+
+
+class NormalSupervision(Part):
+    """The loss of the normal maps, ``weight`` times.
+
+    Attributes:
+        signs: (3,) int8: what turns x, y and z of the maps into x right, y down, z forward; 0: not
+            known yet.
+        used: (V,) bool on the CPU: the views whose map is used.
+    """
+
+    name = "normals"
+
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+
+    def prepare(self, run: Run) -> None:
+        """Read the maps. Those that are damaged are left out."""
+        views = run.dataset.train
+        given = sum(view.normals is not None for view in views)
+        side = min(LONGER_SIDE, int(math.sqrt(_MOST_PIXELS / max(given, 1))))
+        self._maps: dict[int, Tensor] = {}  # (3, h, w) int8, 127 times the normals; 0: unknown
+        damaged: UserError | None = None
+        for index, view in enumerate(views):
+            try:
+                found = normal_map(view, run.images, side)
+            except UserError as error:
+                damaged = damaged or error
+                continue
+            if found is not None and bool(found.any()):
+                self._maps[index] = (127.0 * found).round().to(run.device, torch.int8)
+        self.used = torch.tensor([index in self._maps for index in range(len(views))])
+        self.signs = torch.zeros(3, dtype=torch.int8)
+        self.with_depth = bool(self._maps)
+        self.idle = not self._maps
+        if given:
+            reason = f"; {damaged}" if damaged else ""
+            run.note(f"normal maps: {len(self._maps)} of {len(views)} photos{reason}")
+
+    def between(self, run: Run) -> None:
+        """Compare the maps with the scene, once."""
+        begun = run.step >= run.schedule.step_of(_FROM)
+        if self.idle or not begun or bool(self.signs.any()):
+            return
+        views = run.cameras.views()
+        pairs = {}
+        for index, stored in self._maps.items():
+            height, width = (max(3, side // _COARSE) for side in stored.shape[1:])
+            camera = views[index].camera.scaled(width, height).to(run.device)
+            splats = run.shards.everywhere(project(run.gaussians, camera, run.sh_degree))
+            _, alpha, depth = ops.rasterize(splats, width, height, with_depth=True)
+            assert depth is not None
+            surfaces, weight = surfaces_of(depth, alpha, camera)
+            own = torch.einsum("ji,jhw->ihw", _rotation(views[index]).to(surfaces), surfaces)
+            stated = interpolate(stored[None].to(own), (height, width), mode="area")[0] / 127.0
+            length = stated.square().sum(0).sqrt()
+            known = (weight > 0.0) & (length > _SAME)
+            pairs[index] = own[:, known], stated[:, known] / length[known]
+        agreement = torch.stack([(own * stated).sum(1) for own, stated in pairs.values()]).sum(0)
+        signs = torch.where(agreement < 0.0, -1.0, 1.0)
+        self.signs = signs.to("cpu", torch.int8)
+        wrong = [
+            index
+            for index, (own, stated) in pairs.items()
+            if contradicts(own, signs[:, None] * stated)
+        ]
+        if wrong:
+            self.used[wrong] = False
+            names = ", ".join(views[index].name for index in wrong[:5])
+            more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+            frame = "" if self.used.any() else "; normals must be in the frame of the camera"
+            run.note(f"normal maps that contradict the photos are not used: {names}{more}{frame}")
+
+    def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
+        """See the module. Each rendering has at most as many pixels as the map."""
+        if not self.used[view.index] or not bool(self.signs.any()):
+            return None
+        assert rendered.depth is not None
+        stored = self._maps[view.index]
+        turn = _rotation(view.view) * self.signs / 127.0
+        target = torch.einsum("ij,jhw->ihw", turn.to(rendered.depth), stored.to(rendered.depth))
+        size = [min(a, b) for a, b in zip(rendered.alpha.shape, stored.shape[1:], strict=True)]
+        if list(target.shape[1:]) != size:
+            target = interpolate(target[None], size, mode="nearest-exact")[0]
+        both = torch.stack([rendered.depth, rendered.alpha])
+        if list(both.shape[1:]) != size:  # the nearest pixels would make steps in a plane
+            both = interpolate(both[None], size, mode="bilinear")[0]
+        term = normal_term(both[0], both[1], target, view.camera.scaled(size[1], size[0]))
+        return self.weight * _RELATIVE * term
+
+    def state(self) -> dict[str, Tensor]:
+        """See `Part`."""
+        return {} if self.idle else {"signs": self.signs, "used": self.used}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """See `Part`."""
+        if not self.idle:
+            self.signs = tensors["signs"].cpu()
+            self.used = tensors["used"].cpu() & self.used
+
+
+def normal_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> Tensor | None:
+    """The normal map of a view, (3, h, w) float32 with the axes of the file, in the frame of its
+    photo; 0: unknown. None if there is none.
+
+    Args:
+        longer_side: the maximum size of the result, in pixels.
+
+    Raises:
+        UserError: the map is damaged, or not one of its photo.
+    """
+    if view.normals is None:
+        return None
+    values = read_normal_file(view.normals)
+    check_aspect(view.normals, values.shape, view)
+    width, height = map_size(view.camera.width, view.camera.height, longer_side)
+    part = view.image.view
+    if part is None:
+        whole = torch.from_numpy(values).permute(2, 0, 1).nan_to_num(nan=0.0)
+        found = interpolate(whole[None], (height, width), mode="area")[0]
+    else:
+        found = torch.from_numpy(nearest(values, part, width, height)).permute(2, 0, 1)
+    length = found.square().sum(0).sqrt()
+    known = length > _SAME
+    usable = usable_pixels(photo_for_map(view, images, longer_side))
+    if usable is not None:
+        known &= usable
+    return torch.where(known, found / length, 0.0)
+
+
+def normal_term(depth: Tensor, alpha: Tensor, target: Tensor, camera: Camera) -> Tensor:
+    """The mean loss () of a view, differentiable in ``depth`` and ``alpha``.
+
+    Args:
+        depth: (H, W) Σ T α z in world units.
+        alpha: (H, W) in 0..1.
+        target: (3, H, W) normals in the camera frame; 0: unknown.
+        camera: of this size.
+    """
+    surfaces, weight = surfaces_of(depth, alpha, camera)
+    weight = weight * target.any(0)
+    a = 1.0 - (surfaces * target).sum(0)
+    # Rounding can make `a` a little negative.
+    return _RESIDUAL * (weight * (a / _RESIDUAL).clamp_min(0.0).log1p()).sum() / a.numel()
+
+
+def surfaces_of(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The normals (3, H, W) of a rendered depth, and their weights (H, W), which are constant.
+
+    The weight is the cosine to the ray, 0 where the pixel or one around it shows no surface. The
+    arguments are those of `normal_term`.
+    """
+    shown = (alpha.detach() > 0.5) & (depth.detach() > 0.0)
+    surfaces = normals_of_depth(
+        torch.where(shown, depth, 1.0) / torch.where(shown, alpha, 1.0), camera
+    )
+    with torch.no_grad():
+        rays = rays_of(camera, depth)
+        cosine = -(surfaces * rays).sum(0) / rays.square().sum(0).sqrt()
+        weight = surrounded(shown) * cosine.clamp_min(0.0)
+    return surfaces, weight
+
+
+def contradicts(surfaces: Tensor, stated: Tensor) -> bool:
+    """Whether a map fits the surfaces worse than their mean direction does.
+
+    With errors of the rendered normals, both mean cosines fall by the same factor, so their ratio
+    tells whether the map is right. It is at least 1 for an exact map. For a map of something else,
+    it is at most the length of the mean of its normals.
+
+    Args:
+        surfaces: (3, P) unit normals that are rendered, of P pixels.
+        stated: (3, P) those of the map.
+    """
+    if not surfaces.shape[1]:
+        return False
+    cosine = (surfaces * stated).sum(0).mean()
+    return bool(cosine < _LEAST_COSINE * surfaces.mean(1).norm())
+
+
+def _rotation(view: View) -> Tensor:
+    """(3, 3) float64: from the frame of the photo to that of the view."""
+    part = view.image.view
+    if part is None or part.rotation is None:
+        return torch.eye(3, dtype=torch.float64)
+    return torch.tensor(part.rotation, dtype=torch.float64)

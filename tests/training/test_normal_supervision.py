@@ -1,0 +1,189 @@
+"""Normal maps in the loss: the term, the axes of a map, maps that are wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from snowsplat import Trainer, recipe
+from snowsplat.data.dataset import Dataset
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.render import render
+from snowsplat.training.parts.normal_supervision import (
+    NormalSupervision,
+    contradicts,
+    normal_term,
+    surfaces_of,
+)
+
+from .sphere import cameras, dataset, rays, z_of_sphere
+
+CONFIG = replace(
+    recipe("default", iterations=60, init="points", max_gaussians=600, transients="off", sky=False),
+    coarse_to_fine=(0.0, 0.0),
+    few_passes=0.0,
+    depth_weight=1.0,
+)
+SMALL = Camera(7, 6, 8.0, 9.0, 3.2, 2.9, torch.eye(4, dtype=torch.float64)[:3])
+
+
+def random_view() -> tuple[Tensor, Tensor, Tensor]:
+    """Depth and alpha (6, 7) of a rendering, and a map with unknown pixels, in float64."""
+    generator = torch.Generator().manual_seed(0)
+    alpha, z = torch.rand(2, 6, 7, generator=generator, dtype=torch.float64)
+    alpha, z = 0.6 + 0.4 * alpha, 3.0 + 0.2 * z
+    target = torch.randn(3, 6, 7, generator=generator, dtype=torch.float64)
+    target[2] = -target[2].abs()
+    target /= target.norm(dim=0)
+    target[:, 2, 3] = 0.0
+    return alpha * z, alpha, target
+
+
+def test_the_term_is_its_formula() -> None:
+    depth, alpha, target = random_view()
+    alpha[4, 5] = 0.3  # no surface: the pixels around it have no normal
+    z, ray = depth / alpha, rays(SMALL)
+    expected = 0.0
+    c = 1 - math.cos(math.radians(15))
+    for y in range(1, 5):
+        for x in range(1, 6):
+            if abs(y - 4) <= 1 and abs(x - 5) <= 1:
+                continue
+            points = ray * z[..., None]
+            normal = torch.linalg.cross(
+                points[y + 1, x] - points[y - 1, x], points[y, x + 1] - points[y, x - 1]
+            )
+            normal /= normal.norm()
+            weight = max(0.0, float(-(normal @ ray[y, x]) / ray[y, x].norm()))
+            if bool(target[:, y, x].any()):
+                a = 1 - normal @ target[:, y, x]
+                expected += weight * c * math.log(1 + float(a) / c)
+    found = float(normal_term(depth, alpha, target, SMALL))
+    assert found == pytest.approx(expected / 42, rel=1e-9)
+
+
+def test_the_gradient_is_that_of_a_fixed_weight() -> None:
+    depth, alpha, target = random_view()
+    _, weight = surfaces_of(depth, alpha, SMALL)
+    c = 1 - math.cos(math.radians(15))
+
+    def term(depth: Tensor, alpha: Tensor) -> Tensor:
+        surfaces, _ = surfaces_of(depth, alpha, SMALL)
+        a = 1 - (surfaces * target).sum(0)
+        return (weight * target.any(0) * c * (a / c).log1p()).mean()
+
+    leaves = [depth.requires_grad_(), alpha.requires_grad_()]
+    assert torch.autograd.gradcheck(term, leaves)
+    found = torch.autograd.grad(normal_term(*leaves, target, SMALL), leaves)
+    for one, other in zip(found, torch.autograd.grad(term(*leaves), leaves), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_pixels_without_rendering_or_map_have_no_gradient() -> None:
+    for value, target in ((0.0, torch.ones(3, 6, 7)), (1.0, torch.zeros(3, 6, 7))):
+        leaves = [torch.full((6, 7), value, requires_grad=True) for _ in range(2)]
+        grads = torch.autograd.grad(normal_term(*leaves, target, SMALL), leaves)
+        assert all(grad.isfinite().all() and not grad.any() for grad in grads)
+
+
+def test_a_map_contradicts_if_the_mean_direction_fits_better() -> None:
+    generator = torch.Generator().manual_seed(0)
+    true, noise, bumps = torch.randn(3, 3, 500, generator=generator)
+    true[2] = -true[2].abs()  # towards the camera
+    true = torch.nn.functional.normalize(true, dim=0)
+    noisy = torch.nn.functional.normalize(true + 0.3 * noise, dim=0)
+    assert not contradicts(noisy, true)
+    assert contradicts(noisy, true.flip(1))
+    wall = torch.tensor([[0.0], [0.0], [-1.0]]).expand(3, 500)
+    bumpy = torch.nn.functional.normalize(wall + 0.3 * bumps, dim=0)
+    assert not contradicts(bumpy, wall)  # as good as the mean direction
+    assert contradicts(bumpy, wall.roll(1, 0))
+    assert not contradicts(true[:, :0], true[:, :0])
+
+
+def with_normals(data: Dataset, signs: tuple[int, int, int]) -> Dataset:
+    """The maps of the sphere, with axes in other directions, in place of its depths."""
+    views = []
+    for view in data.train:
+        pose = view.camera.cam_from_world
+        cam = rays(view.camera) * z_of_sphere(view.camera)[..., None]
+        normals = cam - pose[:, 3]  # the centre of the unit sphere is the origin
+        path = view.image.path.with_name(f"normals{view.name}.npy")
+        np.save(path, (normals * torch.tensor(signs)).numpy())
+        views.append(replace(view, depth=None, normals=path))
+    return replace(data, train=views)
+
+
+def trained(data: Dataset, **settings) -> tuple[Trainer, list[str]]:
+    lines: list[str] = []
+    trainer = Trainer(data, replace(CONFIG, **settings), note=lines.append)
+    trainer.run()
+    return trainer, lines
+
+
+def angle(trainer: Trainer) -> float:
+    """The median angle between the rendered and the true normals in all views, degrees."""
+    angles = []
+    for camera in cameras():
+        shown = render(trainer.gaussians, camera, with_depth=True)
+        surfaces, weight = surfaces_of(shown.depth, shown.alpha, camera)
+        true = (rays(camera) * z_of_sphere(camera)[..., None] - camera.cam_from_world[:, 3]).float()
+        known = (weight > 0) & true.isfinite().all(2)
+        cosine = (surfaces.permute(1, 2, 0) * true).sum(2)[known]
+        angles.append(cosine.clamp(-1, 1).acos().rad2deg())
+    return float(torch.cat(angles).median())
+
+
+def test_the_axes_of_the_maps_are_found_and_the_normals_follow(tmp_path) -> None:
+    data = dataset(tmp_path)
+    without, lines = trained(with_normals(data, (1, 1, 1)), depth_weight=0.0)
+    for signs in ((1, 1, 1), (1, -1, -1)):
+        trainer, lines = trained(with_normals(data, signs))
+        part = trainer.part(NormalSupervision)
+        assert part.signs.tolist() == list(signs)
+        assert part.used.all()
+        assert lines == ["normal maps: 6 of 6 photos"]
+        assert angle(trainer) < 0.9 * angle(without)
+
+
+def test_maps_that_are_damaged_or_of_something_else_are_left_out(tmp_path) -> None:
+    data = with_normals(dataset(tmp_path), (1, 1, 1))
+    data.train[1].normals.write_bytes(b"no array")
+    np.save(data.train[2].normals, np.load(data.train[2].normals)[::-1, ::-1])
+    trainer, lines = trained(data, iterations=40)
+    assert trainer.part(NormalSupervision).used.tolist() == [True, False, False, True, True, True]
+    first, second = lines
+    assert "normal maps: 5 of 6 photos" in first
+    assert "cannot be read as a normal map" in first
+    assert second == "normal maps that contradict the photos are not used: 2"
+
+
+def test_without_maps_nothing_changes(tmp_path) -> None:
+    data = dataset(tmp_path)
+    data = replace(data, train=[replace(view, depth=None) for view in data.train])
+    one, _ = trained(data, iterations=8)
+    other, _ = trained(data, iterations=8, depth_weight=0.0)
+    part = one.part(NormalSupervision)
+    assert part.idle
+    assert part.state() == {}
+    assert torch.equal(one.gaussians.means, other.gaussians.means)
+
+
+def test_a_resumed_run_has_the_same_bits(tmp_path) -> None:
+    data, config = with_normals(dataset(tmp_path), (1, -1, -1)), replace(CONFIG, iterations=20)
+    whole = Trainer(data, config)
+    whole.run(until=12)
+    first = Trainer(data, config)
+    first.run(until=9)
+    state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
+    second = Trainer(data, config, state=state)
+    second.step = first.step
+    second.run(until=12)
+    assert second.part(NormalSupervision).signs.tolist() == [1, -1, -1]
+    for name, tensor in second.state_tensors().items():
+        assert torch.equal(tensor, whole.state_tensors()[name]), name
