@@ -217,12 +217,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const figures = make("dl.figures");
         const curve = make("div.curve");
         const strip = make("div.strip", { "aria-label": say("placed") });
-        const map = make("img.map", { alt: say("map"), hidden: true });
+        const map = make("img.map", { alt: say("map") });
         const mapBox = make("figure", { hidden: true }, map, make("figcaption", {}, say("map")));
         const notes = make("ul.notes");
         const stop = make("button.main", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
         const live = /** @type {HTMLIFrameElement} */ (make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true }));
         let listed = "";
+        let drawn = 0; // the map that is shown
         update = (/** @type {any} */ now) => {
             const state = now.state;
             showStages(stages, now);
@@ -232,12 +233,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 live.hidden = !now.has_page;
                 live.src = now.has_page ? `${address}/live/` : "about:blank";
             }
-            mapBox.hidden = map.hidden = !now.has_map;
-            if (now.has_map && !map.getAttribute("src")) map.setAttribute("src", `${address}/map`);
-            const key = (state.stages ?? []).map((/** @type {any} */ each) => each.stage).join();
+            mapBox.hidden = !now.map;
+            if (now.map && now.map !== drawn) map.setAttribute("src", `${address}/map?${(drawn = now.map)}`);
+            // The map is drawn anew when photos have been placed.
+            const key = [now.map, ...(state.stages ?? []).map((/** @type {any} */ each) => each.stage)].join();
             if (key !== listed) {
                 listed = key;
-                ask(`${address}/photos`).then(names => showPhotos(strip, address, names), () => (listed = ""));
+                ask(`${address}/photos`).then(photos => showPhotos(strip, address, photos), () => (listed = ""));
             }
         };
         return [
@@ -399,8 +401,12 @@ function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement}
     curve.replaceChildren(svg, make("figcaption", {}, say("loss")));
 }
 
-function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {string[]} */ names) {
-    strip.replaceChildren(...names.map((name, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+/** Pictures that are there already remain; those of photos without a pose are dim. */
+function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {{name: string, placed: boolean}[]} */ photos) {
+    const there = /** @type {HTMLImageElement[]} */ ([...strip.children]);
+    const same = there.length === photos.length && photos.every(({ name }, i) => there[i].alt === name);
+    if (!same) strip.replaceChildren(...photos.map(({ name }, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+    photos.forEach(({ placed }, i) => strip.children[i].classList.toggle("waits", !placed));
 }
 
 /** The film of the scene; `made`: its time, 0 if there is none. */
