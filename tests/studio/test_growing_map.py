@@ -24,7 +24,7 @@ def test_photos_are_placed_one_by_one(studio):
     assert studio.ask(f"{address}/photos")[1] == [{"name": "z.jpg", "placed": True}]
     recorder = worker._Recorder(scene)
     recorder.begin("poses")
-    cloud = np.random.default_rng(0).uniform(-1, 1, (50, 3)) + [0, 4, 0]
+    cloud = np.random.default_rng(0).uniform((-1, 3, -1), (1, 5, 1), (50, 3))
     drawn = set()
     for count in (2, 3):
         names = [f"walk/{letter}.jpg" for letter in "abc"[:count]]

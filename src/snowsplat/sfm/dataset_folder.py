@@ -192,7 +192,8 @@ def _run(
     def find_poses(report: Report) -> dict[str, Any]:
         if options.skip_matching:
             return asdict(describe_model(folder, photos))
-        return asdict(estimate_poses(folder, photos, options.sfm, report, left.figures, watcher.placed))
+        watchers = report, left.figures, watcher.placed
+        return asdict(estimate_poses(folder, photos, options.sfm, *watchers))
 
     settings = {k: v for k, v in asdict(options.sfm).items() if k not in ("threads", "seconds")}
     stage(

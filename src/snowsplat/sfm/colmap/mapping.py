@@ -248,9 +248,7 @@ class Mapping:
             self.report(model.num_reg_images(), len(graph.names), "registered photos")
             self.placed(model, False)
 
-        return IncrementalMapper(
-            self.database, graph, self._options(relaxed), registered, reduced
-        )
+        return IncrementalMapper(self.database, graph, self._options(relaxed), registered, reduced)
 
     def _first(self, graph: ViewGraph) -> set[int]:
         """The photos (image ids) that are registered with bundle adjustment."""

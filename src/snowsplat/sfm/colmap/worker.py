@@ -4,9 +4,9 @@
 
 The parent sends the job as one line of JSON to stdin. The child answers with lines of JSON on
 stdout: its progress, with its processor time and the number of features; the photos that have a
-pose so far; and at the end the result or a `UserError`. Stdin stays open as long as the parent runs; when it closes, the child ends
-immediately. The child ignores Ctrl-C, which the parent handles. The output of COLMAP goes to
-stderr, which the parent redirects to a log file.
+pose so far; and at the end the result or a `UserError`. Stdin stays open as long as the parent
+runs; when it closes, the child ends immediately. The child ignores Ctrl-C, which the parent
+handles. The output of COLMAP goes to stderr, which the parent redirects to a log file.
 """
 
 from __future__ import annotations
