@@ -91,7 +91,7 @@ class Watcher(Protocol):
         """Called with a line of information for the user."""
 
     def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
-        """Called about once a second while photos get their poses; see `progress.Placed`."""
+        """Called every two seconds while photos get their poses; see `progress.Placed`."""
 
 
 def make_dataset(

@@ -38,7 +38,7 @@ def ignored(cpu_seconds: float, features: float) -> None:
 
 
 class Placed(Protocol):
-    """Receives the photos that have a pose so far, and some points (P, 3), about once a second.
+    """Receives the photos that have a pose so far, and some points (P, 3), every two seconds.
 
     Scale and orientation are arbitrary, and another attempt begins anew.
     """

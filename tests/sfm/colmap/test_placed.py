@@ -47,7 +47,7 @@ def test_no_more_than_a_message_in_a_pause(monkeypatch):
     monkeypatch.setattr(placed.time, "monotonic", lambda: now[0])
     model, sent = synthetic(3), []
     send = Placements(sent.append)
-    for seconds, forced, total in ((0, False, 1), (0.9, False, 1), (0.05, True, 2), (1, False, 3)):
+    for seconds, forced, total in ((0, False, 1), (1.9, False, 1), (0.05, True, 2), (2, False, 3)):
         now[0] += seconds
         send(model, forced)
         assert len(sent) == total

@@ -63,7 +63,7 @@ def estimate_poses(
     more than 150 photos, the coordinate frame may differ, too.
 
     ``report`` is called at least twice per second, also if nothing has changed. ``figures``
-    is called as often as there is progress, ``placed`` about once a second while photos are placed.
+    is called as often as there is progress, ``placed`` every two seconds while photos are placed.
 
     Raises:
         UserError: fewer than 3 photos, an unknown camera model, no poses found (the message

@@ -16,15 +16,15 @@ from snowsplat.sfm.scene_map import PlacedPhoto
 if TYPE_CHECKING:
     import pycolmap
 
-_MAX_POINTS = 1500
-_PAUSE = 1.0  # seconds between two messages
+_MAX_POINTS = 1000
+_PAUSE = 2.0  # seconds between two messages
 # The pause is at least this multiple of the time that a message takes: with very many photos, the
-# messages still take less than 0.5% of the time.
+# messages take less than 0.5% of the time.
 _SHARE = 200.0
 
 
 class Placements:
-    """Makes messages of a model that grows, at most one in a second."""
+    """Makes messages of a model that grows, at most one in two seconds."""
 
     def __init__(self, send: Callable[[dict[str, Any]], None]) -> None:
         """``send`` is called with each message, a JSON value; see `read_placed`."""
