@@ -63,6 +63,7 @@ from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
+from snowsplat.util.html import CHINESE
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
@@ -123,7 +124,7 @@ class _Studio:
         self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
 
     def routes(self) -> list[BaseRoute]:
-        page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
+        page = [Route(f"/{name}", self._page) for name in ("", *_page_files(), CHINESE.name)]
         scene = [
             ("", "GET", self._scene),
             ("", "DELETE", self._remove),
@@ -171,7 +172,8 @@ class _Studio:
         return find
 
     async def _page(self, request: Request) -> Any:
-        return _File(_PAGES / (request.url.path.strip("/") or "index.html"))
+        name = request.url.path.strip("/") or "index.html"
+        return _File(CHINESE if name == CHINESE.name else _PAGES / name)
 
     async def _about(self, request: Request) -> Any:
         path = request.query_params.get("path", "")

@@ -1,7 +1,7 @@
 // The page of one scene: uploads, what the photos are, the progress of the job, and the result.
 
 import { action, ask, bytes, command, duration, make, notice, Refused } from "./page.js";
-import { say } from "./text.js";
+import { say, told } from "./text.js";
 import { chosen, dropped, Upload } from "./upload.js";
 
 const STAGES = ["photos", "poses", "images", "report", "scene", "pictures", "all", "page"];
@@ -228,7 +228,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             const state = now.state;
             showStages(stages, now);
             showFigures(figures, curve, state);
-            notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, line)));
+            notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, told(line))));
             if (live.hidden === now.has_page) {
                 live.hidden = !now.has_page;
                 live.src = now.has_page ? `${address}/live/` : "about:blank";
@@ -261,7 +261,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             make(
                 "section.card",
                 {},
-                make(scene.status === "failed" ? "p.bad" : "p", { role: "alert" }, why ?? ""),
+                make(scene.status === "failed" ? "p.bad" : "p", { role: "alert" }, told(why ?? "")),
                 make("button.main", { type: "button", click: action(start(wanted)) }, say("resume")),
                 stages,
                 make("details", {}, make("summary", {}, say("command")), command(scene.command)),
@@ -298,7 +298,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
             ),
             result.verdict.length > 0 &&
-                make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, line))),
+                make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, told(line)))),
             make("section.card", {}, make("h2", {}, say("download")), ...Object.entries(scene.exports).map(([kind, line]) => download(kind, String(line)))),
             film,
             phone,
@@ -360,12 +360,12 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {any} */ scene) {
             const past = done.get(name);
             const item = make("li", { "data-state": past ? "done" : name === current ? "now" : "later" }, make("b", {}, say(`stage_${name}`)));
             if (past) {
-                const result = name === "report" ? "" : `${past.lines[0]} `;
+                const result = name === "report" ? "" : `${told(past.lines[0])} `;
                 item.append(make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`));
             } else if (name === current) {
                 const training = name === "scene" && steps;
                 const [count, total, left] = training ? [steps.step, steps.iterations, steps.left] : [now.done, now.total, now.left];
-                const what = training ? say("step").toLowerCase() : (now.what ?? "");
+                const what = training ? say("step").toLowerCase() : told(now.what ?? "");
                 const time = left ? ` – ${say("left", duration(left))}` : "";
                 item.append(
                     make("span.soft", {}, total ? ` ${what} ${say("of", count.toLocaleString(), total.toLocaleString())}${time}` : ` ${what}${time}`),
