@@ -126,7 +126,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         return make(
             "section.card",
             {},
-            make("form.row", {}, name, make("button.plain", { type: "submit", click: action(rename) }, say("rename"))),
+            // The form that starts the job has the name, too.
+            scene.status === "done" && make("form.row", {}, name, make("button.plain", { type: "submit", click: action(rename) }, say("rename"))),
             make("p.soft", {}, say("kept_at", scene.folder)),
             !scene.found && make("div.row", {}, make("button.plain", { type: "button", click: action(remove) }, say("remove")), make("span.soft", {}, say("remove_help"))),
         );
@@ -212,7 +213,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     }
 
     /** The stages, the photos, the map and the figures of the training. */
-    function progressPart(/** @type {any} */ scene) {
+    function progressPart() {
         const stages = make("ol.stages");
         const figures = make("dl.figures");
         const curve = make("div.curve");
@@ -244,9 +245,11 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         };
         return [
             live,
-            make("section.card", {}, stages, make("div.row", {}, scene.status === "running" && stop, make("span.soft", {}, say("stop_help")))),
-            make("section.row.wide", {}, mapBox, make("div.training", {}, figures, curve)),
+            // The map is beside the stages, so that it is seen while it grows.
+            make("div.row.wide", {}, make("section.card", {}, stages, make("div.row", {}, stop, make("span.soft", {}, say("stop_help")))), mapBox),
             strip,
+            figures,
+            curve,
             notes,
         ];
     }
