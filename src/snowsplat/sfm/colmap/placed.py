@@ -44,7 +44,8 @@ class Placements:
 def _message(model: pycolmap.Reconstruction) -> dict[str, Any]:
     photos = []
     for number in model.reg_image_ids():
-        image, camera = model.image(number), model.image(number).camera
+        image = model.image(number)
+        camera = model.cameras[image.camera_id]
         pose = image.cam_from_world().matrix()
         # A panorama has no focal length.
         focal = camera.mean_focal_length() if camera.focal_length_idxs() else float(camera.width)
