@@ -99,7 +99,8 @@ def test_small_photos_of_a_dataset(studio):
     folder.mkdir(parents=True)
     Image.new("RGB", (2000, 1000), "red").save(folder / "a.jpg")
     (folder / "b.jpg").write_bytes(b"damaged")
-    assert studio.ask(f"scenes/{name}/photos") == (200, ["a.jpg", "b.jpg"])
+    listed = [{"name": photo, "placed": True} for photo in ("a.jpg", "b.jpg")]
+    assert studio.ask(f"scenes/{name}/photos") == (200, listed)
     small = Image.open(io.BytesIO(studio.ask(f"scenes/{name}/photos/0")[1]))
     assert small.size == (320, 160)
     assert studio.ask(f"scenes/{name}/photos/1")[0] == 400

@@ -1,7 +1,9 @@
-"""`cameras_from_above`: a drawing of what a training run begins with."""
+"""Drawings from above of cameras whose frame may have any up direction: `draw_level`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import torch
 from snowsplat.data.points_ply import read_points
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.camera_json import read_cameras
-from snowsplat.scene.geometry import Similarity, shortest_rotation
+from snowsplat.scene.geometry import shortest_rotation
 from snowsplat.scene.orientation import scene_up
 from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
 
@@ -26,15 +28,11 @@ def cameras_from_above(output: Path | str) -> str:
     """
     folder = OutputFolder(Path(output))
     names, cameras = read_cameras(folder.path / "cameras.json")
-    up = scene_up(np.array([camera.cam_from_world[:, :3].numpy() for camera in cameras]))
-    above = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)  # of the drawing
-    turn = shortest_rotation(torch.from_numpy(up), above)
-    level = Similarity(1.0, turn, torch.zeros(3, dtype=torch.float64))
     photos = [
         PlacedPhoto(
             name,
             None,
-            camera.transformed(level).cam_from_world.numpy(),
+            camera.cam_from_world.numpy(),
             camera.width / 2 / camera.fx,
             camera.height / 2 / camera.fy,
         )
@@ -42,6 +40,27 @@ def cameras_from_above(output: Path | str) -> str:
     ]
     points = folder.path / "input.ply"
     if not points.is_file():
-        return draw_scene(photos, np.empty((0, 3)), np.empty((0, 3), np.uint8))[0].svg
-    xyz, rgb = read_points(points)
-    return draw_scene(photos, xyz.astype(np.float64) @ turn.numpy().T, rgb)[0].svg
+        return draw_level(photos, np.empty((0, 3)))
+    return draw_level(photos, *read_points(points))
+
+
+def draw_level(
+    photos: Sequence[PlacedPhoto], xyz: np.ndarray, rgb: np.ndarray | None = None
+) -> str:
+    """An SVG drawing from above, where up is the up direction of the cameras.
+
+    Args:
+        photos: at least one; their frame may be any.
+        xyz: (P, 3) points.
+        rgb: (P, 3) uint8, their colours; None: grey.
+    """
+    up = scene_up(np.array([photo.cam_from_world[:, :3] for photo in photos]))
+    above = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)  # of the drawing
+    back = shortest_rotation(torch.from_numpy(up), above).numpy().T
+    level = []
+    for photo in photos:
+        pose = photo.cam_from_world
+        turned = np.column_stack([pose[:, :3] @ back, pose[:, 3]])
+        level.append(replace(photo, cam_from_world=turned))
+    colours = np.full(xyz.shape, 128, np.uint8) if rgb is None else rgb
+    return draw_scene(level, xyz.astype(np.float64) @ back, colours)[0].svg

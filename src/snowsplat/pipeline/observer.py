@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 from snowsplat.sfm.progress import Report, silent
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from snowsplat.pipeline.run.train_result import TrainResult
+    from snowsplat.sfm.scene_map import PlacedPhoto
     from snowsplat.training.core.progress import Progress
     from snowsplat.util.stages import Outcome
 
@@ -43,6 +46,9 @@ class Observer:
 
     def end(self, stage: str, outcome: Outcome) -> None:
         """The stage has finished, now or in an earlier run."""
+
+    def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+        """Photos have a pose; see `snowsplat.sfm.progress.Placed`."""
 
     def leave(self) -> None:
         """The stage that began last is over; there is nothing to tell about it."""
@@ -104,7 +110,10 @@ def _passed_on(name: str) -> Callable[..., None]:
     return call
 
 
-for _name in ("note", "end", "leave", "steps_begin", "step", "steps_end", "trained", "page_opened"):
+for _name in (
+    *("note", "end", "placed", "leave", "page_opened"),
+    *("steps_begin", "step", "steps_end", "trained"),
+):
     setattr(Observers, _name, _passed_on(_name))
 
 #: An observer that does nothing.

@@ -26,6 +26,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from snowsplat.data.placement import PLACEMENT
 from snowsplat.sfm.capture_verdict import capture_verdict
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
@@ -39,6 +41,7 @@ from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
 from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.progress import Report
+from snowsplat.sfm.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
@@ -86,6 +89,9 @@ class Watcher(Protocol):
 
     def note(self, line: str) -> None:
         """Called with a line of information for the user."""
+
+    def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+        """Called every two seconds while photos get their poses; see `progress.Placed`."""
 
 
 def make_dataset(
@@ -186,7 +192,8 @@ def _run(
     def find_poses(report: Report) -> dict[str, Any]:
         if options.skip_matching:
             return asdict(describe_model(folder, photos))
-        return asdict(estimate_poses(folder, photos, options.sfm, report, left.figures))
+        watchers = report, left.figures, watcher.placed
+        return asdict(estimate_poses(folder, photos, options.sfm, *watchers))
 
     settings = {k: v for k, v in asdict(options.sfm).items() if k not in ("threads", "seconds")}
     stage(

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from snowsplat.sfm.scene_map import PlacedPhoto
 
 
 class Report(Protocol):
@@ -30,3 +35,16 @@ Figures = Callable[[float, float], None]
 
 def ignored(cpu_seconds: float, features: float) -> None:
     """A `Figures` that does nothing."""
+
+
+class Placed(Protocol):
+    """Receives the photos that have a pose so far, and some points (P, 3), every two seconds.
+
+    Scale and orientation are arbitrary, and another attempt begins anew.
+    """
+
+    def __call__(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None: ...
+
+
+def unseen(photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+    """A `Placed` that does nothing."""

@@ -10,7 +10,7 @@
     GET  /scenes/NAME/uploads         what has arrived; PUT adds a part
     POST /scenes/NAME/survey          what the photos are, and how long it takes
     POST /scenes/NAME/start, /stop    its job
-    GET  /scenes/NAME/photos          names of its photos; /photos/N is a small one
+    GET  /scenes/NAME/photos          its photos, and which have a pose; /photos/N is a small one
     GET  /scenes/NAME/map             the cameras and points from above
     POST /scenes/NAME/exports/KIND    writes a file; GET sends it
     GET  /scenes/NAME/film            its film; POST renders one, DELETE stops that
@@ -64,6 +64,7 @@ from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
+from snowsplat.util.html import CHINESE
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
@@ -124,7 +125,7 @@ class _Studio:
         self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
 
     def routes(self) -> list[BaseRoute]:
-        page = [Route(f"/{name}", self._page) for name in ("", *_page_files())]
+        page = [Route(f"/{name}", self._page) for name in ("", *_page_files(), CHINESE.name)]
         scene = [
             ("", "GET", self._scene),
             ("", "DELETE", self._remove),
@@ -174,7 +175,8 @@ class _Studio:
         return find
 
     async def _page(self, request: Request) -> Any:
-        return _File(_PAGES / (request.url.path.strip("/") or "index.html"))
+        name = request.url.path.strip("/") or "index.html"
+        return _File(CHINESE if name == CHINESE.name else _PAGES / name)
 
     async def _about(self, request: Request) -> Any:
         path = request.query_params.get("path", "")
@@ -205,6 +207,7 @@ class _Studio:
     async def _scene(self, request: Request, scene: Scene) -> Any:
         state, made = scene.state(), scene.job
         has_page = state.pop("page", None) is not None  # its address is a secret of the job
+        state.pop("placed", None)  # `_photos` tells it
         return {
             "name": scene.name,
             "title": made.title,
@@ -218,7 +221,7 @@ class _Studio:
             "has_page": has_page,
             "edited": _edited(scene),
             "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
-            "has_map": scene.map.is_file(),
+            "map": scene.map.stat().st_mtime if is_file(scene.map) else 0,
             "command": make_command(scene, made),
             "exports": {kind: export_command(scene, kind) for kind in FORMATS},
         }
@@ -302,7 +305,7 @@ class _Studio:
         return {}
 
     async def _photos(self, request: Request, scene: Scene) -> Any:
-        return [path.name for path in await asyncio.to_thread(_shown_photos, scene)]
+        return await asyncio.to_thread(_photo_list, scene)
 
     async def _photo(self, request: Request, scene: Scene) -> Any:
         shown = await asyncio.to_thread(_shown_photos, scene)
@@ -570,10 +573,21 @@ def _is_folder(path: Path) -> bool:
         return False
 
 
+def _photo_list(scene: Scene) -> list[dict[str, Any]]:
+    """The names of the photos that are shown, and whether they have a pose so far."""
+    shown, placed = _shown_photos(scene), scene.state().get("placed")
+    if placed is None:
+        return [{"name": path.name, "placed": True} for path in shown]
+    names, folder = set(placed), scene.made / DATASET / "input"
+    inside = ((path.name, path.relative_to(folder).as_posix()) for path in shown)
+    return [{"name": name, "placed": path in names} for name, path in inside]
+
+
 def _shown_photos(scene: Scene) -> list[Path]:
     """The photos of the dataset: those with a pose as soon as they are known, before that all."""
     dataset = scene.made / DATASET
-    for name in ("images", "input"):
+    # While poses are estimated, the images of an earlier job may still be there.
+    for name in ("input",) if "placed" in scene.state() else ("images", "input"):
         folder = dataset / name
         if folder.is_dir():
             found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)

@@ -21,13 +21,15 @@ import os
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from snowsplat.pipeline.cameras_from_above import cameras_from_above
+import numpy as np
+
+from snowsplat.pipeline.cameras_from_above import cameras_from_above, draw_level
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
@@ -47,6 +49,7 @@ from snowsplat.sfm.cost import Step, measure_speed, steps_of
 from snowsplat.sfm.dataset_report import REPORT, draw_from_above
 from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import Report
+from snowsplat.sfm.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.studio.hand_on import export_file
 from snowsplat.studio.library import TASKS, Scene, safe_title
@@ -107,7 +110,14 @@ class _Recorder(Observer):
         )
         if stage == "images":
             self._draw_map(lambda made: draw_from_above(made / DATASET))
+        if stage == "poses":
+            self.state.pop("placed", None)
         self.leave()
+
+    def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+        self.state["placed"] = [photo.name for photo in photos]
+        self._draw_map(lambda made: draw_level(photos, points))
+        self.write()
 
     def leave(self) -> None:
         self.state.pop("now", None)
@@ -152,7 +162,7 @@ def run_job(scene: Scene, task: str) -> int:
     """Do one of the `TASKS`, or resume it, under its lock; returns the exit code."""
     recorder = _Recorder(scene, task)
     code, outcome = _outcome(scene, task, recorder)
-    for name in ("now", "page"):
+    for name in ("now", "page", "placed"):
         recorder.state.pop(name, None)
     recorder.state |= outcome
     recorder.write()

@@ -16,6 +16,9 @@ from PIL import Image
 
 from snowsplat.util.safe_json import printable
 
+#: The script with which pages tell in Chinese what the program says in English.
+CHINESE = Path(__file__).with_name("chinese.js")
+
 _STYLE = """
 :root { color-scheme: light dark; --bg: #fbfaf7; --card: #fff; --ink: #20252c; --soft: #667080;
   --line: #e3e0d8; --accent: #b8650a; --bad: #b3261e; }
@@ -97,7 +100,8 @@ def page(title: str, html: Iterable[str], style: str = "") -> str:
         style: additional CSS.
     """
     body = "\n".join(filter(None, html))
-    chinese = Path(__file__).with_name("chinese.js").read_text(encoding="utf-8")
+    scripts = (CHINESE, CHINESE.with_name("chinese_report.js"))
+    chinese = "".join(script.read_text(encoding="utf-8") for script in scripts)
     script = (_LARGE if "<img " in body else "") + chinese
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
+from snowsplat.sfm.colmap.placed import read_placed
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.progress import Figures, Report, ignored
+from snowsplat.sfm.progress import Figures, Placed, Report, ignored, unseen
 from snowsplat.util.errors import SettingError, UserError
 
 # Bytes by which the database may grow in one transaction.
@@ -50,6 +51,7 @@ def estimate_poses(
     options: SfmOptions,
     report: Report,
     figures: Figures = ignored,
+    placed: Placed = unseen,
 ) -> SfmResult:
     """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
 
@@ -61,7 +63,7 @@ def estimate_poses(
     more than 150 photos, the coordinate frame may differ, too.
 
     ``report`` is called at least twice per second, also if nothing has changed. ``figures``
-    is called as often as there is progress.
+    is called as often as there is progress, ``placed`` every two seconds while photos are placed.
 
     Raises:
         UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
@@ -88,12 +90,12 @@ def estimate_poses(
     }
     threads = thread_count(options.threads)
     try:
-        return _run({**job, "reduced": False}, log, threads, report, figures)
+        return _run({**job, "reduced": False}, log, threads, report, figures, placed)
     except Crashed as crash:
         first = crash
         _check_disk(distorted)
     try:
-        result = _run({**job, "reduced": True}, log, 1, report, figures)
+        result = _run({**job, "reduced": True}, log, 1, report, figures, placed)
     except Crashed as crash:
         _check_disk(distorted)
         advice = "report it"
@@ -125,7 +127,7 @@ def _last_line(log: Path) -> str:
 
 
 def _run(
-    job: dict[str, Any], log: Path, threads: int, report: Report, figures: Figures
+    job: dict[str, Any], log: Path, threads: int, report: Report, figures: Figures, placed: Placed
 ) -> SfmResult:
     with (
         open(log, "ab") as log_file,
@@ -140,7 +142,7 @@ def _run(
         ) as child,
     ):
         try:
-            answer = _communicate(child, job, report, figures)
+            answer = _communicate(child, job, report, figures, placed)
             code = child.wait()
         finally:
             child.kill()
@@ -152,7 +154,11 @@ def _run(
 
 
 def _communicate(
-    child: subprocess.Popen[str], job: dict[str, Any], report: Report, figures: Figures
+    child: subprocess.Popen[str],
+    job: dict[str, Any],
+    report: Report,
+    figures: Figures,
+    placed: Placed,
 ) -> dict[str, Any]:
     """Send the job, report progress until the child ends, and return its last line.
 
@@ -185,7 +191,11 @@ def _communicate(
         # If the child has ended, the last line may be incomplete.
         if line is None or not line.endswith("\n"):
             break
-        answer = json.loads(line)
+        message = json.loads(line)
+        if "placed" in message:
+            placed(*read_placed(message["placed"]))
+            continue
+        answer = message
         if "progress" in answer:
             figures(answer["cpu"], answer["features"])
             report(*answer["progress"])

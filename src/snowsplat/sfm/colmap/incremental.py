@@ -39,14 +39,14 @@ ImagePair = tuple[int, int]
 class IncrementalMapper:
     """Makes models from the features and verified matches in a database.
 
-    ``registered`` is called with the number of registered photos of the model. ``reduced`` is a
-    copy of the database with a part of the matches; photos are registered with these.
+    ``registered`` is called with the model after each photo. ``reduced`` is a copy of the database
+    with a part of the matches; photos are registered with these.
     """
 
     database: Path
     graph: ViewGraph
     options: pycolmap.IncrementalPipelineOptions
-    registered: Callable[[int], None]
+    registered: Callable[[pycolmap.Reconstruction], None]
     reduced: Path | None = None
     _tried: set[ImagePair] = field(default_factory=set)  # initial pairs
 
@@ -153,7 +153,7 @@ class _Growth:
     graph: ViewGraph
     options: pycolmap.IncrementalPipelineOptions
     adjust: bool  # run bundle adjustment
-    registered: Callable[[int], None]
+    registered: Callable[[pycolmap.Reconstruction], None]
 
     def __post_init__(self) -> None:
         self._mapper_options = self.options.get_mapper()
@@ -163,7 +163,7 @@ class _Growth:
     def register_all(self) -> None:
         while True:
             if self._register_next():
-                self.registered(self.model.num_reg_images())
+                self.registered(self.model)
                 if self.adjust and self._has_grown():
                     self._adjust_all()
             elif self.adjust and self._sizes() != self._size:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,6 +81,7 @@ class Mapping:
     # The photos may have been taken while walking forward. Then the points ahead have small angles,
     # and few of them are in several photos.
     forward: bool = False
+    placed: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
 
     def run(
         self, mapper: Mapper | Literal["plain"], relaxed: bool = False
@@ -244,14 +245,11 @@ class Mapping:
     def _mapper(
         self, graph: ViewGraph, relaxed: bool, reduced: Path | None = None
     ) -> IncrementalMapper:
-        total = len(graph.names)
-        return IncrementalMapper(
-            self.database,
-            graph,
-            self._options(relaxed),
-            lambda registered: self.report(registered, total, "registered photos"),
-            reduced,
-        )
+        def registered(model: pycolmap.Reconstruction) -> None:
+            self.report(model.num_reg_images(), len(graph.names), "registered photos")
+            self.placed(model, False)
+
+        return IncrementalMapper(self.database, graph, self._options(relaxed), registered, reduced)
 
     def _first(self, graph: ViewGraph) -> set[int]:
         """The photos (image ids) that are registered with bundle adjustment."""

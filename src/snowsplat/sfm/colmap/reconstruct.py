@@ -171,6 +171,7 @@ class PoseEstimation:
         if not best.models:
             remove_database(second)
             raise failure(evidence, next((a.doubts for a in self.attempts if a.doubts), []))
+        self.progress.placed(best.models[0], True)
         for model in best.models:
             best.mapping.align_features(model, best.matched.effort.image_size)
             best.mapping.add_points(model)
@@ -459,6 +460,7 @@ class PoseEstimation:
             self.progress.report,
             held=lens.held,
             forward=lens.held,
+            placed=self.progress.placed,
         )
 
     @staticmethod

@@ -3,10 +3,10 @@
     python -m snowsplat.sfm.colmap.worker
 
 The parent sends the job as one line of JSON to stdin. The child answers with lines of JSON on
-stdout: its progress, with its processor time and the number of features; and at the end the result
-or a `UserError`. Stdin stays open as long as the parent runs; when it closes, the child ends
-immediately. The child ignores Ctrl-C, which the parent handles. The output of COLMAP goes to
-stderr, which the parent redirects to a log file.
+stdout: its progress, with its processor time and the number of features; the photos that have a
+pose so far; and at the end the result or a `UserError`. Stdin stays open as long as the parent
+runs; when it closes, the child ends immediately. The child ignores Ctrl-C, which the parent
+handles. The output of COLMAP goes to stderr, which the parent redirects to a log file.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import pycolmap
 
 from snowsplat.sfm.colmap.features import SEED, Folders, WorkerProgress
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions, SfmResult, thread_count
+from snowsplat.sfm.colmap.placed import Placements
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
@@ -56,7 +57,9 @@ def main() -> None:
 
     try:
         progress = WorkerProgress(
-            report=report, features=lambda mean: figures.update(features=mean)
+            report=report,
+            features=lambda mean: figures.update(features=mean),
+            placed=Placements(lambda message: send(placed=message)),
         )
         send(result=asdict(_run(job, progress)))
     except UserError as error:

@@ -1,7 +1,7 @@
 // The page of one scene: uploads, what the photos are, the progress of the job, and the result.
 
 import { action, ask, bytes, command, duration, make, notice, Refused } from "./page.js";
-import { say } from "./text.js";
+import { say, told } from "./text.js";
 import { chosen, dropped, Upload } from "./upload.js";
 
 const STAGES = ["photos", "poses", "images", "report", "scene", "pictures", "all", "page"];
@@ -126,7 +126,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         return make(
             "section.card",
             {},
-            make("form.row", {}, name, make("button.plain", { type: "submit", click: action(rename) }, say("rename"))),
+            // The form that starts the job has the name, too.
+            scene.status === "done" && make("form.row", {}, name, make("button.plain", { type: "submit", click: action(rename) }, say("rename"))),
             make("p.soft", {}, say("kept_at", scene.folder)),
             !scene.found && make("div.row", {}, make("button.plain", { type: "button", click: action(remove) }, say("remove")), make("span.soft", {}, say("remove_help"))),
         );
@@ -212,39 +213,43 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     }
 
     /** The stages, the photos, the map and the figures of the training. */
-    function progressPart(/** @type {any} */ scene) {
+    function progressPart() {
         const stages = make("ol.stages");
         const figures = make("dl.figures");
         const curve = make("div.curve");
         const strip = make("div.strip", { "aria-label": say("placed") });
-        const map = make("img.map", { alt: say("map"), hidden: true });
+        const map = make("img.map", { alt: say("map") });
         const mapBox = make("figure", { hidden: true }, map, make("figcaption", {}, say("map")));
         const notes = make("ul.notes");
         const stop = make("button.main", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
         const live = /** @type {HTMLIFrameElement} */ (make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true }));
         let listed = "";
+        let drawn = 0; // the map that is shown
         update = (/** @type {any} */ now) => {
             const state = now.state;
             showStages(stages, now);
             showFigures(figures, curve, state);
-            notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, line)));
+            notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, told(line))));
             if (live.hidden === now.has_page) {
                 live.hidden = !now.has_page;
                 live.src = now.has_page ? `${address}/live/` : "about:blank";
             }
-            mapBox.hidden = map.hidden = !now.has_map;
-            if (now.has_map && !map.getAttribute("src")) map.setAttribute("src", `${address}/map`);
-            const key = (state.stages ?? []).map((/** @type {any} */ each) => each.stage).join();
+            mapBox.hidden = !now.map;
+            if (now.map && now.map !== drawn) map.setAttribute("src", `${address}/map?${(drawn = now.map)}`);
+            // The map is drawn anew when photos have been placed.
+            const key = [now.map, ...(state.stages ?? []).map((/** @type {any} */ each) => each.stage)].join();
             if (key !== listed) {
                 listed = key;
-                ask(`${address}/photos`).then(names => showPhotos(strip, address, names), () => (listed = ""));
+                ask(`${address}/photos`).then(photos => showPhotos(strip, address, photos), () => (listed = ""));
             }
         };
         return [
             live,
-            make("section.card", {}, stages, make("div.row", {}, scene.status === "running" && stop, make("span.soft", {}, say("stop_help")))),
-            make("section.row.wide", {}, mapBox, make("div.training", {}, figures, curve)),
+            // The map is beside the stages, so that it is seen while it grows.
+            make("div.row.wide", {}, make("section.card", {}, stages, make("div.row", {}, stop, make("span.soft", {}, say("stop_help")))), mapBox),
             strip,
+            figures,
+            curve,
             notes,
         ];
     }
@@ -259,7 +264,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             make(
                 "section.card",
                 {},
-                make(scene.status === "failed" ? "p.bad" : "p", { role: "alert" }, why ?? ""),
+                make(scene.status === "failed" ? "p.bad" : "p", { role: "alert" }, told(why ?? "")),
                 make("button.main", { type: "button", click: action(start(wanted)) }, say("resume")),
                 stages,
                 make("details", {}, make("summary", {}, say("command")), command(scene.command)),
@@ -296,7 +301,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
             ),
             result.verdict.length > 0 &&
-                make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, line))),
+                make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, told(line)))),
             make("section.card", {}, make("h2", {}, say("download")), ...Object.entries(scene.exports).map(([kind, line]) => download(kind, String(line)))),
             film,
             phone,
@@ -358,12 +363,12 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {any} */ scene) {
             const past = done.get(name);
             const item = make("li", { "data-state": past ? "done" : name === current ? "now" : "later" }, make("b", {}, say(`stage_${name}`)));
             if (past) {
-                const result = name === "report" ? "" : `${past.lines[0]} `;
+                const result = name === "report" ? "" : `${told(past.lines[0])} `;
                 item.append(make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`));
             } else if (name === current) {
                 const training = name === "scene" && steps;
                 const [count, total, left] = training ? [steps.step, steps.iterations, steps.left] : [now.done, now.total, now.left];
-                const what = training ? say("step").toLowerCase() : (now.what ?? "");
+                const what = training ? say("step").toLowerCase() : told(now.what ?? "");
                 const time = left ? ` – ${say("left", duration(left))}` : "";
                 item.append(
                     make("span.soft", {}, total ? ` ${what} ${say("of", count.toLocaleString(), total.toLocaleString())}${time}` : ` ${what}${time}`),
@@ -399,8 +404,12 @@ function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement}
     curve.replaceChildren(svg, make("figcaption", {}, say("loss")));
 }
 
-function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {string[]} */ names) {
-    strip.replaceChildren(...names.map((name, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+/** Pictures that are there already remain; those of photos without a pose are dim. */
+function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {{name: string, placed: boolean}[]} */ photos) {
+    const there = /** @type {HTMLImageElement[]} */ ([...strip.children]);
+    const same = there.length === photos.length && photos.every(({ name }, i) => there[i].alt === name);
+    if (!same) strip.replaceChildren(...photos.map(({ name }, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+    photos.forEach(({ placed }, i) => strip.children[i].classList.toggle("waits", !placed));
 }
 
 /** The film of the scene; `made`: its time, 0 if there is none. */

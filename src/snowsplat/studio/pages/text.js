@@ -193,6 +193,13 @@ export function speak(language) {
 }
 
 /**
+ * A line that the program tells, which is English, in the chosen language; some lines remain English.
+ * @param {string} line
+ * @returns {string}
+ */
+export const told = line => (column ? /** @type {any} */ (globalThis).snowsplatChinese(line) : line);
+
+/**
  * A text in the chosen language; {0}, {1} are replaced.
  * @param {string} key
  * @param {...(string | number)} values
