@@ -15,9 +15,11 @@ from torch import Tensor
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
+from snowsplat.pipeline.confirmed_depth import confirmed_by_photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
+from snowsplat.surface import depth as surface_depth
 from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts import swept_points
 from snowsplat.training.starts.depth_map import DepthMap
@@ -133,6 +135,27 @@ def test_depth_maps_of_a_plane(dataset: Dataset) -> None:
         error = depth_map.inverse_depth / true_inverse_depth(depth_map.camera) - 1.0
         assert float(error[known].abs().median()) < 0.005
         assert float((error[known].abs() < 0.03).float().mean()) > 0.9
+
+
+def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
+    """Depths that are 4% too small, with a hole and a part without a surface."""
+    maps, weight = [], torch.full((HEIGHT, WIDTH), 255, dtype=torch.uint8)
+    for camera in CAMERAS:
+        depth = (0.96 / true_inverse_depth(camera)).to(torch.float32)
+        depth[:10], depth[-10:] = 0.0, math.inf
+        maps.append(surface_depth.DepthMap(camera, depth, weight))
+    found = confirmed_by_photos(dataset.train, maps, 100.0, lambda *_: None)
+    for each, camera in zip(found, CAMERAS, strict=True):
+        error = (each.depth * true_inverse_depth(camera) - 1.0).abs()
+        confirmed = each.weight == 255
+        assert float(confirmed[10:-10].float().mean()) > 0.5
+        assert float(error[10:-10][confirmed[10:-10]].median()) < 0.005
+        assert (each.weight[:-10][~confirmed[:-10]] == 64).all()
+        assert each.depth[-10:].isinf().all()
+        assert (each.weight[-10:] == 255).all()
+        assert float((each.depth[:10] > 0).float().mean()) > 0.2
+    far = confirmed_by_photos(dataset.train, maps, 1.0, lambda *_: None)
+    assert all(torch.equal(a.depth, b.depth) for a, b in zip(far, maps, strict=True))
 
 
 def test_views_without_sources_or_points_have_no_map(dataset: Dataset) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
+from snowsplat.pipeline.confirmed_depth import confirmed_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
@@ -102,14 +103,16 @@ def write_mesh(
 ) -> Surface:
     """Write the surfaces of a scene as triangles with the colours of the photos.
 
-    The depth of each training photo is rendered and fused into a signed distance field.
+    The depth of each training photo is rendered, corrected where other photos confirm another depth
+    (see `pipeline.confirmed_depth`), and fused into a signed distance field.
 
     Args:
         load: loads the scene with its dataset, as `load_trained`; called after the other
             arguments have been checked.
         target: .ply, .glb or .obj; its folder is created if it does not exist.
         overwrite: replace ``target``.
-        observer: gets the stages "reading", "depth", "fusion", "triangles" and "colours".
+        observer: gets the stages "reading", "depth", "stereo", "fusion", "triangles" and
+            "colours".
 
     Raises:
         UserError: ``target`` exists or has another suffix; a photo is damaged; there is no surface,
@@ -174,6 +177,8 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
     with single_threaded():
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
+        with observer.waiting("stereo") as report:
+            maps = confirmed_by_photos(views, maps, far, report)
         with observer.waiting("fusion") as report:
             voxel, keys, closer = _voxel(maps, options)
             if not len(keys):

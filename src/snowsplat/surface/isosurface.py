@@ -20,8 +20,8 @@ _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # (8, 3): z, y, 
 _EDGES = np.array(
     [(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
 )
-#: Smallest sum of weights of a voxel: about that of one view from the front.
-_LEAST_WEIGHT = 0.5
+#: Smallest sum of weights of a voxel: that of one view from the front that no other one confirms.
+_LEAST_WEIGHT = 0.25
 
 
 def zero_level(

@@ -1,0 +1,121 @@
+"""`confirmed_by_photos`: the depth maps of a scene, corrected where photos confirm another depth.
+
+A training makes images like the photos, and many arrangements of Gaussians do. On a wall with
+little texture, they are in front of the wall, because those in front hide those behind. A plane
+sweep compares the photos themselves: each pixel gets the depth at which a window of one photo
+correlates best with others. Where the map of another photo has the same depth, this depth is
+more exact than that of the Gaussians, even where the two agree. Elsewhere, for example
+on a wall of one colour, the depth of the Gaussians remains, and has less weight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from snowsplat.data import ImageLoader, View
+from snowsplat.surface.depth import DepthMap
+from snowsplat.surface.volume import Report
+from snowsplat.training.starts.depth_map import LONGER_SIDE
+from snowsplat.training.starts.fusion import consistent
+from snowsplat.training.starts.plane_sweep import depth_maps
+from snowsplat.training.starts.source_views import source_views
+
+#: All maps of a sweep together have at most this number of pixels, of nine bytes.
+_MOST_PIXELS = 24_000_000
+#: The sizes of the sweeps. The second one has larger windows, in which faint texture suffices.
+_REDUCTIONS = (1, 2)
+#: Each map is checked with those of this number of other views.
+_SOURCES = 4
+#: Points of the scene: with the first number, other views are chosen; with the second, the range
+#: of the depths of a view.
+_SAMPLE, _POINTS = 300, 10_000
+#: Of 255: the least weight of a depth that photos confirm.
+_CONFIRMED = 128
+#: The factor of the weight of all others.
+_UNCONFIRMED = 0.25
+#: The depths of two neighbouring pixels are those of one surface if an interpolated depth differs
+#: by less than this share from the nearest one.
+_SMOOTH = 0.01
+
+
+def confirmed_by_photos(
+    views: Sequence[View], maps: Sequence[DepthMap], far: float, report: Report
+) -> list[DepthMap]:
+    """The maps, in which depths that two photos confirm replace those of the Gaussians.
+
+    Pixels that show no surface, and views that share no surface with others, remain as they are.
+
+    Args:
+        maps: of each view.
+        far: farther away, in world units, there is no surface.
+
+    Raises:
+        UserError: a photo is damaged.
+    """
+    points = _points_of(maps)
+    sample = points[:: math.ceil(max(1, len(points)) / _SAMPLE)]
+    sources = source_views([view.camera for view in views], sample, _SOURCES)
+    pixels = sum(each.depth.numel() for each in maps)
+    longest = max(max(each.depth.shape) for each in maps)
+    side = min(LONGER_SIDE, int(longest * min(1.0, math.sqrt(_MOST_PIXELS / pixels))))
+    found: list[Tensor | None] = [None] * len(maps)  # (h, w) inverse depths; 0: not confirmed
+    with ImageLoader(views) as loader:
+        for number, reduction in enumerate(_REDUCTIONS):
+            report(number, len(_REDUCTIONS), "comparisons of photos")
+            swept = depth_maps(views, sources, loader, points, max(1, side // reduction))
+            for i, known in enumerate(consistent(swept, sources)):
+                each, finer = swept[i], found[i]
+                if each is not None:
+                    inverse = torch.where(known, each.inverse_depth, 0.0)
+                    if finer is not None:
+                        inverse = torch.where(finer > 0, finer, _enlarged(inverse, finer.shape))
+                    found[i] = inverse
+    return [
+        each if inverse is None else _corrected(each, inverse, far)
+        for each, inverse in zip(maps, found, strict=True)
+    ]
+
+
+def _points_of(maps: Sequence[DepthMap]) -> Tensor:
+    """(P, 3) float64 on the CPU, world frame: points on the surfaces of all maps."""
+    random = torch.Generator().manual_seed(0)
+    count, found = math.ceil(_POINTS / len(maps)), []
+    for each in maps:
+        height, width = each.depth.shape
+        rows, columns = (
+            torch.randint(size, (count,), generator=random) for size in (height, width)
+        )
+        z = each.depth.cpu()[rows, columns].double()
+        x = (columns + 0.5 - each.camera.cx) / each.camera.fx
+        y = (rows + 0.5 - each.camera.cy) / each.camera.fy
+        pose = each.camera.world_from_cam.cpu().double()
+        points = (torch.stack([x, y, torch.ones_like(x)], 1) * z[:, None]) @ pose[:, :3].T
+        found.append((points + pose[:, 3])[z.isfinite() & (z > 0)])
+    return torch.cat(found)
+
+
+def _corrected(each: DepthMap, inverse: Tensor, far: float) -> DepthMap:
+    """The map with the confirmed inverse depths (h, w); 0: not confirmed."""
+    inverse = _enlarged(inverse, each.depth.shape).to(each.depth.device)
+    surface = each.depth.isfinite()
+    known = surface & (inverse * far > 1.0)
+    depth = torch.where(known, 1.0 / inverse, each.depth)
+    doubtful = (_UNCONFIRMED * each.weight).ceil().to(torch.uint8)
+    weight = torch.where(surface, doubtful, each.weight)
+    weight = torch.where(known, each.weight.clamp(min=_CONFIRMED), weight)
+    return DepthMap(each.camera, depth, weight)
+
+
+def _enlarged(inverse: Tensor, size: Sequence[int]) -> Tensor:
+    """(h, w) at another size; 0 at the edges of surfaces, and where the values are 0."""
+    if inverse.shape == size:
+        return inverse
+    known = torch.where(inverse > 0, inverse, torch.nan)[None, None]
+    smooth = interpolate(known, list(size), mode="bilinear")[0, 0]
+    nearest = interpolate(known, list(size), mode="nearest-exact")[0, 0]
+    return torch.where((smooth / nearest - 1.0).abs() < _SMOOTH, smooth, 0.0)
