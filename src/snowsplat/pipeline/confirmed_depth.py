@@ -3,9 +3,10 @@
 A training makes images like the photos, and many arrangements of Gaussians do. On a wall with
 little texture, they are in front of the wall, because those in front hide those behind. A plane
 sweep compares the photos themselves: each pixel gets the depth at which a window of one photo
-correlates best with others. Where the map of another photo has the same depth, this depth is
-more exact than that of the Gaussians, even where the two agree. Elsewhere, for example
-on a wall of one colour, the depth of the Gaussians remains, and has less weight.
+correlates best with others. Where the map of another photo has the same depth, this depth
+replaces that of the Gaussians; where the two agree, their mean does, because their errors are not
+the same. Elsewhere, for example on a wall of one colour, the depth of the Gaussians remains, and
+has less weight.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _SOURCES = 4
 #: Points of the scene: with the first number, other views are chosen; with the second, the range
 #: of the depths of a view.
 _SAMPLE, _POINTS = 300, 10_000
+#: The two depths agree if they differ by less than this share.
+_AGREE = 0.01
 #: Of 255: the least weight of a depth that photos confirm.
 _CONFIRMED = 128
 #: The factor of the weight of all others.
@@ -46,7 +49,7 @@ _SMOOTH = 0.01
 def confirmed_by_photos(
     views: Sequence[View], maps: Sequence[DepthMap], far: float, report: Report
 ) -> list[DepthMap]:
-    """The maps, in which depths that two photos confirm replace those of the Gaussians.
+    """The maps, corrected by the depths that two photos confirm.
 
     Pixels that show no surface, and views that share no surface with others, remain as they are.
 
@@ -104,7 +107,10 @@ def _corrected(each: DepthMap, inverse: Tensor, far: float) -> DepthMap:
     inverse = _enlarged(inverse, each.depth.shape).to(each.depth.device)
     surface = each.depth.isfinite()
     known = surface & (inverse * far > 1.0)
-    depth = torch.where(known, 1.0 / inverse, each.depth)
+    swept = 1.0 / inverse
+    agree = (each.depth / swept - 1.0).abs() < _AGREE
+    swept = torch.where(agree, 0.5 * (swept + each.depth), swept)
+    depth = torch.where(known, swept, each.depth)
     doubtful = (_UNCONFIRMED * each.weight).ceil().to(torch.uint8)
     weight = torch.where(surface, doubtful, each.weight)
     weight = torch.where(known, each.weight.clamp(min=_CONFIRMED), weight)
