@@ -71,6 +71,9 @@ class Stopwatch:
     def note(self, line: str) -> None:
         pass
 
+    def placed(self, photos: object, points: object) -> None:
+        pass
+
     def _switch(self, to: str) -> None:
         """Add the time since the last call to the stage that was running."""
         now = (time.perf_counter(), processor_time())

@@ -165,8 +165,8 @@ def test_exercises_and_chapters_link_to_each_other():
     for path in EXERCISES:
         (link,) = re.findall(r"Chapter: \[.*\]\((.*)\)", cells(path, "markdown")[0]["source"])
         chapter = (path.parent / link).resolve()
-        last = chapter.read_text(encoding="utf-8").rstrip().splitlines()[-1]
-        assert f"](../../notebooks/exercises/{path.name})" in last, chapter
+        text = chapter.read_text(encoding="utf-8")
+        assert f"](../../notebooks/exercises/{path.name})" in text, chapter
 
 
 class Installed(Exception):

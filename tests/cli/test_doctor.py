@@ -42,6 +42,7 @@ def lines(out: str) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_the_facts_of_this_installation(run, monkeypatch, tmp_path):
+    monkeypatch.delenv("SNOWSPLAT_GPU_ARCHITECTURES", raising=False)
     monkeypatch.setenv("SNOWSPLAT_THREADS", "3")
     monkeypatch.chdir(tmp_path)
     result = run("doctor", "--json")

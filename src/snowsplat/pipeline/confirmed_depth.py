@@ -36,7 +36,7 @@ _SOURCES = 4
 #: of the depths of a view.
 _SAMPLE, _POINTS = 300, 10_000
 #: The two depths agree if they differ by less than this share.
-_AGREE = 0.01
+_AGREE = 0.03
 #: Of 255: the least weight of a depth that photos confirm.
 _CONFIRMED = 128
 #: The factor of the weight of all others.
