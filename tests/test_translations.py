@@ -1,5 +1,6 @@
 """The Chinese pages: the check in the documentation build, and their code and formulas."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -27,15 +28,24 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
+def write_notebook(path: Path, text: str = "Some text\nin two lines.", code: str = "f()") -> None:
+    cells = [("markdown", ["# Title\n", "\n", text]), ("code", [code])]
+    cells += [("markdown", "Then:\n\n$$ a = b\\,c $$"), ("code", "g()")]
+    listed = [{"cell_type": kind, "source": source} for kind, source in cells]
+    write(path, json.dumps({"cells": listed}))
+
+
 @pytest.fixture
 def docs(tmp_path, translations) -> Path:
     """A small project whose pages are all translated."""
-    for name in ("README.md", "docs/quick-start.md", "docs/learn/camera.md", "docs/formats.md"):
+    pages = ("README.md", "docs/quick-start.md", "docs/learn/camera.md", "docs/formats.md")
+    for name in (*pages, "notebooks/README.md"):
         write(tmp_path / name, f"# {name}\n\nSome text\nin two lines.\n")
+    write_notebook(tmp_path / "notebooks" / "01_render.ipynb")
     for name in translations.OWN:
         write(tmp_path / "docs" / "zh" / name, "# 中文\n")
     for english, chinese in translations.pairs(tmp_path / "docs"):
-        digest = translations.digest(english.read_text(encoding="utf-8"))
+        digest = translations.digest(translations.text_of(english))
         write(chinese, f"<!-- translation of {english.name} {digest} -->\n# 标题\n\n文字\n")
     return tmp_path / "docs"
 
@@ -44,6 +54,8 @@ def test_complete_translations_have_no_problems(translations, docs):
     names = [chinese.relative_to(docs.parent) for _, chinese in translations.pairs(docs)]
     assert list(map(str, names)) == [
         "README.zh-CN.md",
+        "docs/zh/guides/notebooks.md",
+        "docs/zh/notebooks/01_render.md",
         "docs/zh/quick-start.md",
         "docs/zh/learn/camera.md",
     ]
@@ -66,7 +78,25 @@ def test_a_changed_page_is_a_problem_until_the_first_line_is_changed(translation
     assert list(translations.problems(docs)) == []
 
 
-@pytest.mark.parametrize("name", ["README.zh-CN.md", "docs/zh/learn/camera.md"])
+def test_the_text_of_a_notebook_has_numbers_in_place_of_the_code(translations, docs):
+    text = translations.text_of(docs.parent / "notebooks" / "01_render.ipynb")
+    first, second = "# Title\n\nSome text\nin two lines.", "Then:\n\n```math\na = b\\,c\n```"
+    assert text == f"{first}\n\n`[1]`\n\n{second}\n\n`[2]`\n"
+
+
+def test_changed_text_of_a_notebook_is_a_problem_and_changed_code_is_not(translations, docs):
+    notebook = docs.parent / "notebooks" / "01_render.ipynb"
+    write_notebook(notebook, code="h()")
+    assert list(translations.problems(docs)) == []
+    write_notebook(notebook, text="Some other text.")
+    (problem,) = translations.problems(docs)
+    assert problem.startswith("docs/zh/notebooks/01_render.md: older than notebooks/01_render.ip")
+
+
+NAMES = ["README.zh-CN.md", "docs/zh/learn/camera.md", "docs/zh/notebooks/01_render.md"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_missing_page_is_a_problem(translations, docs, name):
     (docs.parent / name).unlink()
     (problem,) = translations.problems(docs)
@@ -105,6 +135,11 @@ def blocks(text: str) -> tuple[list[tuple[str, str]], list[str]]:
     return found, [Path(image).name for image in images]
 
 
+def outline(text: str) -> list[str]:
+    """The levels of the headings, and the numbers of the code cells of a notebook."""
+    return re.findall(r"^(#+(?= )|`\[\d+\]`$)", FENCE.sub("", text), re.MULTILINE)
+
+
 def formulas(text: str) -> set[str]:
     """The formulas within text."""
     text = re.sub(r"^> ?", "", FENCE.sub("", text), flags=re.MULTILINE)
@@ -113,12 +148,13 @@ def formulas(text: str) -> set[str]:
     return {" ".join(formula.split()) for formula in re.findall(r"\$([^$]+)\$", text)}
 
 
-def test_code_and_formulas_of_every_chinese_page_are_those_of_the_english_page(translations):
+def test_headings_code_and_formulas_of_every_chinese_page_are_those_of_the_english(translations):
     pages = list(translations.pairs(ROOT / "docs"))
-    assert len(pages) >= 17
+    assert len(pages) >= 40
     for english, chinese in pages:
-        original = english.read_text(encoding="utf-8")
+        original = translations.text_of(english)
         translated = chinese.read_text(encoding="utf-8")
+        assert outline(translated) == outline(original), chinese
         assert blocks(translated) == blocks(original), chinese
         assert formulas(translated) == formulas(original), chinese
 
@@ -131,5 +167,4 @@ def test_chinese_pages_link_to_chinese_pages_where_there_are_some(translations):
         for link in re.findall(r"\]\(([^)#:]+\.md)", text):
             target = (page.parent / link).resolve()
             assert target.exists(), f"{page}: {link}"
-            if page.name != "README.zh-CN.md" or target.name != "README.md":
-                assert target not in pages, f"{page}: {link}: there is a Chinese page"
+            assert pages.get(target, page) == page, f"{page}: {link}: there is a Chinese page"

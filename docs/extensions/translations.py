@@ -1,7 +1,8 @@
 """Checks that the Chinese pages are complete and not older than the English ones.
 
-`docs/zh/` has a page for each page of `TRANSLATED`; README.md has README.zh-CN.md beside it. The
-first line of a Chinese page contains a digest of the English text that it translates:
+`docs/zh/` has a page for each page of `TRANSLATED`, and for each lesson in `notebooks/` a page with
+the text between the code cells; README.md has README.zh-CN.md beside it. The first line of a
+Chinese page contains a digest of the English text that it translates:
 
     <!-- translation of quick-start.md 0123456789abcdef -->
 
@@ -12,6 +13,8 @@ and links each page to the same page in the other language.
 """
 
 import hashlib
+import itertools
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,7 +51,26 @@ _FIRST_LINE = re.compile(r"<!-- translation of (\S+) ([0-9a-f]{16}) -->\n")
 # Excerpts of source files (docs/excerpts.py): a translation has the same, and nothing to translate.
 _EXCERPT = re.compile(r"(<!-- code: .* -->)\n```.*\n(?:.*\n)*?```")
 
+# A formula in its own lines, as Jupyter reads it. GitHub needs a block, as the other pages have.
+_FORMULA = re.compile(r"^\$\$ (.*) \$\$$", re.MULTILINE)
+
 logger = logging.getLogger(__name__)
+
+
+def text_of(file: Path) -> str:
+    """The Markdown text of a page or of a notebook.
+
+    In a notebook, the number that Jupyter shows beside a code cell takes the place of its code.
+    """
+    text = file.read_text(encoding="utf-8")
+    if file.suffix != ".ipynb":
+        return text
+    number = itertools.count(1)
+    parts = [
+        "".join(cell["source"]) if cell["cell_type"] == "markdown" else f"`[{next(number)}]`"
+        for cell in json.loads(text)["cells"]
+    ]
+    return _FORMULA.sub(r"```math\n\1\n```", "\n\n".join(parts)) + "\n"
 
 
 def digest(text: str) -> str:
@@ -58,8 +80,12 @@ def digest(text: str) -> str:
 
 
 def pairs(docs: Path) -> Iterator[tuple[Path, Path]]:
-    """The English pages that are translated, each with its Chinese page."""
+    """The English pages and notebooks that are translated, each with its Chinese page."""
     yield docs.parent / "README.md", docs.parent / "README.zh-CN.md"
+    notebooks = docs.parent / "notebooks"
+    yield notebooks / "README.md", docs / "zh" / "guides" / "notebooks.md"
+    for notebook in sorted(notebooks.glob("*.ipynb")):
+        yield notebook, docs / "zh" / "notebooks" / f"{notebook.stem}.md"
     for pattern in TRANSLATED:
         for page in sorted(docs.glob(pattern)):
             yield page, docs / "zh" / page.relative_to(docs)
@@ -72,7 +98,7 @@ def problems(docs: Path) -> Iterator[str]:
         known.add(chinese)
         source = english.relative_to(docs.parent)
         name = chinese.relative_to(docs.parent)
-        current = digest(english.read_text(encoding="utf-8"))
+        current = digest(text_of(english))
         line = f"<!-- translation of {english.name} {current} -->"
         if not chinese.exists():
             yield f"{name}: missing; translate {source}, and begin with the line {line}"
