@@ -108,7 +108,7 @@ def test_every_flag_is_described(site, capsys):
             cli.parse([name, "--help"])
         # The flags at the start of a line of the help text, or after a comma.
         help_text = capsys.readouterr().out
-        flags = re.findall(r"(?:^\W*|, )--([a-z][a-z-]+)", help_text, re.MULTILINE)
+        flags = re.findall(r"(?:^\W*|, )--([a-z][a-z0-9-]+)", help_text, re.MULTILINE)
         assert len(flags) > 1
         for flag in set(flags) - {"help"}:
             assert f"cmdoption-snowsplat-{name}-{flag}" in anchors, flag

@@ -145,8 +145,8 @@ class TrainConfig(Settings):
     )
     huber_weight: float = setting(
         0.0,
-        "Weight of a term of the loss that is the squared difference up to 0.1, and linear beyond; "
-        "from `huber_from` on. It decreases the largest differences, which the PSNR counts most.",
+        "Weight of a term of the loss that is the squared difference up to 0.1, and linear beyond, "
+        "in the last steps. It decreases the largest differences, which the PSNR counts most.",
         least=0.0,
         metavar="F",
     )
