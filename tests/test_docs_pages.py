@@ -140,7 +140,7 @@ def test_every_svg_has_colours_for_dark_surroundings():
         assert drawing.STYLE in file.read_text(encoding="utf-8"), file
 
 
-@pytest.mark.parametrize("name", ["covariance", "gaussian", "history", "projection"])
+@pytest.mark.parametrize("name", ["covariance", "gaussian", "history", "projection", "surfaces"])
 def test_figures_are_those_of_their_scripts(name, tmp_path, monkeypatch):
     script = module(FIGURES / f"{name}.py", FIGURES)
     monkeypatch.setattr(sys.modules["drawing"], "FOLDER", tmp_path)

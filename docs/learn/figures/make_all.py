@@ -15,6 +15,7 @@ import rasterizer
 import reference_walk
 import spherical_harmonics
 import structure_from_motion
+import surfaces
 
 for module in (
     gaussian,
@@ -29,6 +30,7 @@ for module in (
     reference_walk,
     initialisation,
     density_control,
+    surfaces,
     ply,
     interactive_tiles,
     history,
