@@ -31,6 +31,7 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth import aligned_depth_map, contradicts
 from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.util.errors import UserError
+from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
     from snowsplat.training.core.batch import BatchView
@@ -143,9 +144,8 @@ class DepthSupervision(Part):
         ]
         if wrong:
             self.used[wrong] = False
-            names = ", ".join(run.dataset.train[index].name for index in wrong[:5])
-            more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
-            run.note(f"depth maps that contradict the photos are not used any more: {names}{more}")
+            names = first_names([run.dataset.train[index].name for index in wrong], 5)
+            run.note(f"depth maps that contradict the photos are not used any more: {names}")
 
     def state(self) -> dict[str, Tensor]:
         """See `Part`."""

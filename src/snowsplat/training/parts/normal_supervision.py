@@ -36,6 +36,7 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.util.errors import UserError
+from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
     from snowsplat.training.core.batch import BatchView
@@ -124,10 +125,9 @@ class NormalSupervision(Part):
         ]
         if wrong:
             self.used[wrong] = False
-            names = ", ".join(views[index].name for index in wrong[:5])
-            more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+            names = first_names([views[index].name for index in wrong], 5)
             frame = "" if self.used.any() else "; normals must be in the frame of the camera"
-            run.note(f"normal maps that contradict the photos are not used: {names}{more}{frame}")
+            run.note(f"normal maps that contradict the photos are not used: {names}{frame}")
 
     def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
         """See the module. Each rendering has at most as many pixels as the map."""

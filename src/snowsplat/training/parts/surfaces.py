@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from snowsplat import ops
 from snowsplat.ops.capacity import Capacity
@@ -33,7 +32,7 @@ from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
 from snowsplat.scene.render import RenderOutput
-from snowsplat.scene.surface_normals import normals_of_depth, rays_of
+from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
 from snowsplat.training.parts.part import Part
 from snowsplat.util.errors import SettingError
 
@@ -153,7 +152,5 @@ def consistency(
     from_depth = normals_of_depth(depth, camera)
     with torch.no_grad():
         # All nine pixels around have a depth. At the border of the image, the normals are 0.
-        rows = shown[:, :-2] & shown[:, 1:-1] & shown[:, 2:]
-        around = pad(rows[:-2] & rows[1:-1] & rows[2:], (1, 1, 1, 1))
-        weight = around * -((from_depth * rays).sum(0) / lengths).clamp(max=0.0)
+        weight = surrounded(shown) * -((from_depth * rays).sum(0) / lengths).clamp(max=0.0)
     return (weight * (alpha.detach() - (normals * from_depth).sum(0))).mean()

@@ -25,6 +25,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 from snowsplat.training.parts.part import Part
 from snowsplat.training.settings.declare import When
+from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
@@ -118,9 +119,7 @@ def left_out_line(names: Sequence[str]) -> str:
     """The line about photos that the scene does not explain; at least one name."""
     one = len(names) == 1
     photos, poses = ("photo is", "pose is") if one else ("photos are", "poses are")
-    listed = ", ".join(names[:_LISTED])
-    if len(names) > _LISTED:
-        listed += f" and {len(names) - _LISTED} more"
+    listed = first_names(names, _LISTED)
     return (
         f"{len(names)} {photos} not explained by the scene and left out of the training: {listed}; "
         f"{'its' if one else 'their'} camera {poses} probably wrong"

@@ -15,6 +15,7 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.training.starts.point_colors import point_pixels
+from snowsplat.util.names import first_names
 
 #: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
 #: of the photo (1 / √10); at 0.75, a half: contours are doubled or missing.
@@ -116,10 +117,8 @@ def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
     )
     if not wrong:
         return []
-    names = ", ".join(f"{view.name} ({view.psnr_aligned:.1f} dB)" for view in wrong[:3])
-    text = f"the scene looks wrong in {names}"
-    if len(wrong) > 3:
-        text += f" and {len(wrong) - 3} more"
+    names = [f"{view.name} ({view.psnr_aligned:.1f} dB)" for view in wrong]
+    text = f"the scene looks wrong in {first_names(names, 3)}"
     views = {view.name: view for view in dataset.test}
     seldom = _seen_by_few(views[wrong[0].name], dataset) if wrong[0].name in views else 0.0
     if seldom >= _SELDOM:
@@ -153,10 +152,9 @@ def _sharpness(held_out: Evaluation) -> list[Reason]:
 def _left_out(names: Sequence[str], count: int) -> list[Reason]:
     if not names:
         return []
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     text = (
         f"{len(names)} of {count} photos contradict the others and were left out: "
-        f"{', '.join(names[:3])}{more}"
+        f"{first_names(names, 3)}"
     )
     return [Reason("usable" if len(names) > _LEFT_OUT * count else "good", text)]
 
