@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from snowsplat import TrainConfig, Trainer
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.scene.camera import Camera
@@ -80,3 +81,17 @@ def dataset(folder: Path, kind: str = "png in mm") -> Dataset:
         depth = write(folder / f"depth{i}", kind, z, i)
         views.append(View(f"{i}", camera, ImageSource(photo, SIZE, SIZE), depth=depth))
     return Dataset(views, [], points_of(maps), 3.0)
+
+
+def resumed_with_the_same_bits(data: Dataset, config: TrainConfig, at: int, until: int) -> Trainer:
+    """A training that is resumed after step ``at`` has the state of one that is not, ``until``."""
+    whole, first = Trainer(data, config), Trainer(data, config)
+    whole.run(until=until)
+    first.run(until=at)
+    state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
+    second = Trainer(data, config, state=state)
+    second.step = first.step
+    second.run(until=until)
+    for name, tensor in second.state_tensors().items():
+        assert torch.equal(tensor, whole.state_tensors()[name]), name
+    return second

@@ -13,7 +13,7 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.scene.render import render
 from snowsplat.training.parts.depth_supervision import CHECK_FROM, DepthSupervision, depth_term
 
-from .sphere import cameras, dataset, z_of_sphere
+from .sphere import cameras, dataset, resumed_with_the_same_bits, z_of_sphere
 
 CONFIG = replace(
     recipe("default", iterations=60, init="points", max_gaussians=600, transients="off", sky=False),
@@ -144,13 +144,4 @@ def test_a_map_that_contradicts_the_photos_is_dropped_and_named(tmp_path) -> Non
 
 def test_a_resumed_run_has_the_same_bits(tmp_path) -> None:
     data, config = dataset(tmp_path), replace(CONFIG, batch=2)
-    whole = Trainer(data, config)
-    whole.run(until=8)
-    first = Trainer(data, config)
-    first.run(until=4)
-    state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
-    second = Trainer(data, config, state=state)
-    second.step = first.step
-    second.run(until=8)
-    for name, tensor in second.state_tensors().items():
-        assert torch.equal(tensor, whole.state_tensors()[name]), name
+    resumed_with_the_same_bits(data, config, 4, 8)

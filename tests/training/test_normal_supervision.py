@@ -21,7 +21,7 @@ from snowsplat.training.parts.normal_supervision import (
     surfaces_of,
 )
 
-from .sphere import cameras, dataset, rays, z_of_sphere
+from .sphere import cameras, dataset, rays, resumed_with_the_same_bits, z_of_sphere
 
 CONFIG = replace(
     recipe("default", iterations=60, init="points", max_gaussians=600, transients="off", sky=False),
@@ -176,14 +176,5 @@ def test_without_maps_nothing_changes(tmp_path) -> None:
 
 def test_a_resumed_run_has_the_same_bits(tmp_path) -> None:
     data, config = with_normals(dataset(tmp_path), (1, -1, -1)), replace(CONFIG, iterations=20)
-    whole = Trainer(data, config)
-    whole.run(until=12)
-    first = Trainer(data, config)
-    first.run(until=9)
-    state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
-    second = Trainer(data, config, state=state)
-    second.step = first.step
-    second.run(until=12)
+    second = resumed_with_the_same_bits(data, config, 9, 12)
     assert second.part(NormalSupervision).signs.tolist() == [1, -1, -1]
-    for name, tensor in second.state_tensors().items():
-        assert torch.equal(tensor, whole.state_tensors()[name]), name
