@@ -35,7 +35,7 @@ PARTS = Path(__file__).with_name("gpu_parts.py")
 GROUPS = ("device", "tests", "sanitizer", "stages", "peer", "train", "cpu")
 SIZES = ("200k", "1m", "3m")
 DATASETS = ("fox", "lego400")
-TRAINING_TESTS = ("trainer_gpu", "view_graphs")
+TRAINING_TESTS = ("finite", "trainer_gpu", "view_graphs")
 
 
 def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:

@@ -52,6 +52,7 @@ def every_op(
                     _ops_of(scene, device, dtype)
         _neighbours(scene.gaussians.means, device)
         _plane_sweep(width, height, device)
+        _geometry(scene, device)
         if count > 0:
             for in_order in (False, True):
                 say(f"training: {count} Gaussians, {width}x{height}, in order: {in_order}")
@@ -122,7 +123,8 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
         splats.abs_grad = torch.zeros(len(splats), 2, device=device, dtype=dtype)
         with torch.enable_grad():
             image, _, _ = ops.rasterize(splats, *size, background.detach())
-            ops.photometric_loss(image, (255 * photo).to(torch.uint8)).backward()
+            target = (255 * photo).to(torch.uint8)
+            ops.photometric_loss(image, target, huber_weight=10.0).backward()
         many = [torch.zeros(len(scene.gaussians), device=device, dtype=dtype) for _ in range(3)]
         for absolute in (False, True):
             ops.accumulate_screen_statistics(splats, *size, *many, absolute=absolute)
@@ -148,7 +150,8 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
             for p in params.values():
                 p.grad = None
         counts = ops.count_blended(splats, *size)
-    _finite(counts, splats.abs_grad, *many, *params.values())
+        median, mean, alpha = ops.rasterize_median(splats, *size)
+    _finite(median, mean, alpha, counts, splats.abs_grad, *many, *params.values())
 
 
 def _neighbours(means: Tensor, device: torch.device) -> None:
@@ -170,6 +173,30 @@ def _plane_sweep(width: int, height: int, device: torch.device) -> None:
                     image, sources, matrix, 0.0, 1.0, planes=3, radius=radius, centre=centre
                 )
             )
+
+
+def _geometry(scene: Workload, device: torch.device) -> None:
+    """The Gaussians' means in cameras, and a depth map in cubes of samples and in single points."""
+    camera, means = scene.camera, scene.gaussians.means
+    width, height = camera.width, camera.height
+    for dtype in (torch.float32, torch.float64):
+        points = means.to(device, dtype)
+        to_image = (camera.intrinsics @ camera.cam_from_world).to(device, dtype)
+        frusta = ops.Frusta(
+            to_image.expand(3, 3, 4).contiguous(),
+            torch.tensor([width, height], dtype=dtype, device=device).expand(3, 2).contiguous(),
+            torch.tensor([[0.1, 9], [0.1, 2], [3, 4]], dtype=dtype, device=device),
+            torch.full((3,), camera.fx, dtype=dtype, device=device),
+        )
+        _finite(*ops.points_in_frusta(points, frusta))
+        depth = 1 + 5 * torch.rand(height, width, dtype=dtype).to(device)
+        weight = torch.rand(height, width, dtype=dtype).to(device)
+        image = torch.rand(3, height, width, dtype=dtype).to(device)
+        for side, photo in ((8, None), (1, image)):
+            channels = 2 if photo is None else 5
+            sums = points.new_zeros(len(points), side, side, side, channels)
+            ops.fuse_depth(sums, points, 0.05, to_image, depth, weight, 0.2, photo)
+            _finite(sums)
 
 
 def _finite(*tensors: Tensor | None) -> None:
