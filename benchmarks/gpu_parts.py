@@ -419,28 +419,27 @@ def stages(size: str, folder: Path, repeats: int) -> None:
     step = Step(scene, GPU)
     for _ in range(4):  # warm-up: capacity for the instances, kernels, torch's memory
         step.run()
-    torch.cuda.synchronize()
-    allocated = torch.cuda.memory_allocated()
     counts = step.counts()
+    # The memory of a recorded graph is reserved, but it does not count as allocated.
+    torch.cuda.synchronize()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
-    with step.without_graphs():  # the memory of a graph does not count as allocated
-        for _ in range(3):
-            step.run()
+    for _ in range(3):
+        step.run()
+    torch.cuda.synchronize()
+    allocated, peak = torch.cuda.memory_allocated(), torch.cuda.max_memory_reserved()
     finding("frame", size=size, **counts)
-    finding("memory", size=size, allocated=allocated, peak=torch.cuda.max_memory_allocated())
+    finding("memory", size=size, allocated=allocated, peak=peak)
     for in_order in (False, True):
         with sums_in_order(in_order):
             for _ in range(3):
                 step.run()
-            torch.cuda.reset_peak_memory_stats()
             found = {"size": size, "in_order": in_order, "repeats": repeats}
             times = step_times(step, repeats)
-            peak = torch.cuda.max_memory_allocated()
             with step.without_graphs():
                 step.run()
                 plain = step_times(step, repeats)
-            finding("step", **found, peak=peak, **times, plain=plain)
+            finding("step", **found, **times, plain=plain)
             kernels = stage_times(step, driver.run, repeats)
             finding("stages", size=size, in_order=in_order, kernels=kernels)
 

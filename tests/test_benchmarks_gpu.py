@@ -231,7 +231,7 @@ def fake_gpu(gpu_modules, monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: begun.append(True))
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset)
-    for name in ("memory_allocated", "max_memory_allocated"):
+    for name in ("memory_allocated", "max_memory_allocated", "max_memory_reserved"):
         monkeypatch.setattr(torch.cuda, name, one_megabyte)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 20, 1 << 20))
     card = argparse.Namespace(name="Card X", major=9, minor=0, multi_processor_count=2)

@@ -34,7 +34,7 @@ from snowsplat.training.parts.direction_cells import (
     spread_of,
 )
 from snowsplat.training.parts.far_regions import in_far_regions
-from snowsplat.training.starts.photos import reduced_photo, usable_pixels
+from snowsplat.training.starts.photos import in_threads, reduced_photo, usable_pixels
 
 #: Distance of the sky from the middle of the cameras, in units of the root mean square of their
 #: distances from it. From two of them, the sky is seen in directions that differ by a degree.
@@ -144,7 +144,7 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     points = points[:: max(1, len(points) // _POINTS)]
     cameras = [view.camera for view in dataset.train]
     up = _up(cameras)
-    samples = [_Sample.of(view, images, points, up) for view in views]
+    samples = in_threads(lambda view: _Sample.of(view, images, points, up), views)
     cell = torch.cat([sample.cells for sample in samples])
     color = torch.cat([sample.colors for sample in samples])
     depths = torch.cat([sample.depths for sample in samples])

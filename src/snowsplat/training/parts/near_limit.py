@@ -34,6 +34,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.frusta import frusta_of
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.training.parts.part import REMOVED, Part
+from snowsplat.training.starts.photos import in_threads
 from snowsplat.training.starts.source_views import source_views
 
 if TYPE_CHECKING:
@@ -84,7 +85,8 @@ class NearLimit(Part):
         used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
         unseen = unseen_cameras(used, _sample(points, _PAIRING))
         sample = _sample(points, _POINTS)
-        limits = [self.share * nearest_depth(camera, sample) for camera in used + unseen]
+        nearest = in_threads(lambda camera: nearest_depth(camera, sample), used + unseen)
+        limits = [self.share * depth for depth in nearest]
         views = [(c, limit) for c, limit in zip(used + unseen, limits, strict=True) if limit > 0.0]
         if not views:
             return

@@ -13,7 +13,7 @@ from snowsplat.data.dataset import Points
 from snowsplat.data.image_loader import Photos
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.training.starts.map_views import MapViews
-from snowsplat.training.starts.photos import reduced_photo
+from snowsplat.training.starts.photos import in_threads, reduced_photo
 
 #: Two inverse depths of one point agree if they differ by at most this share.
 _TOLERANCE = 0.02
@@ -38,16 +38,20 @@ def fused_points(
     """
     confirmed = consistent(maps, chosen.sources)
     share = _PIXELS_PER_POINT * count / max(1, sum(int(pixels.sum()) for pixels in confirmed))
-    points, widths = [torch.zeros(0, 3)], [torch.zeros(0)]
-    colors = [torch.zeros(0, 3, dtype=torch.uint8)]
-    for view, depth_map, pixels in zip(chosen.views, maps, confirmed, strict=True):
+    used = [
+        pixels & (torch.rand(pixels.shape, generator=generator) < share) for pixels in confirmed
+    ]
+
+    def points_of(i: int) -> tuple[Tensor, Tensor, Tensor]:
+        depth_map, pixels = maps[i], used[i]
         if depth_map is None:
-            continue
-        pixels &= torch.rand(pixels.shape, generator=generator) < share
-        points.append(depth_map.points(pixels))
-        size = depth_map.camera.width, depth_map.camera.height
-        colors.append(reduced_photo(view, images, *size).rgb[pixels])
-        widths.append(1.0 / (depth_map.inverse_depth[pixels] * depth_map.camera.fx))
+            return torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8), torch.zeros(0)
+        camera = depth_map.camera
+        photo = reduced_photo(chosen.views[i], images, camera.width, camera.height)
+        width = 1.0 / (depth_map.inverse_depth[pixels] * camera.fx)
+        return depth_map.points(pixels), photo.rgb[pixels], width
+
+    points, colors, widths = zip(*in_threads(points_of, range(len(maps))), strict=True)
     return thinned(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
 
 
@@ -57,20 +61,21 @@ def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]
     A depth is confirmed if its point, projected into the source view, has the depth of the map
     there (geometric consistency, Schönberger et al. 2016).
     """
-    confirmed = []
-    for depth_map, chosen in zip(maps, sources, strict=True):
+
+    def confirmed(i: int) -> Tensor:
+        depth_map = maps[i]
         if depth_map is None:
-            confirmed.append(torch.zeros(0, 0, dtype=torch.bool))
-            continue
+            return torch.zeros(0, 0, dtype=torch.bool)
         known = depth_map.inverse_depth > 0.0
         points = depth_map.points(known)
         agrees = torch.zeros(len(points), dtype=torch.bool)
-        for j in chosen:
+        for j in sources[i]:
             other = maps[j]
             if other is not None:
                 agrees |= _agrees(points, other)
-        confirmed.append(known.clone().masked_scatter_(known, agrees))
-    return confirmed
+        return known.clone().masked_scatter_(known, agrees)
+
+    return in_threads(confirmed, range(len(maps)))
 
 
 def _agrees(points: Tensor, depth_map: DepthMap) -> Tensor:

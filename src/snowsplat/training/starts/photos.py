@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from snowsplat.data.dataset import View
 from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.image_loader import DECODERS, Photos
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def reduced_photo(view: View, images: Photos, width: int, height: int) -> LoadedImage:
@@ -23,6 +30,16 @@ def reduced_photo(view: View, images: Photos, width: int, height: int) -> Loaded
     if mask is not None:
         mask = interpolate(mask[None, None].to(torch.float32), size, mode="area")[0, 0] > 0.5
     return LoadedImage(planes.round().to(torch.uint8), mask)
+
+
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """The results of a function of photos, in the order of the items, by `DECODERS` threads.
+
+    Most of the time of a start is spent on one photo after another, by one thread: see
+    `single_threaded`. Each result is computed by one thread, so it does not depend on their number.
+    """
+    with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-start") as pool:
+        return list(pool.map(function, items))
 
 
 def usable_pixels(photo: LoadedImage) -> Tensor | None:

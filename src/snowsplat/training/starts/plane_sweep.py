@@ -15,7 +15,7 @@ from snowsplat.data.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
 from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, photo_for_map
-from snowsplat.training.starts.photos import usable_pixels
+from snowsplat.training.starts.photos import in_threads, usable_pixels
 
 #: Windows have (2 r + 1)² pixels.
 _RADIUS = 3
@@ -53,10 +53,10 @@ def depth_maps(
         points: (P, 3) in the world frame. Those that a view shows determine its range of depths.
         longer_side: the maximum size of the maps, in pixels.
     """
-    return [
-        _depth_map(views[i], [views[j] for j in chosen], images, points, longer_side)
-        for i, chosen in enumerate(sources)
-    ]
+    return in_threads(
+        lambda i: _depth_map(views[i], [views[j] for j in sources[i]], images, points, longer_side),
+        range(len(sources)),
+    )
 
 
 @dataclass(frozen=True)

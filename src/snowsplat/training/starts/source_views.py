@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.scene.camera import Camera
+from snowsplat.training.starts.photos import in_threads
 
 #: Angles between two viewing directions of a point, in degrees. The weight of a pair of views rises
 #: from 0 at the first angle to 1 at the second one, and falls from 1 at the third to 0 at the last.
@@ -42,16 +43,16 @@ def source_views(cameras: Sequence[Camera], points: Tensor, count: int) -> list[
         rays.append(torch.nn.functional.normalize(points - camera.position, dim=1))
     visible_, depth_, ray_ = torch.stack(visible), torch.stack(depths), torch.stack(rays)
 
-    chosen = []
-    for i in range(len(cameras)):
+    def chosen(i: int) -> list[int]:
         cosine = (ray_ * ray_[i]).sum(2).clamp(-1.0, 1.0)
         ratio = torch.minimum(depth_ / depth_[i], depth_[i] / depth_)
         weight = (_angle_weight(cosine.acos()) * ratio * (visible_ & visible_[i])).sum(1)
         weight[i] = 0.0
         order = torch.argsort(weight, descending=True, stable=True)[:count].tolist()
         least = max(_LEAST_WEIGHT * float(weight.max()), 1e-9)
-        chosen.append([j for j in order if float(weight[j]) >= least])
-    return chosen
+        return [j for j in order if float(weight[j]) >= least]
+
+    return in_threads(chosen, range(len(cameras)))
 
 
 def _angle_weight(angle: Tensor) -> Tensor:
