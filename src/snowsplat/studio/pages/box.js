@@ -1,7 +1,7 @@
 // The box of the editor: a handle in the middle of each face, which is dragged or moved by the arrow keys,
 // and a slider for each face. Its coordinates are those of the page, whose y axis points up.
 
-import { make } from "./page.js";
+import { button, make } from "./page.js";
 import { along, bounds, outside, project } from "./selection.js";
 import { say } from "./text.js";
 
@@ -11,12 +11,8 @@ const ARROWS = new Map([["ArrowRight", 1], ["ArrowUp", 1], ["ArrowLeft", -1], ["
 const STEP = 0.01; // of an arrow key, as a share of the first box; ten times as much with Shift
 const BEYOND = 0.5; // of the first box, to both sides of it: the range of a slider
 
-/**
- * @param {Float32Array} centers (N, 3)
- * @param {HTMLElement} canvas
- * @param {() => Float64Array} model the clip space from the space of the centres
- */
-export function addBox(centers, canvas, model) {
+/** @param {import("./edit.js").Editing} editing */
+export function addBox({ centers, canvas, overlay, model, select }) {
     const corners = bounds(centers).map(corner => corner.map((value, k) => SIGNS[k] * value));
     const sides = [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
     const spans = AXES.map((_, k) => sides[1][k] - sides[0][k]);
@@ -77,35 +73,48 @@ export function addBox(centers, canvas, model) {
         return { axis, side, handle, slider, show };
     }
 
+    /** Puts the handles to their places in the window; those behind the camera are hidden. */
+    function place() {
+        for (const { axis, side, handle } of faces) {
+            const [x, y, depth] = project(model(), middle(side, axis), canvas.clientWidth, canvas.clientHeight);
+            handle.hidden = depth <= 0;
+            handle.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
+            handle.style.zIndex = String(Math.round(1e5 / (1 + Math.max(depth, 0))));
+        }
+    }
+
+    /** The twelve edges in the space of the centres, in short pieces, since those behind the camera are not drawn. */
+    function edges() {
+        const pieces = 16;
+        return AXES.flatMap((_, axis) =>
+            [0, 1, 2, 3].flatMap(edge => {
+                const ends = AXES.map((_, k) => (edge >> Number((k + 3 - axis) % 3 === 1)) & 1);
+                const point = (/** @type {number} */ share) =>
+                    inScene(AXES.map((_, k) => (k === axis ? sides[0][k] + share * (sides[1][k] - sides[0][k]) : sides[ends[k]][k])));
+                return Array.from({ length: pieces }, (_, i) => [point(i / pieces), point((i + 1) / pieces)]);
+            }),
+        );
+    }
+
+    function selectOutside() {
+        const [a, b] = sides.map(inScene);
+        select(outside(centers, AXES.map((_, k) => Math.min(a[k], b[k])), AXES.map((_, k) => Math.max(a[k], b[k]))));
+    }
+
     const handles = make("div.snow-handles", { hidden: true }, ...faces.map(face => face.handle));
+    overlay.element.after(handles);
+    const sliders = AXES.map((name, k) => make("div.snow-sides", {}, make("b", {}, name), ...faces.filter(face => face.axis === k).map(face => face.slider)));
     return {
-        handles,
-        sliders: AXES.map((name, k) => make("div.snow-sides", {}, make("b", {}, name), ...faces.filter(face => face.axis === k).map(face => face.slider))),
-        /** A byte per Gaussian: whether its centre is outside. */
-        outside: () => {
-            const [a, b] = sides.map(inScene);
-            return outside(centers, AXES.map((_, k) => Math.min(a[k], b[k])), AXES.map((_, k) => Math.max(a[k], b[k])));
+        element: make("div", {}, make("p", {}, say("edit_box_how")), ...sliders, button("edit_outside", selectOutside)),
+        choose() {
+            handles.hidden = false;
         },
-        /** Puts the handles to their places in the window; those behind the camera are hidden. */
-        place: () => {
-            for (const { axis, side, handle } of faces) {
-                const [x, y, depth] = project(model(), middle(side, axis), canvas.clientWidth, canvas.clientHeight);
-                handle.hidden = depth <= 0;
-                handle.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
-                handle.style.zIndex = String(Math.round(1e5 / (1 + Math.max(depth, 0))));
-            }
+        leave() {
+            handles.hidden = true;
         },
-        /** The twelve edges in the space of the centres, in short pieces, since those behind the camera are not drawn. */
-        edges: () => {
-            const pieces = 16;
-            return AXES.flatMap((_, axis) =>
-                [0, 1, 2, 3].flatMap(edge => {
-                    const ends = AXES.map((_, k) => (edge >> Number((k + 3 - axis) % 3 === 1)) & 1);
-                    const point = (/** @type {number} */ share) =>
-                        inScene(AXES.map((_, k) => (k === axis ? sides[0][k] + share * (sides[1][k] - sides[0][k]) : sides[ends[k]][k])));
-                    return Array.from({ length: pieces }, (_, i) => [point(i / pieces), point((i + 1) / pieces)]);
-                }),
-            );
+        draw() {
+            overlay.lines(model(), edges());
+            place();
         },
     };
 }
