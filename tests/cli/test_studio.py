@@ -72,10 +72,3 @@ def test_a_studio_that_was_killed_goes_on_at_its_address(start, tmp_path):
     assert again.wait(10) == 0
     other = start("studio", tmp_path, "--no-browser")
     assert address_in(other).split("/")[3] != url.split("/")[3]  # another token
-
-
-def test_a_studio_that_does_not_answer(start, refused, tmp_path):
-    first = start("studio", tmp_path, "--no-browser")
-    address_in(first)
-    (tmp_path / ".studio.json").unlink()
-    assert f"in use by process {first.pid}" in refused("studio", tmp_path, "--no-browser")

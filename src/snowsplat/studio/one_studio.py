@@ -68,9 +68,8 @@ def _address_in(folder: Path) -> Address | None:
     try:
         about = os.lstat(file)
         # Another user could lead the browser elsewhere.
-        if not stat.S_ISREG(about.st_mode) or (
-            hasattr(os, "getuid") and about.st_uid != os.getuid()
-        ):
+        ours = not hasattr(os, "getuid") or about.st_uid == os.getuid()
+        if not (ours and stat.S_ISREG(about.st_mode)):
             return None
         return from_json(Address, read_json(file))
     except (OSError, ValueError):
@@ -84,10 +83,11 @@ def write_address(folder: Path, address: Address) -> None:
 
 
 @contextmanager
-def only_studio(folder: Path) -> Iterator[Address | None]:
+def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None]:
     """Hold the library during the block, which gets the address of a studio that was killed.
 
     A folder that cannot be written, such as that of another user to look at, needs no lock.
+    ``wait``: seconds for a process that is just ending.
 
     Raises:
         Running: another studio has it, and answers.
@@ -99,7 +99,7 @@ def only_studio(folder: Path) -> Iterator[Address | None]:
     with ExitStack() as stack:
         _check_running(folder)
         try:
-            stack.enter_context(locked(folder / _LOCK, f"{folder}: in use by"))
+            stack.enter_context(locked(folder / _LOCK, f"{folder}: in use by", wait))
         except InUse:
             _check_running(folder)  # it has just started
             raise
