@@ -71,8 +71,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             shown = parts;
             update = undefined;
             /** @type {Record<string, (scene: any) => HTMLElement[]>} */
-            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart, found: openingPart };
-            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene), ...(["upload", "running", "found"].includes(parts) ? [] : [keptPart(scene)]));
+            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart, found: openingPart, opening: openingPart };
+            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene), ...(["upload", "running", "found", "opening"].includes(parts) ? [] : [keptPart(scene)]));
         }
         update?.(scene);
     }
@@ -100,7 +100,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         return [make("section.card", {}, bar, line, more)];
     }
 
-    /** A scene of the command line has no site yet. */
+    /** A scene of the command line has no site yet; that of another one is not written. */
     function openingPart() {
         const line = make("p", { role: "status" }, say("opening"));
         const tell = (/** @type {any} */ error) => (line.textContent = error instanceof Refused ? error.message : say("offline"));
