@@ -9,22 +9,43 @@ const AXES = ["x", "y", "z"];
 const SIGNS = [-1, -1, 1]; // of the axes of the scene: the viewer has turned it by 180° about z
 const ARROWS = new Map([["ArrowRight", 1], ["ArrowUp", 1], ["ArrowLeft", -1], ["ArrowDown", -1]]);
 const STEP = 0.01; // of an arrow key, as a share of the first box; ten times as much with Shift
+const PAUSE = 1000; // milliseconds without a key, after which the next one begins another step
 const BEYOND = 0.5; // of the first box, to both sides of it: the range of a slider
 
-/** @param {import("./edit.js").Editing} editing */
-export function addBox({ centers, canvas, overlay, model, select }) {
+/** The first box: its lower and its upper corner. */
+export function boxAround(/** @type {Float32Array} */ centers) {
     const corners = bounds(centers).map(corner => corner.map((value, k) => SIGNS[k] * value));
-    const sides = [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
+    return [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
+}
+
+/** @param {import("./edit.js").Editing} editing */
+export function addBox({ edits, centers, canvas, overlay, model, select, show }) {
+    let sides = edits.present.box;
     const spans = AXES.map((_, k) => sides[1][k] - sides[0][k]);
     const inScene = (/** @type {number[]} */ point) => point.map((value, k) => SIGNS[k] * value);
     const middle = (/** @type {number} */ side, /** @type {number} */ axis) =>
         inScene(AXES.map((_, k) => (k === axis ? sides[side][k] : (sides[0][k] + sides[1][k]) / 2)));
+    // A drag, or keys without a pause between them, are one step that can be undone.
+    let step = 0;
+    let pressed = -Infinity; // the time of the last key
+    /** @type {EventTarget | null} */
+    let focused = null; // its face
 
     /** Moves a face; it takes the opposite one with it. */
     function move(/** @type {number} */ side, /** @type {number} */ axis, /** @type {number} */ value) {
-        sides[side][axis] = value;
-        sides[1 - side][axis] = Math[side ? "min" : "max"](sides[1 - side][axis], value);
-        for (const face of faces) if (face.axis === axis) face.show();
+        if (value === sides[side][axis]) return;
+        const next = sides.map(corner => [...corner]);
+        next[side][axis] = value;
+        next[1 - side][axis] = Math[side ? "min" : "max"](next[1 - side][axis], value);
+        edits.change({ box: next }, `box ${step}`);
+        show();
+    }
+
+    /** A key begins a step after a pause, or on another face. */
+    function begin(/** @type {KeyboardEvent} */ event) {
+        if (event.timeStamp - pressed > PAUSE || event.target !== focused) step++;
+        pressed = event.timeStamp;
+        focused = event.target;
     }
 
     const faces = AXES.flatMap((name, axis) => [0, 1].map(side => addFace(name, axis, side)));
@@ -33,7 +54,10 @@ export function addBox({ centers, canvas, overlay, model, select }) {
         const label = say(side ? "edit_to" : "edit_from", name);
         const first = sides[side][axis];
         const slider = /** @type {HTMLInputElement} */ (
-            make("input", { type: "range", step: "any", "aria-label": label, title: label, input: () => move(side, axis, Number(slider.value)) })
+            make("input", { type: "range", step: "any", "aria-label": label, title: label,
+                input: () => move(side, axis, Number(slider.value)),
+                pointerdown: () => step++,
+                keydown: begin })
         );
         slider.min = String(first - (side ? 1 : BEYOND) * spans[axis]);
         slider.max = String(first + (side ? BEYOND : 1) * spans[axis]);
@@ -44,6 +68,7 @@ export function addBox({ centers, canvas, overlay, model, select }) {
             if (!event.isPrimary || event.button) return;
             event.stopPropagation(); // it is not for the camera
             handle.setPointerCapture(event.pointerId);
+            step++;
             held = { from: sides[side][axis], place: [event.clientX, event.clientY], point: middle(side, axis) };
         });
         handle.addEventListener("pointermove", event => {
@@ -59,6 +84,7 @@ export function addBox({ centers, canvas, overlay, model, select }) {
             const way = ARROWS.get(event.key);
             if (!way) return;
             event.preventDefault();
+            begin(event);
             move(side, axis, sides[side][axis] + way * STEP * (event.shiftKey ? 10 : 1) * spans[axis]);
         });
         // They are not for the camera.
@@ -111,6 +137,11 @@ export function addBox({ centers, canvas, overlay, model, select }) {
         },
         leave() {
             handles.hidden = true;
+        },
+        show() {
+            if (sides === edits.present.box) return;
+            sides = edits.present.box;
+            for (const face of faces) face.show();
         },
         draw() {
             overlay.lines(model(), edges());

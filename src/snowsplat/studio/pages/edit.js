@@ -1,7 +1,7 @@
 // The editor in the page of a finished scene; see tools.js. Each of its tools has a file of its own. The
 // scene is changed in `Edits`, and everything is shown from there.
 
-import { addBox } from "./box.js";
+import { addBox, boxAround } from "./box.js";
 import { DELETED, Edits, SELECTED } from "./edits.js";
 import { addLevel } from "./level.js";
 import { addNotes, notesOf } from "./notes.js";
@@ -69,7 +69,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     const { viewer, scene, camera, canvas, hiding, panel, presentView } = page;
     const { app } = viewer;
     const entity = app.root.findByName("gsplat");
-    const edits = new Edits(centers.length / 3, notesOf(page));
+    const edits = new Edits(centers.length / 3, notesOf(page), boxAround(centers));
     const placement = addPlacement(page, edits);
     const overlay = addOverlay(canvas);
     const told = make("p", { role: "status" });
@@ -175,7 +175,9 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     const undo = button("edit_undo", change(() => go("undo")));
     const redo = button("edit_redo", change(() => go("redo")));
     function go(/** @type {"undo" | "redo"} */ way) {
+        const { box } = edits.present;
         edits[way]();
+        if (edits.present.box !== box && tool !== "box") choose("box"); // what is undone is seen
         tell("");
     }
     const counts = make("p", { role: "status" });
