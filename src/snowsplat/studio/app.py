@@ -61,7 +61,7 @@ from snowsplat.studio.hand_on import (
 )
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
-from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
+from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, uploads, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.html import CHINESE
@@ -133,7 +133,7 @@ class _Studio:
             ("/picture", "GET", self._picture),
             ("/open", "POST", self._open),
             ("/rename", "POST", self._rename),
-            ("/uploads", "GET", self._received),
+            ("/uploads", "GET", self._uploads),
             ("/uploads", "PUT", self._upload),
             ("/survey", "POST", self._survey),
             ("/start", "POST", self._start),
@@ -259,12 +259,13 @@ class _Studio:
                 await asyncio.to_thread(job.work, "rename", scene.folder, title)
         return {}
 
-    async def _received(self, request: Request, scene: Scene) -> Any:
-        return await asyncio.to_thread(received, scene)
+    async def _uploads(self, request: Request, scene: Scene) -> Any:
+        return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
 
     async def _upload(self, request: Request, scene: Scene) -> Any:
         query = request.query_params
-        size, start = (_whole(query.get(name)) for name in ("size", "start"))
+        numbers = (_whole(query.get(name)) for name in ("size", "modified", "start"))
+        file = Upload(query.get("path", ""), *numbers)
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then add photos")
         if scene.found:
@@ -272,10 +273,9 @@ class _Studio:
         if scene.job.inputs:
             raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
         data = await request.body()
-        path = query.get("path", "")
         async with self._locks[scene.name, "upload"]:
             self._library.find(scene.name)  # it may have been removed meanwhile
-            return {"received": await asyncio.to_thread(write_part, scene, path, size, start, data)}
+            return {"received": await asyncio.to_thread(write_part, scene, file, data)}
 
     async def _survey(self, request: Request, scene: Scene) -> Any:
         async with self._locks["", "survey"]:
@@ -522,7 +522,7 @@ async def _object(request: Request) -> dict[str, Any]:
 
 def _whole(text: str | None) -> int:
     if text is None or not (text.isascii() and text.isdecimal()) or len(text) > 18:
-        raise UserError("size and start are whole numbers of bytes")
+        raise UserError("size, modified and start are whole numbers")
     return int(text)
 
 

@@ -40,6 +40,8 @@ from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
 
 _JOB = "job.json"
+#: The ending of an upload that is not complete.
+PART = ".part"
 #: What a process of its own does for a scene, and the files of its state, lock and output.
 TASKS = {
     "make": ("state.json", ".job.lock", "log.txt"),
@@ -157,7 +159,7 @@ class Scene:
         if given:
             return [Path(path) for path in given]
         entries = sorted(self.photos.iterdir()) if self.photos.is_dir() else []
-        entries = [entry for entry in entries if not entry.name.startswith(".")]
+        entries = [e for e in entries if not (e.name.startswith(".") or e.name.endswith(PART))]
         zips = [entry for entry in entries if entry.suffix.lower() == ".zip"]
         # The folders into which zip files were unpacked are no further inputs.
         unpacked = {name for entry in zips for name in (entry.stem, f"{entry.stem}_unpacked")}

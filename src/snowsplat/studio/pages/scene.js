@@ -143,10 +143,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
         async function look() {
             try {
-                const arrived = scene.inputs.length ? 1 : Object.keys(await ask(`${address}/uploads`)).length;
-                const found = arrived ? await ask(`${address}/survey`, "POST") : null;
+                /** @type {any[]} */
+                const files = uploaded ? await ask(`${address}/uploads`) : [];
+                const parts = files.filter(file => file.received < file.size).length;
+                const found = !uploaded || files.length > parts ? await ask(`${address}/survey`, "POST") : null;
                 if (closed.aborted || shown !== "new") return;
                 facts.replaceChildren(...(found ? factsOf(found.facts) : [make("p", {}, say("no_files"))]));
+                if (parts) facts.append(make("p.bad", { role: "alert" }, say("not_arrived", parts)));
                 if (uploaded) facts.append(moreFiles());
                 form.hidden = !found;
                 for (const [quality, seconds] of Object.entries(found?.seconds ?? {})) {
