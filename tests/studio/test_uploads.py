@@ -1,5 +1,6 @@
 """Uploads: parts in order, resume, paths that lead elsewhere, full disks."""
 
+import os
 import shutil
 from types import SimpleNamespace
 
@@ -35,6 +36,19 @@ def test_a_file_appears_when_it_is_complete(scene):
     assert send(scene, "tour/a.jpg", 10, 5, b"56789") == 10  # its answer was lost
     assert send(scene, "empty", 0, 0, b"") == 0
     assert (scene.photos / "empty").read_bytes() == b""
+
+
+def test_killed_before_a_complete_file_has_its_name(scene, monkeypatch):
+    """Its last part is sent again, or none."""
+    for name, start, data in (("a.jpg", 5, b"56789"), ("b.jpg", 10, b"")):
+        send(scene, name, 10, 0, b"01234")
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "utime", lambda *_, **__: {}["killed"])
+            with pytest.raises(KeyError):
+                send(scene, name, 10, 5, b"56789")
+        assert not (scene.photos / name).exists()
+        assert send(scene, name, 10, start, data) == 10
+        assert (scene.photos / name).read_bytes() == b"0123456789"
 
 
 def test_parts_that_do_not_follow(scene):

@@ -104,7 +104,9 @@ def write_part(scene: Scene, file: Upload, data: bytes) -> int:
     part = target.with_name(f"{target.name}.{size}-{file.modified}{PART}")
     before = part.stat().st_size if part.is_file() else 0
     end = file.received + len(data)
-    if file.received != before or end > size:
+    if part.is_file() and before == size:  # all was written, and then the process was killed
+        end, data = size, b""
+    elif file.received != before or end > size:
         raise WrongPart(f"{path}: {before} bytes of it have arrived", before)
     free = shutil.disk_usage(target.parent).free
     if size - before + _RESERVE > free:
