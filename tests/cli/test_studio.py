@@ -1,6 +1,7 @@
 """`snowsplat studio`: prints the address of the page, ends on Ctrl-C, and needs no torch."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -36,3 +37,38 @@ def test_the_server_has_no_torch():
     code = f"import sys, {modules}; print('torch' in sys.modules, 'cv2' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True)
     assert done.stdout == b"False False\n"
+
+
+def address_in(process: subprocess.Popen[str]) -> str:
+    lines = process.stdout.readline() + process.stdout.readline()
+    return re.search(r"http://127\.0\.0\.1:\S+", lines)[0]
+
+
+def test_a_second_studio_opens_the_first(start, refused, tmp_path):
+    """Also by another path; with other settings, it says why not."""
+    scenes, other = tmp_path / "scenes", tmp_path / "other"
+    first = start("studio", scenes, "--no-browser")
+    url = address_in(first)
+    other.symlink_to(scenes)
+    second = start("studio", other, "--no-browser")
+    assert address_in(second) == url
+    assert second.wait(10) == 0
+    assert "end that one with Ctrl-C" in refused("studio", scenes, "--port", "1024")
+    if hasattr(os, "getuid"):  # it has the token
+        assert (scenes / ".studio.json").stat().st_mode & 0o77 == 0
+    first.send_signal(signal.SIGINT)
+    assert first.wait(10) == 0
+    assert list(scenes.iterdir()) == []
+
+
+def test_a_studio_that_was_killed_goes_on_at_its_address(start, tmp_path):
+    first = start("studio", tmp_path, "--no-browser")
+    url = address_in(first)
+    first.kill()
+    first.wait()
+    again = start("studio", tmp_path, "--no-browser")
+    assert address_in(again) == url
+    again.send_signal(signal.SIGINT)
+    assert again.wait(10) == 0
+    other = start("studio", tmp_path, "--no-browser")
+    assert address_in(other).split("/")[3] != url.split("/")[3]  # another token

@@ -14,6 +14,7 @@ from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames
+from snowsplat.pipeline.output import edit_record
 from snowsplat.pipeline.output.edit_record import Note, PageEdit, read_record, shown_file
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.page_film import PageFilm
@@ -250,3 +251,37 @@ def test_the_page_is_that_of_the_scene(scene, tmp_path):
 def test_impossible_changes(wrong, why):
     with pytest.raises(ValueError, match=why):
         PageEdit(**{"count": N, "removed": bits(np.zeros(N, bool)), **wrong})
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("moment", ["file", "announced", "replaced", "record"])
+def test_a_process_that_is_killed_leaves_one_edit_or_the_other(scene, tmp_path, moment):
+    """At each moment of a second edit, the scene that is shown has its own record."""
+    first = edit(scene, tmp_path / "site", PageEdit(N, bits(np.arange(N) < 3), scale=2.0))
+    publish(first, tmp_path / "site", overwrite=True)
+    was = (first.read_bytes(), read_record(first))
+
+    def write(path, value):
+        stage = {"tour_edited.next.json": "announced", "tour_edited.json": "record"}[path.name]
+        if moment == {"announced": "file", "record": "replaced"}[stage]:
+            raise Killed
+        write_json(path, value)
+        if moment == stage:
+            raise Killed
+
+    again = PageEdit(N - 3, bits(np.arange(N - 3) < 4), scale=3.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(edit_record, "write_json", write)
+        with pytest.raises(Killed):
+            edit(first, tmp_path / "site", again)
+    shown = shown_file(scene)
+    if moment in ("file", "announced"):
+        assert (shown.read_bytes(), read_record(shown)) == was
+    else:
+        record = read_record(shown)
+        assert (record.removed, record.scale, len(read_gaussians(shown))) == (7, 6.0, N - 7)
+    assert undo_edits(shown) == scene
+    assert [file.name for file in scene.parent.glob("tour_edited*")] == []

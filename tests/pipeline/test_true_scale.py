@@ -16,7 +16,7 @@ from snowsplat.data.placement import PLACEMENT, Placement
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.output.edit_record import EditRecord, write_record
+from snowsplat.pipeline.output.edit_record import EditRecord, record_file
 from snowsplat.pipeline.true_scale import KnownDistance
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
@@ -103,7 +103,7 @@ def test_it_is_between_photos(tmp_path: Path) -> None:
     assert KnownDistance("6m", between).metres_per_unit(file) == pytest.approx(2)
     edited = file.with_name("point_cloud_edited.ply")
     write_gaussians(edited, scene())
-    write_record(edited, EditRecord(file.name, 0, scale=4.0))
+    write_json(record_file(edited), asdict(EditRecord(file.name, 0, scale=4.0)))
     assert KnownDistance("6m", between).metres_per_unit(edited) == pytest.approx(0.5)
     convert(file, tmp_path / "true.ply", known=KnownDistance("6m", between))
     assert read_gaussians(tmp_path / "true.ply").metres_per_unit == 1

@@ -166,5 +166,6 @@ def finished(library) -> Scene:
     scene.change(quality="draft")
     facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": []}
     result = {"file": file.name, "aligned": False, "reports": {}, **facts}
+    result["shown"] = [str(file.stat().st_mtime_ns), scene.job.title]
     scene.write_state({"outcome": "done", "result": result})
     return scene

@@ -47,12 +47,15 @@ def test_the_page_and_its_parts(studio):
 def test_an_upload_and_what_became_of_it(studio):
     name = new(studio)
     assert studio.ask("scenes")[1][0]["status"] == "new"
-    address = f"scenes/{name}/uploads?path=b/photo.jpg&size=6"
+    address = f"scenes/{name}/uploads?path=b/photo.jpg&size=6&modified=7000"
     assert studio.ask(f"{address}&start=0", "PUT", b"abc") == (200, {"received": 3})
     status, answer = studio.ask(f"{address}&start=0", "PUT", b"abc")
     assert (status, answer["received"]) == (409, 3)
     assert studio.ask(f"{address}&start=3", "PUT", b"def") == (200, {"received": 6})
-    assert studio.ask(f"scenes/{name}/uploads") == (200, {"b/photo.jpg": 6})
+    assert studio.ask(f"scenes/{name}/uploads") == (
+        200,
+        [{"path": "b/photo.jpg", "size": 6, "modified": 7000, "received": 6}],
+    )
     scene = studio.library.find(name)
     assert (scene.photos / "b/photo.jpg").read_bytes() == b"abcdef"
 
@@ -61,7 +64,7 @@ def test_start_and_stop(studio, holder):
     name = new(studio)
     status, answer = studio.ask(f"scenes/{name}/start", "POST", {"quality": "draft"})
     assert (status, "no photos yet" in answer["error"]) == (400, True)
-    studio.ask(f"scenes/{name}/uploads?path=a.jpg&size=1&start=0", "PUT", b"x")
+    studio.ask(f"scenes/{name}/uploads?path=a.jpg&size=1&modified=7000&start=0", "PUT", b"x")
     for wanted in ({"quality": "great"}, {"minutes": 0}, {"minutes": -1}, {"minutes": 1e9}):
         assert studio.ask(f"scenes/{name}/start", "POST", wanted)[0] == 400
     assert studio.ask(f"scenes/{name}/start", "POST", b"[]")[0] == 400
@@ -71,7 +74,9 @@ def test_start_and_stop(studio, holder):
     scene = studio.ask(f"scenes/{name}")[1]
     assert (scene["status"], scene["minutes"], scene["title"]) == ("running", 5, "b")
     assert "--minutes 5" in scene["command"]
-    status, answer = studio.ask(f"scenes/{name}/uploads?path=b.jpg&size=1&start=0", "PUT", b"x")
+    status, answer = studio.ask(
+        f"scenes/{name}/uploads?path=b.jpg&size=1&modified=7000&start=0", "PUT", b"x"
+    )
     assert (status, "is being made" in answer["error"]) == (400, True)
     while "process" not in studio.library.find(name).state():
         time.sleep(0.05)
@@ -153,7 +158,7 @@ def test_folders_of_the_machine(studio, tmp_path):
         assert "\n" not in answer["error"]
     scene = studio.library.find(new(studio, title="", path=str(tmp_path / "tour")))
     assert (scene.job.title, scene.inputs()) == ("tour", [tmp_path / "tour"])
-    address = f"scenes/{scene.name}/uploads?path=x&size=1&start=0"
+    address = f"scenes/{scene.name}/uploads?path=x&size=1&modified=7000&start=0"
     assert "add the photos there" in studio.ask(address, "PUT", b"x")[1]["error"]
     for wrong in ("tour", "~nobody-of-this-name/x", "/\ud800", "/a\0b", "/" + 5000 * "x"):
         status, answer = studio.ask("scenes", "POST", {"path": wrong})
@@ -198,15 +203,16 @@ def test_claims_and_floods_write_nothing_outside(studio, tmp_path):
     name = new(studio)
     base = clients.path(studio.server.url)
     host = f"Host: 127.0.0.1:{studio.server.port}"
-    head = f"PUT {base}scenes/{name}/uploads?path=x&size=10000000000&start=0 HTTP/1.1\r\n{host}\r\n"
+    target = f"{base}scenes/{name}/uploads?path=x&size=10000000000&modified=0&start=0"
+    head = f"PUT {target} HTTP/1.1\r\n{host}\r\n"
     answer = clients.ask(studio.server.url, f"{head}Content-Length: 10000000000\r\n\r\n".encode())
     assert clients.status(answer) == 413
     status, answer = studio.ask(
-        f"scenes/{name}/uploads?path=x&size=1{'0' * 16}&start=0", "PUT", b"x"
+        f"scenes/{name}/uploads?path=x&size=1{'0' * 16}&modified=7000&start=0", "PUT", b"x"
     )
     assert (status, "do not fit" in answer["error"]) == (507, True)
     for size, start in (("-1", "0"), ("x", "0"), ("1" * 30, "0"), ("1", "%C2%B2"), ("", "")):
-        path = f"scenes/{name}/uploads?path=x&size={size}&start={start}"
+        path = f"scenes/{name}/uploads?path=x&size={size}&modified=7000&start={start}"
         assert studio.ask(path, "PUT", b"x")[0] == 400
     outside = files(tmp_path) - files(studio.library.folder)
     slow = [clients.open_socket(studio.server.url) for _ in range(20)]
@@ -231,7 +237,9 @@ def test_claims_and_floods_write_nothing_outside(studio, tmp_path):
         path = "".join(chance.choices(parts, k=chance.randrange(1, 8)))
         method = chance.choice(["GET", "PUT", "POST"])
         with contextlib.suppress(ConnectionError):
-            status, _ = studio.ask(f"scenes/{name}/uploads?size=1&start=0&path={path}", "PUT", b"x")
+            status, _ = studio.ask(
+                f"scenes/{name}/uploads?size=1&modified=7000&start=0&path={path}", "PUT", b"x"
+            )
             assert status in (200, 400, 409), path
             assert studio.ask(path, method, None if method == "GET" else b"{}")[0] < 500, path
     assert studio.ask("scenes")[0] == 200

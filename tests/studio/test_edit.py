@@ -77,7 +77,9 @@ def test_a_scene_of_the_command_line_is_opened_edited_and_handed_on(studio):
     of_the_command_line(studio.library.folder / "tour", 7)
     assert studio.ask(address)[1]["status"] == "found"
     assert studio.ask(f"{address}/start", "POST", {})[0] == 400
-    assert studio.ask(f"{address}/uploads?path=a&size=1&start=0", "PUT", b"x")[0] == 400
+    assert (
+        studio.ask(f"{address}/uploads?path=a&size=1&modified=7000&start=0", "PUT", b"x")[0] == 400
+    )
     assert studio.ask(address, "DELETE")[0] == 400
     assert file.is_file()
 

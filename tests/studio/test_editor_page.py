@@ -1,6 +1,7 @@
 """The tools of the editor in the 3D view, by real clicks: the handles of the box, a level floor."""
 
 import math
+import time
 
 import pytest
 import torch
@@ -79,9 +80,14 @@ def faces(page: Page) -> list[float]:
     )
 
 
-def key(page: Page, name: str) -> None:
+def key(page: Page, name: str, *, control: bool = False, at: float | None = None) -> None:
+    """``at``: seconds since 1970, of the event."""
+    more = {} if at is None else {"timestamp": at}
     for kind in ("rawKeyDown", "keyUp"):
-        page.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
+        modifiers = 2 * control
+        page.call(
+            "Input.dispatchKeyEvent", type=kind, key=name, code=name, modifiers=modifiers, **more
+        )
 
 
 @pytest.mark.usefixtures("in_process")
@@ -111,9 +117,26 @@ def test_box_and_level_by_clicks(studio, finished):
         left = "document.querySelector('.snow-handle').getBoundingClientRect().left"
         page.wait_for(f"Math.abs({left} - {first - 60}) < 1.5")
         page.evaluate("document.querySelectorAll('.snow-handle')[1].focus()")
-        key(page, "ArrowLeft")
-        step = (before[1] - before[0]) / 100
-        assert faces(page)[1] == pytest.approx(before[1] - step)
+        # Keys with a short time between them are one step; a drag is one, too.
+        begin, step = time.time(), (before[1] - before[0]) / 100
+        for seconds in (0.0, 0.3, 0.6, 2.0):
+            key(page, "ArrowLeft", at=begin + seconds)
+        assert faces(page)[1] == pytest.approx(before[1] - 4 * step)
+        end = faces(page)
+        key(page, "z", control=True)
+        assert faces(page)[1] == pytest.approx(before[1] - 3 * step)
+        key(page, "z", control=True)
+        assert faces(page) == after
+        press(page, "Box")  # the box is closed, and shown again by what undoes a step of it
+        assert page.evaluate("document.querySelector('.snow-handles').hidden")
+        key(page, "z", control=True)
+        assert not page.evaluate("document.querySelector('.snow-handles').hidden")
+        assert faces(page) == before
+        press(page, "Redo")
+        assert faces(page) == after
+        for _ in range(2):
+            key(page, "y", control=True)
+        assert faces(page) == end
         press(page, "Select what is outside")
         shown = page.evaluate("document.querySelector('.snow-edit > p').textContent")
         assert 10 < int(shown.split()[0].replace(",", "")) < len(floor) / 2

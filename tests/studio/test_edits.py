@@ -44,6 +44,9 @@ def random_calls(random: np.random.Generator, count: int) -> list[list[Any]]:
     def typed(k: int) -> list[Any]:
         return ["change", {"notes": [NOTE | {"title": "A" * k}]}, "title 0"]
 
+    def dragged() -> list[Any]:
+        return ["change", {"box": random.normal(size=(2, 3)).tolist()}, "box 1"]
+
     makers = [
         lambda: ["select", found(), "replace"],
         lambda: ["select", found(), "add"],
@@ -55,6 +58,7 @@ def random_calls(random: np.random.Generator, count: int) -> list[list[Any]]:
         lambda: ["change", {"scale": random.uniform()}],
         lambda: ["change", {"start": random.normal(size=8).tolist()}],
         *[lambda: typed(int(random.integers(1, 9)))] * 3,
+        *[dragged] * 3,
         *[lambda: ["undo"]] * 4,
         *[lambda: ["redo"]] * 3,
     ]
@@ -65,9 +69,10 @@ def test_undo_and_redo_return_the_same_bits():
     """All operations, in a random sequence: each undo returns exactly what was before the step."""
     calls = [*random_calls(np.random.default_rng(3), 400), *[["undo"]] * 60, *[["redo"]] * 60]
     steps = asked(calls=calls)["steps"]
-    present = {"state": [0] * COUNT, "turn": [1, 0, 0, 0], "scale": 1, "start": None, "notes": []}
+    present: dict[str, Any] = {"state": [0] * COUNT, "turn": [1, 0, 0, 0], "scale": 1}
+    present |= {"start": None, "notes": [], "box": []}
     past, future = [], []
-    typing = False
+    typing = None  # the name of a step that goes on
     undone = redone = 0
     for call, found in zip(calls, steps, strict=True):
         if call[0] in ("undo", "redo"):
@@ -76,14 +81,14 @@ def test_undo_and_redo_return_the_same_bits():
                 forth.append(present)
                 present = back.pop()
                 undone, redone = undone + (call[0] == "undo"), redone + (call[0] == "redo")
-                typing = False
+                typing = None
             assert found == present
         elif found != present or call[0] == "change":
-            goes_on = typing and call[2:] == ["title 0"]  # in the same field
-            if not goes_on:
+            named = call[2] if call[0] == "change" and len(call) == 3 else None
+            if named is None or named != typing:
                 past = [*past, present][-40:]
             future.clear()
-            typing = call[2:] == ["title 0"]
+            typing = named
             present = found
     assert (undone, redone) > (50, 20)
 

@@ -1,5 +1,6 @@
 """Uploads: parts in order, resume, paths that lead elsewhere, full disks."""
 
+import os
 import shutil
 from types import SimpleNamespace
 
@@ -7,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snowsplat.studio.uploads import NoSpace, WrongPart, received, safe_path, write_part
+from snowsplat.studio import uploads
+from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, safe_path, write_part
 from snowsplat.util.errors import UserError
 
 
@@ -16,28 +18,71 @@ def scene(library):
     return library.new("a", [])
 
 
+def send(scene, path: str, size: int, start: int, data: bytes, modified: int = 7) -> int:
+    return write_part(scene, Upload(path, size, modified, start), data)
+
+
+def received(scene) -> dict[str, int]:
+    return {file.path: file.received for file in uploads.uploads(scene)}
+
+
 def test_a_file_appears_when_it_is_complete(scene):
-    assert write_part(scene, "tour/a.jpg", 10, 0, b"01234") == 5
+    assert send(scene, "tour/a.jpg", 10, 0, b"01234") == 5
     assert not (scene.photos / "tour/a.jpg").exists()
     assert received(scene) == {"tour/a.jpg": 5}
-    assert write_part(scene, "tour/a.jpg", 10, 5, b"56789") == 10
+    assert send(scene, "tour/a.jpg", 10, 5, b"56789") == 10
     assert (scene.photos / "tour/a.jpg").read_bytes() == b"0123456789"
     assert received(scene) == {"tour/a.jpg": 10}
-    assert write_part(scene, "tour/a.jpg", 10, 5, b"56789") == 10  # its answer was lost
-    assert write_part(scene, "empty", 0, 0, b"") == 0
+    assert send(scene, "tour/a.jpg", 10, 5, b"56789") == 10  # its answer was lost
+    assert send(scene, "empty", 0, 0, b"") == 0
     assert (scene.photos / "empty").read_bytes() == b""
 
 
+def test_killed_before_a_complete_file_has_its_name(scene, monkeypatch):
+    """Its last part is sent again, or none."""
+    for name, start, data in (("a.jpg", 5, b"56789"), ("b.jpg", 10, b"")):
+        send(scene, name, 10, 0, b"01234")
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "utime", lambda *_, **__: {}["killed"])
+            with pytest.raises(KeyError):
+                send(scene, name, 10, 5, b"56789")
+        assert not (scene.photos / name).exists()
+        assert send(scene, name, 10, start, data) == 10
+        assert (scene.photos / name).read_bytes() == b"0123456789"
+
+
 def test_parts_that_do_not_follow(scene):
-    write_part(scene, "a.jpg", 10, 0, b"01234")
+    send(scene, "a.jpg", 10, 0, b"01234")
     for start, data in ((0, b"01234"), (6, b"6789"), (5, b"567890")):
         with pytest.raises(WrongPart) as refused:
-            write_part(scene, "a.jpg", 10, start, data)
+            send(scene, "a.jpg", 10, start, data)
         assert refused.value.received == 5
-    write_part(scene, "a.jpg", 10, 5, b"56789")
-    with pytest.raises(WrongPart, match="another file of this name"):
-        write_part(scene, "a.jpg", 11, 0, b"other")
+    send(scene, "a.jpg", 10, 5, b"56789")
     assert (scene.photos / "a.jpg").read_bytes() == b"0123456789"
+
+
+def test_files_of_the_same_name_are_kept(scene):
+    """Parts of two files are never mixed; a file that is there already is not kept twice."""
+    send(scene, "a.jpg", 10, 0, b"01234")
+    send(scene, "a.jpg", 10, 0, b"abcde", modified=8)
+    send(scene, "a.jpg", 8, 0, b"ABCD")
+    assert {(f.size, f.modified, f.received) for f in uploads.uploads(scene)} == {
+        (10, 7, 5),
+        (10, 8, 5),
+        (8, 7, 4),
+    }
+    with pytest.raises(UserError, match="no photos yet"):
+        scene.inputs()  # nothing is complete
+    send(scene, "a.jpg", 10, 5, b"fghij", modified=8)
+    send(scene, "a.jpg", 10, 5, b"56789")
+    send(scene, "a.jpg", 8, 4, b"EFGH")
+    files = {"a.jpg": b"abcdefghij", "a-2.jpg": b"0123456789", "a-3.jpg": b"ABCDEFGH"}
+    for _ in range(2):
+        assert {file.name: file.read_bytes() for file in scene.photos.iterdir()} == files
+        assert send(scene, "a.jpg", 10, 0, b"01234") == 10  # dropped again
+        assert send(scene, "a.jpg", 8, 0, b"ABCDEFGH", modified=9) == 8  # a copy
+    with pytest.raises(UserError, match="9999"):
+        send(scene, "a.jpg", 10, 0, b"01234", modified=10**17)
 
 
 @pytest.mark.parametrize(
@@ -57,14 +102,14 @@ def test_parts_that_do_not_follow(scene):
 )
 def test_paths_stay_inside(scene, path, safe):
     assert safe_path(path).as_posix() == safe
-    write_part(scene, path, 1, 0, b"x")
+    send(scene, path, 1, 0, b"x")
     assert list(received(scene)) == [safe]
 
 
 @pytest.mark.parametrize("path", ["", "/", "..", "../..", "\\"])
 def test_paths_without_a_name(scene, path):
     with pytest.raises(UserError, match="has no name"):
-        write_part(scene, path, 1, 0, b"x")
+        send(scene, path, 1, 0, b"x")
 
 
 @given(st.text(max_size=300))
@@ -78,23 +123,23 @@ def test_no_path_leads_outside(text):
 
 
 def test_files_in_the_place_of_folders(scene):
-    write_part(scene, "a", 1, 0, b"x")
+    send(scene, "a", 1, 0, b"x")
     with pytest.raises(UserError, match="a part of its folder is a file"):
-        write_part(scene, "a/b.jpg", 1, 0, b"x")
-    write_part(scene, "c/d.jpg", 1, 0, b"x")
-    with pytest.raises(UserError, match="there is a folder of this name"):
-        write_part(scene, "c", 1, 0, b"x")
+        send(scene, "a/b.jpg", 1, 0, b"x")
+    send(scene, "c/d.jpg", 1, 0, b"x")
+    send(scene, "c", 1, 0, b"x")
+    assert (scene.photos / "c-2").read_bytes() == b"x"
 
 
 def test_a_full_disk(scene, monkeypatch):
     """What a file still needs must be free, and something for the job."""
     with pytest.raises(NoSpace, match="do not fit on the disk"):
-        write_part(scene, "huge.mp4", 10**16, 0, b"x")
+        send(scene, "huge.mp4", 10**16, 0, b"x")
     assert received(scene) == {}
-    write_part(scene, "a.jpg", 10, 0, b"01234")
+    send(scene, "a.jpg", 10, 0, b"01234")
     usage = SimpleNamespace(free=1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     with pytest.raises(NoSpace, match="free some space"):
-        write_part(scene, "a.jpg", 10, 5, b"56789")
+        send(scene, "a.jpg", 10, 5, b"56789")
     usage.free = 1 << 40
-    assert write_part(scene, "a.jpg", 10, 5, b"56789") == 10
+    assert send(scene, "a.jpg", 10, 5, b"56789") == 10

@@ -5,14 +5,22 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.page_flags import AllowHost
-from snowsplat.cli.view import serve
-from snowsplat.viewer.hosts import ANY_HOST, is_loopback
+from snowsplat.cli.view import serve, show
+from snowsplat.util.errors import UserError
+from snowsplat.viewer.hosts import ANY_HOST, LOCAL_HOST, KnownHosts, is_loopback
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp
+
+    from snowsplat.studio.library import Library
+    from snowsplat.studio.one_studio import Address
+    from snowsplat.viewer.http.server import WebServer
 
 
 @dataclass
@@ -28,7 +36,8 @@ class Studio:
       Drop photos, a folder, a zip file or a video on the page, or choose a folder
       of this computer. Everything stays on this computer. A scene is made by a
       process of its own: it goes on if the page or the studio is closed, and
-      resumes after an interruption. Ctrl-C ends the studio only.
+      resumes after an interruption. Ctrl-C ends the studio only. If a studio has
+      the folder already, its page is opened.
     """
 
     folder: Annotated[
@@ -45,11 +54,21 @@ class Studio:
 
     def run(self) -> int:
         """Returns the exit code: 0, also after Ctrl-C, the usual end."""
-        from snowsplat.studio.app import POLICY, own_address, studio_app
         from snowsplat.studio.library import Library, default_folder
-        from snowsplat.viewer.http.server import WebServer
+        from snowsplat.studio.one_studio import Running, only_studio
 
         library = Library(self.folder or default_folder())
+        try:
+            with only_studio(library.folder) as killed, suppress(KeyboardInterrupt):
+                self._serve(library, killed)
+        except Running as running:
+            self._open(library, running.address)
+        return 0
+
+    def _serve(self, library: Library, killed: Address | None) -> None:
+        from snowsplat.studio.app import own_address, studio_app
+        from snowsplat.studio.one_studio import Address, write_address
+
         servers: list[WebServer] = []
 
         def addresses() -> list[str]:
@@ -58,13 +77,34 @@ class Studio:
             open_here = here is not None and not is_loopback(here)
             return ([server.url_at(str(here))] if open_here else []) + server.others
 
-        app = studio_app(library, addresses)
-        policy = {"Content-Security-Policy": POLICY}
-        with (
-            suppress(KeyboardInterrupt),
-            WebServer(app, self.host, self.port, self.allow_host, policy) as server,
-        ):
+        with self._server(studio_app(library, addresses), killed) as server:
             servers.append(server)
+            with suppress(OSError):  # a full disk: then a second studio is refused
+                address = Address(server.url, self.host, server.port, server.token, server.others)
+                write_address(library.folder, address)
             print(f"scenes are kept in {library.folder}")
             serve(server, browser=not self.no_browser)
-        return 0
+
+    def _server(self, app: ASGIApp, killed: Address | None) -> WebServer:
+        """At the address of a studio that was killed, if possible: its pages go on."""
+        from snowsplat.studio.app import POLICY
+        from snowsplat.viewer.http.server import WebServer
+
+        policy = {"Content-Security-Policy": POLICY}
+        if killed is not None and killed.host == self.host and self.port in (0, killed.port):
+            with suppress(UserError):  # another program has the port now
+                return WebServer(app, self.host, killed.port, self.allow_host, policy, killed.token)
+        return WebServer(app, self.host, self.port, self.allow_host, policy)
+
+    def _open(self, library: Library, address: Address) -> None:
+        """Raises: UserError: it has other settings than were asked for."""
+        other_host = self.host not in (LOCAL_HOST, address.host)
+        names = KnownHosts(self.host, self.allow_host).allowed
+        known = all(f"https://{name}/{address.token}/" in address.others for name in names)
+        if other_host or not known or self.port not in (0, address.port):
+            raise UserError(
+                f"{library.folder}: is open in another studio, with host {address.host} and port "
+                f"{address.port}; end that one with Ctrl-C first, or omit the flags"
+            )
+        print(f"scenes are kept in {library.folder}")
+        show("a studio has them open already", address.url, address.others, not self.no_browser)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import webbrowser
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,14 +78,18 @@ class View:
 
 
 def serve(server: WebServer, browser: bool) -> None:
-    """Print the addresses of a page, open it if there is a ``browser`` and a screen, and wait for
-    Ctrl-C."""
-    print(f"open this in a browser, Ctrl-C ends it: {server.url}", flush=True)
-    for line in for_other_computers(server.url, server.others):
+    """Show a page, see `show`, and wait for Ctrl-C."""
+    show("open this in a browser, Ctrl-C ends it", server.url, server.others, browser)
+    wait()
+
+
+def show(how: str, url: str, others: Sequence[str], browser: bool) -> None:
+    """Print the addresses of a page, and open it if there is a ``browser`` and a screen."""
+    print(f"{how}: {url}", flush=True)
+    for line in for_other_computers(url, others):
         print(line, flush=True)
     if browser and has_screen():
-        open_browser(server.url)
-    wait()
+        open_browser(url)
 
 
 def open_browser(url: str) -> None:

@@ -17,15 +17,14 @@ from snowsplat.pipeline.output.edit_record import (
     PageEdit,
     edited_file,
     read_record,
-    record_file,
-    write_record,
+    remove_edited,
+    written_with_record,
 )
 from snowsplat.pipeline.output.scene_source import load_viewable, moved_origin
 from snowsplat.scene.edit import transform, with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
 from snowsplat.viewer.web.panel import numbers_of, rotation_of_page, view_of_page
 from snowsplat.viewer.web.publication import SCENE
 
@@ -105,11 +104,8 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         turn=turn,
     )
     target = edited_file(scene)
-    with atomic_path(target) as temporary:
+    with written_with_record(target, record) as temporary:
         write_ply(temporary, GaussianArrays.from_gaussians(kept))
-        # Until both are there, there is no edited scene.
-        record_file(target).unlink(missing_ok=True)
-    write_record(target, record)
     return target
 
 
@@ -122,8 +118,7 @@ def undo_edits(edited: Path | str) -> Path:
     record = read_record(edited)
     if record is None:
         raise UserError(f"{edited}: this scene was not edited; nothing to take back")
-    record_file(edited).unlink()
-    edited.unlink(missing_ok=True)
+    remove_edited(edited)
     return edited.with_name(Path(record.scene).name)
 
 

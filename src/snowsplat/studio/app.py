@@ -61,10 +61,11 @@ from snowsplat.studio.hand_on import (
 )
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
-from snowsplat.studio.uploads import NoSpace, WrongPart, received, write_part
+from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, uploads, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.html import CHINESE
+from snowsplat.util.run_lock import is_locked
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
@@ -132,7 +133,7 @@ class _Studio:
             ("/picture", "GET", self._picture),
             ("/open", "POST", self._open),
             ("/rename", "POST", self._rename),
-            ("/uploads", "GET", self._received),
+            ("/uploads", "GET", self._uploads),
             ("/uploads", "PUT", self._upload),
             ("/survey", "POST", self._survey),
             ("/start", "POST", self._start),
@@ -229,7 +230,9 @@ class _Studio:
     async def _remove(self, request: Request, scene: Scene) -> Any:
         if job.is_running(scene) or job.is_running(scene, "film"):
             raise UserError("the scene or its film is being made; stop that, then remove it")
-        async with self._locks[scene.name, "edit"]:
+        async with self._locks[scene.name, "edit"], self._locks[scene.name, "upload"]:
+            if is_locked(scene.edit_lock):
+                raise UserError("the scene is being changed; remove it in a moment")
             photos = await asyncio.to_thread(scene.remove)
         return {"photos": None if photos is None else str(photos)}
 
@@ -252,17 +255,17 @@ class _Studio:
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then rename it")
         async with self._locks[scene.name, "edit"]:
-            before = scene.job.title
-            if scene.change(title=safe_title(title)).title != before and scene.scene_file():
-                await asyncio.to_thread(job.work, "show", scene.folder)
+            if safe_title(title) != scene.job.title:
+                await asyncio.to_thread(job.work, "rename", scene.folder, title)
         return {}
 
-    async def _received(self, request: Request, scene: Scene) -> Any:
-        return await asyncio.to_thread(received, scene)
+    async def _uploads(self, request: Request, scene: Scene) -> Any:
+        return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
 
     async def _upload(self, request: Request, scene: Scene) -> Any:
         query = request.query_params
-        size, start = (_whole(query.get(name)) for name in ("size", "start"))
+        numbers = (_whole(query.get(name)) for name in ("size", "modified", "start"))
+        file = Upload(query.get("path", ""), *numbers)
         if job.is_running(scene):
             raise UserError("the scene is being made; stop it, then add photos")
         if scene.found:
@@ -270,9 +273,9 @@ class _Studio:
         if scene.job.inputs:
             raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
         data = await request.body()
-        path = query.get("path", "")
         async with self._locks[scene.name, "upload"]:
-            return {"received": await asyncio.to_thread(write_part, scene, path, size, start, data)}
+            self._library.find(scene.name)  # it may have been removed meanwhile
+            return {"received": await asyncio.to_thread(write_part, scene, file, data)}
 
     async def _survey(self, request: Request, scene: Scene) -> Any:
         async with self._locks["", "survey"]:
@@ -319,7 +322,7 @@ class _Studio:
 
     async def _export(self, request: Request, scene: Scene) -> Any:
         kind = _kind(request)
-        async with self._locks["", "export"]:
+        async with self._locks["", "export"], self._locks[scene.name, "edit"]:
             return await asyncio.to_thread(job.work, "export", scene.folder, kind)
 
     async def _exported(self, request: Request, scene: Scene) -> Any:
@@ -346,7 +349,7 @@ class _Studio:
     async def _render_film(self, request: Request, scene: Scene) -> Any:
         plan = await _planned(request)
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "film"]:
-            _check_version(request, scene)
+            scene.check_version(_version(request))
             if not job.is_running(scene, "film"):
                 write_json(scene.plan, asdict(plan))
                 scene.write_state({}, "film")
@@ -360,7 +363,7 @@ class _Studio:
     async def _film_path(self, request: Request, scene: Scene) -> Any:
         plan = await _planned(request)
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "film"]:
-            _check_version(request, scene)
+            scene.check_version(_version(request))
             if job.is_running(scene, "film"):
                 raise UserError("a film is being rendered; wait until it ends, or stop it")
             write_json(scene.plan, asdict(plan))
@@ -375,19 +378,15 @@ class _Studio:
             changes = from_json(PageEdit, await _object(request))
         except ValueError as error:
             raise UserError(f"this cannot be stored: {error}") from None
-        if job.is_running(scene):
-            raise UserError("the scene is being made; stop it, then edit it")
         async with self._locks[scene.name, "edit"]:
-            _check_version(request, scene)
             await _film_has_read(scene)
             write_json(scene.edits, asdict(changes))
-            return await asyncio.to_thread(job.work, "edit", scene.folder)
+            return await asyncio.to_thread(job.work, "edit", scene.folder, _version(request))
 
     async def _undo(self, request: Request, scene: Scene) -> Any:
         async with self._locks[scene.name, "edit"]:
-            _check_version(request, scene)
             await _film_has_read(scene)
-            return await asyncio.to_thread(job.work, "undo", scene.folder)
+            return await asyncio.to_thread(job.work, "undo", scene.folder, _version(request))
 
     async def _site(self, request: Request, scene: Scene) -> Any:
         kind = "small" if (scene.site / "scene.sog").is_file() else "levels"
@@ -406,7 +405,9 @@ class _Studio:
         if path == "index.html" and is_file(file):
             page = await asyncio.to_thread(file.read_text, "utf-8")
             edited = str(bool(_edited(scene))).lower()
-            head = _TOOLS.format(page=kind, edited=edited, version=_version(scene))
+            # A page that is not yet that of the scene cannot change it.
+            version = (scene.state().get("result") or {}).get("shown", ["-"])[0]
+            head = _TOOLS.format(page=kind, edited=edited, version=version)
             text = page.replace("</head>", f"{head}</head>", 1)
             return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
         return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
@@ -461,7 +462,8 @@ def _summary(scene: Scene) -> dict[str, Any]:
     """A scene in the list of all; one whose file is damaged does not hide the others."""
     try:
         about = {"title": scene.job.title, "created": scene.job.created}
-        about["status"] = _status(scene, scene.state())
+        status = _status(scene, scene.state())
+        about["status"] = "done" if status == "opening" else status
     except UserError:
         about = {"title": scene.name, "created": "", "status": "failed"}
     return {"name": scene.name, "picture": _picture_of(scene) is not None, **about}
@@ -470,7 +472,8 @@ def _summary(scene: Scene) -> dict[str, Any]:
 def _status(scene: Scene, state: dict[str, Any]) -> str:
     """One of new, running, done, stopped, failed or, if the process was killed, interrupted.
 
-    A scene of the command line is "found" until its site was written.
+    A scene of the command line is "found" until its site was written; any other one is "opening"
+    if the process that has changed it was killed before it has written the site.
     """
     if scene.found:
         return "done" if scene.is_shown() else "found"
@@ -478,7 +481,9 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
         return "running"
     if not state and scene.job.quality is None and scene.job.minutes is None:
         return "new"
-    return str(state.get("outcome", "interrupted"))
+    status = str(state.get("outcome", "interrupted"))
+    behind = status == "done" and not scene.is_shown() and not is_locked(scene.edit_lock)
+    return "opening" if behind else status
 
 
 def _edited(scene: Scene) -> float:
@@ -487,16 +492,9 @@ def _edited(scene: Scene) -> float:
     return file.stat().st_mtime if file and read_record(file) else 0
 
 
-def _version(scene: Scene) -> str:
-    """Names the scene that is shown; each edit changes it."""
-    file = scene.scene_file()
-    return str(file.stat().st_mtime_ns) if file else ""
-
-
-def _check_version(request: Request, scene: Scene) -> None:
-    """Raises UserError: the page shows the scene before an edit, whose world is another one."""
-    if request.query_params.get("version", _version(scene)) != _version(scene):
-        raise UserError("the scene was changed in another page; open this page anew")
+def _version(request: Request) -> str:
+    """That of the scene which the page shows."""
+    return request.query_params.get("version", "")
 
 
 async def _film_has_read(scene: Scene) -> None:
@@ -524,7 +522,7 @@ async def _object(request: Request) -> dict[str, Any]:
 
 def _whole(text: str | None) -> int:
     if text is None or not (text.isascii() and text.isdecimal()) or len(text) > 18:
-        raise UserError("size and start are whole numbers of bytes")
+        raise UserError("size, modified and start are whole numbers")
     return int(text)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from snowsplat.studio.library import Scene
 from snowsplat.util.errors import UserError
-from snowsplat.util.run_lock import InUse, holder, locked
+from snowsplat.util.run_lock import holder, is_locked
 
 _WORKER = [sys.executable, "-m", "snowsplat.studio"]
 # By their lock: jobs that this process has started. They are asked whether they have ended, or
@@ -47,13 +47,7 @@ def is_running(scene: Scene, task: str = "make") -> bool:
     if process is not None and process.poll() is None:
         return True
     _started.pop(lock, None)
-    if not lock.exists():
-        return False
-    try:
-        with locked(lock, "", wait=0.0):
-            return False
-    except InUse:
-        return True
+    return is_locked(lock)
 
 
 def stop(scene: Scene, task: str = "make") -> None:

@@ -8,7 +8,7 @@ A scene NAME has:
     NAME/site/       the web site of the scene
     NAME/whole/      a page for editing, if the site has levels of detail
     NAME/exports/    its files in other formats
-    NAME/edit.json   what was changed in its page last
+    NAME/edit.json   what was changed in its page last; edit_begun.json: what is left to do after it
     NAME/film.json   the plan of its film; film_cameras.json and film.mp4 are the film
     NAME/state.json  the progress of the job, and its result; film_state.json: of the film
 
@@ -40,6 +40,8 @@ from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
 
 _JOB = "job.json"
+#: The ending of an upload that is not complete.
+PART = ".part"
 #: What a process of its own does for a scene, and the files of its state, lock and output.
 TASKS = {
     "make": ("state.json", ".job.lock", "log.txt"),
@@ -94,6 +96,7 @@ class Scene:
         self.whole = kept / "whole"
         self.exports = kept / "exports"
         self.edits = kept / "edit.json"
+        self.begun = kept / "edit_begun.json"
         self.map = kept / "map.svg"
         self.plan = kept / "film.json"
         self.keys = kept / "film_cameras.json"
@@ -127,6 +130,11 @@ class Scene:
     def lock(self, task: str = "make") -> Path:
         return self.kept / TASKS[task][1]
 
+    @property
+    def edit_lock(self) -> Path:
+        """Held by the process that changes the scene, its site or its exports."""
+        return self.kept / ".edit.lock"
+
     def log(self, task: str = "make") -> Path:
         return self.kept / TASKS[task][2]
 
@@ -151,7 +159,7 @@ class Scene:
         if given:
             return [Path(path) for path in given]
         entries = sorted(self.photos.iterdir()) if self.photos.is_dir() else []
-        entries = [entry for entry in entries if not entry.name.startswith(".")]
+        entries = [e for e in entries if not (e.name.startswith(".") or e.name.endswith(PART))]
         zips = [entry for entry in entries if entry.suffix.lower() == ".zip"]
         # The folders into which zip files were unpacked are no further inputs.
         unpacked = {name for entry in zips for name in (entry.stem, f"{entry.stem}_unpacked")}
@@ -168,17 +176,24 @@ class Scene:
         file = self.made / Path(str(result.get("file", ""))).name
         return shown_file(file) if file.is_file() else None
 
-    def is_shown(self) -> bool:
-        """Whether the site shows what `scene_file` is now; of scenes of the studio, it always does.
+    def version(self) -> str:
+        """Names the content of the scene file; "" if there is none."""
+        file = self.scene_file()
+        return str(file.stat().st_mtime_ns) if file else ""
 
-        A training in a terminal may have gone on since the site was written.
+    def check_version(self, version: str) -> None:
+        """Raises UserError: a page shows another version, whose world is another one. "" is any."""
+        if version not in ("", self.version()):
+            raise UserError("the scene was changed in another page; open this page anew")
+
+    def is_shown(self) -> bool:
+        """Whether the site shows what `scene_file` is now, under its title.
+
+        A training in a terminal may have gone on since the site was written, or the process that
+        has edited the scene was killed before it wrote the site.
         """
-        if not self.found:
-            return True
-        page, file = self.site / "index.html", self.scene_file()
-        if file is None or not page.is_file() or "outcome" not in self.state():
-            return False
-        return page.stat().st_mtime_ns >= file.stat().st_mtime_ns
+        result = self.state().get("result") or {}
+        return result.get("shown") == [self.version(), self.job.title]
 
     def remove(self) -> Path | None:
         """Remove the scene, but not its photos; returns their folder, or None if it has none.
@@ -197,7 +212,7 @@ class Scene:
                 folder.unlink()
             elif folder.exists():
                 shutil.rmtree(folder)
-        files = [self.edits, self.map, self.plan, self.keys, self.film]
+        files = [self.edits, self.begun, self.map, self.plan, self.keys, self.film, self.edit_lock]
         files += [self.folder / name for names in TASKS.values() for name in names]
         for file in (*files, self.folder / _JOB):
             file.unlink(missing_ok=True)

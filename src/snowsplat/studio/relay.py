@@ -7,13 +7,14 @@ may be elsewhere, so that they reach the studio only.
 from __future__ import annotations
 
 import asyncio
-import urllib.request
 from contextlib import suppress
 
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
+
+from snowsplat.studio.local_page import open_local
 
 _SECONDS = 20.0  # to answer; a training step may block the process
 
@@ -22,7 +23,7 @@ async def relay_file(url: str, name: str) -> Response:
     """The file ``name`` of the page at ``url``; 404 if there is none, or no page."""
 
     def load() -> Response:
-        with urllib.request.urlopen(url + name, timeout=_SECONDS) as answer:
+        with open_local(url + name, _SECONDS) as answer:
             kept = {key: answer.headers[key] for key in ("Content-Type", "Content-Security-Policy")}
             return Response(answer.read(), headers=kept)
 

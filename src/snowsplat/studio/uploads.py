@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import filecmp
+import itertools
 import os
 import re
 import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.studio.library import Scene, safe_name
+from snowsplat.studio.library import PART, Scene, safe_name
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
-_PART = ".part"
+# While it arrives, a file has its size and time in its name: that of another one is not continued.
+_PART_NAME = re.compile(rf"(?P<name>.+)\.(?P<size>\d+)-(?P<modified>\d+){re.escape(PART)}", re.S)
+_LATEST = 253_402_300_799_999  # the end of the year 9999, milliseconds since 1970
 # Free space on the disk that uploads leave, bytes: the job writes about as much as its photos.
 _RESERVE = 1 << 30
 _DEEPEST = 8  # folders of an uploaded folder that are kept
@@ -33,24 +39,45 @@ class WrongPart(UserError):
         self.received = received
 
 
-def received(scene: Scene) -> dict[str, int]:
-    """The number of bytes of each file that have arrived, by its path."""
-    found = {}
+@dataclass(frozen=True)
+class Upload:
+    """A file of a browser. Its path, size and time tell it from others of the same name.
+
+    Attributes:
+        path: that in the uploaded folder. Its names are made safe (`safe_path`).
+        size: bytes.
+        modified: when it was changed last, milliseconds since 1970.
+        received: the bytes of it that have arrived.
+    """
+
+    path: str
+    size: int
+    modified: int
+    received: int = 0
+
+
+def uploads(scene: Scene) -> list[Upload]:
+    """The files that have arrived, and those of which a part has."""
+    found = []
     for folder, _, names in os.walk(scene.photos):
         for name in names:
             path = Path(folder) / name
-            shown = path.relative_to(scene.photos).as_posix().removesuffix(_PART)
-            found[shown] = path.stat().st_size
+            shown, about = path.relative_to(scene.photos), path.stat()
+            part = _PART_NAME.fullmatch(name)
+            if part:
+                size, modified = int(part["size"]), int(part["modified"])
+                shown = shown.with_name(part["name"])
+                found.append(Upload(shown.as_posix(), size, modified, about.st_size))
+            elif not name.endswith(PART):
+                size, modified = about.st_size, about.st_mtime_ns // 1_000_000
+                found.append(Upload(shown.as_posix(), size, modified, size))
     return found
 
 
-def write_part(scene: Scene, path: str, size: int, start: int, data: bytes) -> int:
-    """Append a part of an uploaded file.
+def write_part(scene: Scene, file: Upload, data: bytes) -> int:
+    """Append a part of an uploaded file, after the bytes that it has received.
 
-    Args:
-        path: that of the file in the uploaded folder. Its names are made safe (`safe_path`).
-        size: of the whole file in bytes.
-        start: the number of bytes before the part.
+    If there is another file of this name, the file gets a number, unless both are the same.
 
     Returns:
         The number of bytes that have arrived.
@@ -58,23 +85,28 @@ def write_part(scene: Scene, path: str, size: int, start: int, data: bytes) -> i
     Raises:
         WrongPart: it does not follow what has arrived, or goes beyond the size.
         NoSpace: the rest of the file does not fit on the disk.
-        UserError: the path is empty, or there is a folder in the place of the file.
+        UserError: the path is empty, or there is a file in the place of a folder.
     """
+    path, size = file.path, file.size
+    if file.modified > _LATEST:
+        raise UserError(f"{path}: its time is after the year 9999")
     target = scene.photos / safe_path(path)
-    part = target.with_name(target.name + _PART)
-    if target.is_file():
-        before = target.stat().st_size
-        if before == size:  # the answer to its last part was lost
-            return size
-        raise WrongPart(f"{path}: there is another file of this name", before)
+    for other in _numbered(target):
+        if not other.exists():
+            break
+        about = other.stat()
+        if (about.st_size, about.st_mtime_ns // 1_000_000) == (size, file.modified):
+            return size  # the answer to its last part was lost, or it is dropped again
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError:
         raise UserError(f"{path}: a part of its folder is a file; rename it") from None
-    if target.is_dir():
-        raise UserError(f"{path}: there is a folder of this name; rename the file")
+    part = target.with_name(f"{target.name}.{size}-{file.modified}{PART}")
     before = part.stat().st_size if part.is_file() else 0
-    if start != before or start + len(data) > size:
+    end = file.received + len(data)
+    if part.is_file() and before == size:  # all was written, and then the process was killed
+        end, data = size, b""
+    elif file.received != before or end > size:
         raise WrongPart(f"{path}: {before} bytes of it have arrived", before)
     free = shutil.disk_usage(target.parent).free
     if size - before + _RESERVE > free:
@@ -82,11 +114,28 @@ def write_part(scene: Scene, path: str, size: int, start: int, data: bytes) -> i
             f"{path}: {format_bytes(size - before)} do not fit on the disk, which has "
             f"{format_bytes(free)} left; free some space"
         )
-    with open(part, "ab") as file:
-        file.write(data)
-    if start + len(data) == size:
-        os.replace(part, target)
-    return start + len(data)
+    with open(part, "ab") as opened:
+        opened.write(data)
+        if end == size:  # it is not sent again after a power cut
+            opened.flush()
+            os.fsync(opened.fileno())
+    if end == size:
+        os.utime(part, ns=(file.modified * 1_000_000, file.modified * 1_000_000))
+        for other in _numbered(target):
+            if not other.exists():
+                os.replace(part, other)
+                break
+            if other.is_file() and filecmp.cmp(part, other, shallow=False):
+                part.unlink()
+                break
+    return end
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """photo.jpg, photo-2.jpg, …"""
+    yield path
+    for number in itertools.count(2):
+        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def safe_path(path: str) -> Path:
@@ -99,5 +148,5 @@ def safe_path(path: str) -> Path:
         raise UserError("a file has no name")
     safe = [safe_name(name) for name in names[-_DEEPEST:]]
     # A name of ours means that it is not complete.
-    safe[-1] = safe[-1].removesuffix(_PART) or "_"
+    safe[-1] = safe[-1].removesuffix(PART) or "_"
     return Path(*safe)

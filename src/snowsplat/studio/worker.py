@@ -6,11 +6,14 @@
     python -m snowsplat.studio survey FOLDER        what its photos are, and the time needed
     python -m snowsplat.studio export FOLDER KIND   a file in another format
     python -m snowsplat.studio show FOLDER          the site of a scene, anew
+    python -m snowsplat.studio rename FOLDER TITLE  its title, also in the site
     python -m snowsplat.studio whole FOLDER         the page that edits a scene with levels
-    python -m snowsplat.studio edit FOLDER          what was changed in the page of a scene
-    python -m snowsplat.studio undo FOLDER          the scene as it was made
+    python -m snowsplat.studio edit FOLDER VERSION  what was changed in the page of this version
+    python -m snowsplat.studio undo FOLDER VERSION  the scene as it was made
 
-The first two write their progress to a file in the folder. The others print one line of JSON.
+The first two write their progress to a file in the folder. The others print one line of JSON; of
+those that change files, one at a time works on a scene, also if the studio was killed and started
+again meanwhile.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,16 +55,20 @@ from snowsplat.sfm.progress import Report
 from snowsplat.sfm.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.studio.hand_on import export_file
+from snowsplat.studio.job import is_running
 from snowsplat.studio.library import TASKS, Scene, safe_title
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json, write_text
 from snowsplat.util.interrupts import ended_by_signals
+from snowsplat.util.run_lock import locked
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.util.stages import Outcome
 from snowsplat.viewer.web.publication import PAGE
 from snowsplat.viewer.web.publication import SCENE as SITE_SCENE
 
+# Seconds for an edit or export of a killed studio to end.
+_LONGEST_CHANGE = 600.0
 _PAUSE = 1.0  # seconds between two files of the state
 _CURVE = 400  # points of the curve of the loss
 
@@ -188,6 +195,8 @@ def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[st
 
 
 def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
+    with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
+        pass  # an edit that has begun ends first; none begins while this job runs
     job = scene.job
     scene.map.unlink(missing_ok=True)  # the photos may be others now
     options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
@@ -196,9 +205,11 @@ def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
             scene.inputs(), scene.made, options, overwrite=True, observer=recorder, page=page
         )
     recorder.begin("page")
-    site = publish(shown_file(made.scene), scene.site, PublishOptions(job.title), overwrite=True)
+    file = shown_file(made.scene)
+    shown = [str(file.stat().st_mtime_ns), job.title]
+    site = publish(file, scene.site, PublishOptions(job.title), overwrite=True)
     recorder.leave()
-    return _result(scene, made, site.gaussians)
+    return _result(scene, made) | {"gaussians": site.gaussians, "shown": shown}
 
 
 def _film(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
@@ -218,12 +229,11 @@ def _finished(scene: Scene) -> Path:
     return file
 
 
-def _result(scene: Scene, made: MakeResult, gaussians: int) -> dict[str, Any]:
+def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
     reports = {"training": made.folder.report, "photos": made.dataset_report}
     return {
         "file": made.scene.name,
         "bytes": made.scene.stat().st_size,
-        "gaussians": gaussians,
         # With gains of exposure, the scene has the mean exposure of the photos.
         "psnr": made.psnr_aligned if made.exposures else made.psnr,
         "aligned": made.exposures,
@@ -256,48 +266,85 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished.
     """
-    file = _finished(scene)
-    target = export_file(scene, kind)
-    if not target.is_file() or target.stat().st_mtime_ns < file.stat().st_mtime_ns:
+    file, target = _finished(scene), export_file(scene, kind)
+    # It gets the time of the scene that is read, which may be replaced meanwhile.
+    time = file.stat().st_mtime_ns
+    if not target.is_file() or target.stat().st_mtime_ns != time:
         target.parent.mkdir(exist_ok=True)
         if kind == "zip":
+            if not scene.is_shown():
+                show_scene(scene)
             with atomic_path(target) as temporary:
                 archive = shutil.make_archive(str(temporary), "zip", scene.site)
                 os.replace(archive, temporary)
         else:
             convert(file, target, overwrite=True)
+        os.utime(target, ns=(time, time))
     return {"file": target.name}
 
 
-def edit_scene(scene: Scene, undo: bool) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Begun:
+    """What an edit changes beside the scene file, after it: what is done if its process is killed.
+
+    Attributes:
+        version: of the scene before.
+        title: the new one; "": as it is.
+        plan: that of the film; its keys are in the world of the scene before all edits.
+    """
+
+    version: str
+    title: str
+    plan: PageFilm | None
+
+
+def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
     """Write the edited scene and its page; or remove it, and write the page of the other one.
 
-    Raises: UserError: the scene is not finished, or the page does not show it.
+    Args:
+        version: of the scene that was edited; "": as it is.
+
+    Raises: UserError: the scene is not finished, is being made, or was changed since then.
     """
-    file = _finished(scene)
-    # A film that was planned is that of the scene as it is then.
-    plan = None
-    with suppress(OSError, ValueError):  # there is none
-        plan = _plan(scene)
-    before = page_frames(file) if plan else []
-    if undo:
-        file = undo_edits(file)
+    changes = None if undo else from_json(PageEdit, read_json(scene.edits))
+    if is_running(scene):
+        raise UserError("the scene is being made; stop it, then edit it")
+    scene.check_version(version)
+    finish_edit(scene)  # an earlier one
+    file, plan = _finished(scene), None
+    with suppress(OSError, ValueError):  # no film is planned
+        plan = moved_film(_plan(scene), page_frames(file), [])
+    title = changes.title and safe_title(changes.title) if changes else ""
+    write_json(scene.begun, asdict(_Begun(scene.version(), title, plan)))
+    if changes is None:
+        undo_edits(file)
     else:
-        changes = from_json(PageEdit, read_json(scene.edits))
         try:
             has_levels = not (scene.site / SITE_SCENE).is_file()
-            file = edit(file, scene.whole if has_levels else scene.site, changes)
-        except OtherScene as error:  # an earlier process was killed before it wrote the page
+            edit(file, scene.whole if has_levels else scene.site, changes)
+        except OtherScene as error:
             show_scene(scene)
             raise UserError(f"{error}. Open the page anew, then edit it") from None
-        if changes.title:
-            scene.change(title=safe_title(changes.title))
-    if plan:
-        plan = moved_film(plan, before, page_frames(file))
-        write_json(scene.plan, asdict(plan))
-        if is_file(scene.keys):
-            write_keys(file, plan, scene.keys)
     return show_scene(scene)
+
+
+def finish_edit(scene: Scene) -> None:
+    """Do what is left of an edit whose process was killed, if the scene was edited: the title is
+    changed, and the keys of the film keep their places. Doing it again changes nothing."""
+    try:
+        begun = from_json(_Begun, read_json(scene.begun))
+    except (OSError, ValueError):  # nothing is left
+        return
+    if begun.version != scene.version():
+        if begun.title:
+            scene.change(title=begun.title)
+        if begun.plan is not None:
+            file = _finished(scene)
+            plan = moved_film(begun.plan, [], page_frames(file))
+            write_json(scene.plan, asdict(plan))
+            if is_file(scene.keys):
+                write_keys(file, plan, scene.keys)
+    scene.begun.unlink()
 
 
 def show_scene(scene: Scene) -> dict[str, Any]:
@@ -305,17 +352,26 @@ def show_scene(scene: Scene) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished.
     """
-    file = _finished(scene)
+    finish_edit(scene)
+    file, title = _finished(scene), scene.job.title
+    shown = [scene.version(), title]
     for folder in (scene.exports, scene.whole):  # they have another title, or other Gaussians
         shutil.rmtree(folder, ignore_errors=True)
     scene.site.mkdir(parents=True, exist_ok=True)
-    site = publish(file, scene.site, PublishOptions(scene.job.title), overwrite=True)
+    site = publish(file, scene.site, PublishOptions(title), overwrite=True)
     state = scene.state()
     if scene.found:
         state = {"outcome": "done", "result": _found(scene)}
-    state["result"] |= {"gaussians": site.gaussians, "bytes": file.stat().st_size}
+    figures = {"gaussians": site.gaussians, "bytes": file.stat().st_size, "shown": shown}
+    state["result"] |= figures
     scene.write_state(state)
     return {"file": file.name}
+
+
+def rename(scene: Scene, title: str) -> dict[str, Any]:
+    """Change the title, also in the site if there is one."""
+    scene.change(title=safe_title(title))
+    return show_scene(scene) if scene.scene_file() else {}
 
 
 def show_whole(scene: Scene) -> dict[str, Any]:
@@ -358,20 +414,27 @@ def _reports(scene: Scene, reports: Mapping[str, Path | None]) -> dict[str, str]
     }
 
 
+def _answer(scene: Scene, words: list[str]) -> dict[str, Any]:
+    if words[0] == "survey":
+        return survey_photos(scene)
+    if words[0] == "preview":
+        return {"path": film_preview(_finished(scene), _plan(scene))}
+    scene.kept.mkdir(exist_ok=True, mode=0o700)
+    with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
+        if words[0] == "export":
+            return export(scene, words[1])
+        if words[0] == "show":
+            return show_scene(scene)
+        if words[0] == "rename":
+            return rename(scene, words[1])
+        if words[0] == "whole":
+            return show_whole(scene)
+        return edit_scene(scene, words[1], words[0] == "undo")
+
+
 def _printed(scene: Scene, words: list[str]) -> int:
     try:
-        if words[0] == "survey":
-            answer = survey_photos(scene)
-        elif words[0] == "export":
-            answer = export(scene, words[1])
-        elif words[0] == "show":
-            answer = show_scene(scene)
-        elif words[0] == "whole":
-            answer = show_whole(scene)
-        elif words[0] == "preview":
-            answer = {"path": film_preview(_finished(scene), _plan(scene))}
-        else:
-            answer = edit_scene(scene, words[0] == "undo")
+        answer = _answer(scene, words)
     except (UserError, OSError) as error:
         answer = {"error": printable(" ".join(str(error).split()))}
     print("\n" + json.dumps(answer))

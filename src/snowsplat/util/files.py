@@ -27,13 +27,14 @@ def _default_mode() -> int:
 
 
 @contextlib.contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
+def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
     """Context with a temporary file that is renamed to ``path`` when the block ends.
 
     The temporary file is in the same folder, so the rename is atomic, and it is synced before the
     rename. After a crash or a power cut, ``path`` has either the old or the new content, never a
     part of it. If the block raises, the temporary file is removed and ``path`` does not change. If
     the process is killed, the temporary file stays; the next write of ``path`` reuses it.
+    ``private``: other users cannot read the file.
 
     Raises: OSError: the folder is missing or not writable, or the disk is full. The error names
     ``path``.
@@ -45,7 +46,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-            os.chmod(temporary, _default_mode())  # mkstemp and _lock create private files
+            if not private:  # as mkstemp and _lock create them
+                os.chmod(temporary, _default_mode())
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):

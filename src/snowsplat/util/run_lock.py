@@ -117,6 +117,17 @@ def locked(file: Path, what: str, wait: float = _WAIT_SECONDS) -> Iterator[None]
         yield
 
 
+def is_locked(file: Path) -> bool:
+    """Whether another process holds a lock."""
+    if not file.exists():
+        return False
+    try:
+        with locked(file, "", wait=0.0):
+            return False
+    except InUse:
+        return True
+
+
 def _acquired(file: Path, what: str, wait: float) -> int:
     """The handle of the locked file, which names this process as the holder."""
     end = time.monotonic() + wait

@@ -8,10 +8,13 @@ from __future__ import annotations
 import base64
 import binascii
 import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from snowsplat.util.files import write_json
+from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.safe_json import from_json, read_json
 
 _ENDING = "_edited"
@@ -156,19 +159,58 @@ def record_file(edited: Path) -> Path:
     return edited.with_suffix(".json")
 
 
+@dataclass(frozen=True)
+class _Announced:
+    """The record of an edited scene that is about to be written, and how its file is known."""
+
+    record: EditRecord
+    bytes: int
+    time: int  # of its last change, nanoseconds
+
+
 def read_record(file: Path) -> EditRecord | None:
     """The record of a scene file; None if it was not edited here."""
     if not file.stem.endswith(_ENDING):
         return None
+    # The process that has written the file was killed before it wrote the record.
+    with suppress(OSError, ValueError):
+        announced = from_json(_Announced, read_json(_announced_file(file)))
+        about = file.stat()
+        if (about.st_size, about.st_mtime_ns) == (announced.bytes, announced.time):
+            return announced.record
     try:
         return from_json(EditRecord, read_json(record_file(file)))
     except (OSError, ValueError):
         return None
 
 
-def write_record(edited: Path, record: EditRecord) -> None:
-    """Raises OSError: the folder is not writable, or the disk is full."""
+@contextmanager
+def written_with_record(edited: Path, record: EditRecord) -> Iterator[Path]:
+    """Context with a temporary file, as `atomic_path`, which becomes an edited scene with a record.
+
+    An edited scene that is replaced has its own record until then, also if the process is killed.
+
+    Raises: OSError: the folder is not writable, or the disk is full.
+    """
+    with atomic_path(edited) as temporary:
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())  # network file systems then know its time
+        about = temporary.stat()
+        announced = _Announced(record, about.st_size, about.st_mtime_ns)
+        write_json(_announced_file(edited), asdict(announced))
     write_json(record_file(edited), asdict(record))
+    _announced_file(edited).unlink()
+
+
+def remove_edited(edited: Path) -> None:
+    """Remove an edited scene, and then its record. Raises OSError: the folder is not writable."""
+    for file in (edited, record_file(edited), _announced_file(edited)):
+        file.unlink(missing_ok=True)
+
+
+def _announced_file(edited: Path) -> Path:
+    return edited.with_suffix(".next.json")
 
 
 def shown_file(scene: Path) -> Path:

@@ -1,7 +1,7 @@
 // The box of the editor: a handle in the middle of each face, which is dragged or moved by the arrow keys,
 // and a slider for each face. Its coordinates are those of the page, whose y axis points up.
 
-import { make } from "./page.js";
+import { button, make } from "./page.js";
 import { along, bounds, outside, project } from "./selection.js";
 import { say } from "./text.js";
 
@@ -9,26 +9,43 @@ const AXES = ["x", "y", "z"];
 const SIGNS = [-1, -1, 1]; // of the axes of the scene: the viewer has turned it by 180° about z
 const ARROWS = new Map([["ArrowRight", 1], ["ArrowUp", 1], ["ArrowLeft", -1], ["ArrowDown", -1]]);
 const STEP = 0.01; // of an arrow key, as a share of the first box; ten times as much with Shift
+const PAUSE = 1000; // milliseconds without a key, after which the next one begins another step
 const BEYOND = 0.5; // of the first box, to both sides of it: the range of a slider
 
-/**
- * @param {Float32Array} centers (N, 3)
- * @param {HTMLElement} canvas
- * @param {() => Float64Array} model the clip space from the space of the centres
- */
-export function addBox(centers, canvas, model) {
+/** The first box: its lower and its upper corner. */
+export function boxAround(/** @type {Float32Array} */ centers) {
     const corners = bounds(centers).map(corner => corner.map((value, k) => SIGNS[k] * value));
-    const sides = [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
+    return [0, 1].map(side => AXES.map((_, k) => Math[side ? "max" : "min"](corners[0][k], corners[1][k])));
+}
+
+/** @param {import("./edit.js").Editing} editing */
+export function addBox({ edits, centers, canvas, overlay, model, select, show }) {
+    let sides = edits.present.box;
     const spans = AXES.map((_, k) => sides[1][k] - sides[0][k]);
     const inScene = (/** @type {number[]} */ point) => point.map((value, k) => SIGNS[k] * value);
     const middle = (/** @type {number} */ side, /** @type {number} */ axis) =>
         inScene(AXES.map((_, k) => (k === axis ? sides[side][k] : (sides[0][k] + sides[1][k]) / 2)));
+    // A drag, or keys without a pause between them, are one step that can be undone.
+    let step = 0;
+    let pressed = -Infinity; // the time of the last key
+    /** @type {EventTarget | null} */
+    let focused = null; // its face
 
     /** Moves a face; it takes the opposite one with it. */
     function move(/** @type {number} */ side, /** @type {number} */ axis, /** @type {number} */ value) {
-        sides[side][axis] = value;
-        sides[1 - side][axis] = Math[side ? "min" : "max"](sides[1 - side][axis], value);
-        for (const face of faces) if (face.axis === axis) face.show();
+        if (value === sides[side][axis]) return;
+        const next = sides.map(corner => [...corner]);
+        next[side][axis] = value;
+        next[1 - side][axis] = Math[side ? "min" : "max"](next[1 - side][axis], value);
+        edits.change({ box: next }, `box ${step}`);
+        show();
+    }
+
+    /** A key begins a step after a pause, or on another face. */
+    function begin(/** @type {KeyboardEvent} */ event) {
+        if (event.timeStamp - pressed > PAUSE || event.target !== focused) step++;
+        pressed = event.timeStamp;
+        focused = event.target;
     }
 
     const faces = AXES.flatMap((name, axis) => [0, 1].map(side => addFace(name, axis, side)));
@@ -37,7 +54,10 @@ export function addBox(centers, canvas, model) {
         const label = say(side ? "edit_to" : "edit_from", name);
         const first = sides[side][axis];
         const slider = /** @type {HTMLInputElement} */ (
-            make("input", { type: "range", step: "any", "aria-label": label, title: label, input: () => move(side, axis, Number(slider.value)) })
+            make("input", { type: "range", step: "any", "aria-label": label, title: label,
+                input: () => move(side, axis, Number(slider.value)),
+                pointerdown: () => step++,
+                keydown: begin })
         );
         slider.min = String(first - (side ? 1 : BEYOND) * spans[axis]);
         slider.max = String(first + (side ? BEYOND : 1) * spans[axis]);
@@ -48,6 +68,7 @@ export function addBox(centers, canvas, model) {
             if (!event.isPrimary || event.button) return;
             event.stopPropagation(); // it is not for the camera
             handle.setPointerCapture(event.pointerId);
+            step++;
             held = { from: sides[side][axis], place: [event.clientX, event.clientY], point: middle(side, axis) };
         });
         handle.addEventListener("pointermove", event => {
@@ -63,6 +84,7 @@ export function addBox(centers, canvas, model) {
             const way = ARROWS.get(event.key);
             if (!way) return;
             event.preventDefault();
+            begin(event);
             move(side, axis, sides[side][axis] + way * STEP * (event.shiftKey ? 10 : 1) * spans[axis]);
         });
         // They are not for the camera.
@@ -77,35 +99,53 @@ export function addBox(centers, canvas, model) {
         return { axis, side, handle, slider, show };
     }
 
+    /** Puts the handles to their places in the window; those behind the camera are hidden. */
+    function place() {
+        for (const { axis, side, handle } of faces) {
+            const [x, y, depth] = project(model(), middle(side, axis), canvas.clientWidth, canvas.clientHeight);
+            handle.hidden = depth <= 0;
+            handle.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
+            handle.style.zIndex = String(Math.round(1e5 / (1 + Math.max(depth, 0))));
+        }
+    }
+
+    /** The twelve edges in the space of the centres, in short pieces, since those behind the camera are not drawn. */
+    function edges() {
+        const pieces = 16;
+        return AXES.flatMap((_, axis) =>
+            [0, 1, 2, 3].flatMap(edge => {
+                const ends = AXES.map((_, k) => (edge >> Number((k + 3 - axis) % 3 === 1)) & 1);
+                const point = (/** @type {number} */ share) =>
+                    inScene(AXES.map((_, k) => (k === axis ? sides[0][k] + share * (sides[1][k] - sides[0][k]) : sides[ends[k]][k])));
+                return Array.from({ length: pieces }, (_, i) => [point(i / pieces), point((i + 1) / pieces)]);
+            }),
+        );
+    }
+
+    function selectOutside() {
+        const [a, b] = sides.map(inScene);
+        select(outside(centers, AXES.map((_, k) => Math.min(a[k], b[k])), AXES.map((_, k) => Math.max(a[k], b[k]))));
+    }
+
     const handles = make("div.snow-handles", { hidden: true }, ...faces.map(face => face.handle));
+    overlay.element.after(handles);
+    const sliders = AXES.map((name, k) => make("div.snow-sides", {}, make("b", {}, name), ...faces.filter(face => face.axis === k).map(face => face.slider)));
     return {
-        handles,
-        sliders: AXES.map((name, k) => make("div.snow-sides", {}, make("b", {}, name), ...faces.filter(face => face.axis === k).map(face => face.slider))),
-        /** A byte per Gaussian: whether its centre is outside. */
-        outside: () => {
-            const [a, b] = sides.map(inScene);
-            return outside(centers, AXES.map((_, k) => Math.min(a[k], b[k])), AXES.map((_, k) => Math.max(a[k], b[k])));
+        element: make("div", {}, make("p", {}, say("edit_box_how")), ...sliders, button("edit_outside", selectOutside)),
+        choose() {
+            handles.hidden = false;
         },
-        /** Puts the handles to their places in the window; those behind the camera are hidden. */
-        place: () => {
-            for (const { axis, side, handle } of faces) {
-                const [x, y, depth] = project(model(), middle(side, axis), canvas.clientWidth, canvas.clientHeight);
-                handle.hidden = depth <= 0;
-                handle.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
-                handle.style.zIndex = String(Math.round(1e5 / (1 + Math.max(depth, 0))));
-            }
+        leave() {
+            handles.hidden = true;
         },
-        /** The twelve edges in the space of the centres, in short pieces, since those behind the camera are not drawn. */
-        edges: () => {
-            const pieces = 16;
-            return AXES.flatMap((_, axis) =>
-                [0, 1, 2, 3].flatMap(edge => {
-                    const ends = AXES.map((_, k) => (edge >> Number((k + 3 - axis) % 3 === 1)) & 1);
-                    const point = (/** @type {number} */ share) =>
-                        inScene(AXES.map((_, k) => (k === axis ? sides[0][k] + share * (sides[1][k] - sides[0][k]) : sides[ends[k]][k])));
-                    return Array.from({ length: pieces }, (_, i) => [point(i / pieces), point((i + 1) / pieces)]);
-                }),
-            );
+        show() {
+            if (sides === edits.present.box) return;
+            sides = edits.present.box;
+            for (const face of faces) face.show();
+        },
+        draw() {
+            overlay.lines(model(), edges());
+            place();
         },
     };
 }

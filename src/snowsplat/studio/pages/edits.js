@@ -1,5 +1,6 @@
 // What an edit of a scene is: a byte per Gaussian, which says whether it is selected or deleted; how the
-// scene is turned, a quaternion wxyz; its size, initial view and annotations; and what undoes a change.
+// scene is turned, a quaternion wxyz; its size, initial view and annotations; the box that selects, its
+// lower and its upper corner; and what undoes a change.
 
 import { product, UNTURNED } from "./turning.js";
 
@@ -10,16 +11,17 @@ const STEPS = 40; // that can be undone
 const MEMORY = 1 << 28; // bytes of the states of these steps; a large scene has fewer steps
 
 /** @typedef {{title: string, text: string, view: number[]}} Note its view is position, target, field of view, aspect */
-/** @typedef {{state: Uint8Array, turn: number[], scale: number, start: number[] | null, notes: Note[]}} Edit not changed, but replaced */
+/** @typedef {{state: Uint8Array, turn: number[], scale: number, start: number[] | null, notes: Note[], box: number[][]}} Edit not changed, but replaced */
 
 export class Edits {
     /**
      * @param {number} count of Gaussians
      * @param {Note[]} notes
+     * @param {number[][]} box
      */
-    constructor(count, notes = []) {
+    constructor(count, notes = [], box = []) {
         /** @type {Edit} */
-        this.present = { state: new Uint8Array(count), turn: UNTURNED, scale: 1, start: null, notes };
+        this.present = { state: new Uint8Array(count), turn: UNTURNED, scale: 1, start: null, notes, box };
         /** @type {Edit[]} */
         this.past = [];
         /** @type {Edit[]} */
@@ -32,7 +34,7 @@ export class Edits {
     /**
      * A step that can be undone.
      * @param {Partial<Edit>} changes
-     * @param {string} what steps with the same name, one after the other, are one step: typing in a field
+     * @param {string} what steps with the same name, one after the other, are one step: typing in a field, dragging
      */
     change(changes, what = "") {
         if (!what || what !== this.#last) this.past.push(this.present);

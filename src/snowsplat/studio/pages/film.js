@@ -1,7 +1,7 @@
 // A film of a finished scene: key views on a time line, a preview, and the video that the studio
 // renders. The path through the keys is that of the studio, so the preview is what is rendered.
 
-import { action, ask, bytes, command, make, Refused } from "./page.js";
+import { action, ask, button, bytes, command, make, Refused } from "./page.js";
 import { say } from "./text.js";
 
 const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
@@ -51,8 +51,6 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     let timer;
 
-    const button = (/** @type {string} */ key, /** @type {any} */ click) =>
-        /** @type {HTMLButtonElement} */ (make("button", { type: "button", click }, say(key)));
     const told = make("p", { role: "status" });
     const tell = (/** @type {string} */ text) => (told.textContent = text);
 

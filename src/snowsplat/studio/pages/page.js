@@ -22,6 +22,10 @@ export function make(tag, attributes = {}, ...children) {
     return element;
 }
 
+/** A button with a text. */
+export const button = (/** @type {string} */ key, /** @type {(event: any) => void} */ click) =>
+    /** @type {HTMLButtonElement} */ (make("button", { type: "button", click }, say(key)));
+
 /** An error that the server has told in one line. */
 export class Refused extends Error {
     /**

@@ -71,8 +71,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             shown = parts;
             update = undefined;
             /** @type {Record<string, (scene: any) => HTMLElement[]>} */
-            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart, found: openingPart };
-            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene), ...(["upload", "running", "found"].includes(parts) ? [] : [keptPart(scene)]));
+            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart, found: openingPart, opening: openingPart };
+            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene), ...(["upload", "running", "found", "opening"].includes(parts) ? [] : [keptPart(scene)]));
         }
         update?.(scene);
     }
@@ -100,7 +100,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         return [make("section.card", {}, bar, line, more)];
     }
 
-    /** A scene of the command line has no site yet. */
+    /** A scene of the command line has no site yet; that of another one is not written. */
     function openingPart() {
         const line = make("p", { role: "status" }, say("opening"));
         const tell = (/** @type {any} */ error) => (line.textContent = error instanceof Refused ? error.message : say("offline"));
@@ -143,10 +143,13 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
         async function look() {
             try {
-                const arrived = scene.inputs.length ? 1 : Object.keys(await ask(`${address}/uploads`)).length;
-                const found = arrived ? await ask(`${address}/survey`, "POST") : null;
+                /** @type {any[]} */
+                const files = uploaded ? await ask(`${address}/uploads`) : [];
+                const parts = files.filter(file => file.received < file.size).length;
+                const found = !uploaded || files.length > parts ? await ask(`${address}/survey`, "POST") : null;
                 if (closed.aborted || shown !== "new") return;
                 facts.replaceChildren(...(found ? factsOf(found.facts) : [make("p", {}, say("no_files"))]));
+                if (parts) facts.append(make("p.bad", { role: "alert" }, say("not_arrived", parts)));
                 if (uploaded) facts.append(moreFiles());
                 form.hidden = !found;
                 for (const [quality, seconds] of Object.entries(found?.seconds ?? {})) {

@@ -53,6 +53,12 @@ export function titleOf(/** @type {Item[]} */ items) {
     return items.length === 1 ? first[0].replace(/\.[^.]+$/, "") : "";
 }
 
+/** When a file was changed last: milliseconds since 1970. */
+const timeOf = (/** @type {File} */ file) => Math.max(0, Math.floor(file.lastModified));
+
+/** Tells a file from others of the same name. */
+const nameOf = (/** @type {string} */ path, /** @type {number} */ size, /** @type {number} */ modified) => `${path} ${size} ${modified}`;
+
 /** The upload of files to a scene; `changed` is called after each part. */
 export class Upload {
     /**
@@ -86,9 +92,11 @@ export class Upload {
 
     /** Sends all files; true if all have arrived. */
     async run() {
-        const known = await ask(`${this.scene}/uploads`).catch(() => ({}));
+        /** @type {any[]} */
+        const arrived = await ask(`${this.scene}/uploads`).catch(() => []);
+        const known = new Map(arrived.map(each => [nameOf(each.path, each.size, each.modified), each.received]));
         for (const item of this.items) {
-            const count = Math.min(known[item.path] ?? 0, item.file.size);
+            const count = known.get(nameOf(item.path, item.file.size, timeOf(item.file))) ?? 0;
             this.sent.set(item, count);
             this.before += count;
         }
@@ -105,13 +113,13 @@ export class Upload {
         const item = /** @type {Item} */ (this.items.find(each => each.file === file));
         let start = this.sent.get(item) ?? 0;
         do {
-            const query = new URLSearchParams({ path, size: String(file.size), start: String(start) });
+            const query = new URLSearchParams({ path, size: String(file.size), modified: String(timeOf(file)), start: String(start) });
             try {
                 const part = file.slice(start, start + PART);
                 start = (await ask(`${this.scene}/uploads?${query}`, "PUT", part)).received;
                 this.offline = false;
             } catch (error) {
-                if (error instanceof Refused && error.status === 409 && error.answer.received < file.size) {
+                if (error instanceof Refused && error.status === 409) {
                     start = error.answer.received;
                 } else if (error instanceof Refused) {
                     this.error = error.message;

@@ -36,7 +36,7 @@ class WebServer:
 
     All paths begin with a secret token, which ``app`` does not see. Every response has the
     additional ``headers``, unless the app sets them. ``port``: see `listen`. ``allow_host``: names
-    of proxies; see `KnownHosts`.
+    of proxies; see `KnownHosts`. ``token``: the secret of an earlier server that is continued.
     Raises: UserError: the port is in use or not permitted, or the host is not an address of this
     machine; or an allowed name is none.
     """
@@ -48,11 +48,13 @@ class WebServer:
         port: int | None = 0,
         allow_host: Sequence[str] = (),
         headers: Mapping[str, str] | None = None,
+        token: str | None = None,
     ) -> None:
         hosts = KnownHosts(host, allow_host)
         self.host = host
         self._app = app
-        self._guard = Guard(app, hosts, secrets.token_urlsafe(16), headers or {})
+        self.token = token or secrets.token_urlsafe(16)
+        self._guard = Guard(app, hosts, self.token, headers or {})
         self._socket = listen(host, port)
         self.port: int = self._socket.getsockname()[1]
         self._loop = asyncio.new_event_loop()
@@ -70,14 +72,12 @@ class WebServer:
     def others(self) -> list[str]:
         """The URLs of the page for browsers on other machines, if they differ from `url`."""
         named = [self.url_at(socket.gethostname())] if self.host in ANY_HOST else []
-        return named + [
-            f"https://{name}/{self._guard.token}/" for name in self._guard.hosts.allowed
-        ]
+        return named + [f"https://{name}/{self.token}/" for name in self._guard.hosts.allowed]
 
     def url_at(self, host: str) -> str:
         """The URL of the page if this machine is called ``host``."""
         place = f"[{host}]" if ":" in host else host
-        return f"http://{place}:{self.port}/{self._guard.token}/"
+        return f"http://{place}:{self.port}/{self.token}/"
 
     def call(self, run: Callable[..., object], *args: Any) -> None:
         """Schedule a call in the thread of the server; does nothing if the server has stopped."""

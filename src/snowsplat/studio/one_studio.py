@@ -1,0 +1,116 @@
+"""One studio per library, and its address: a second one finds the first.
+
+Two servers would not know of each other's uploads, edits and removals. The lock is that of
+`snowsplat.util.run_lock`. The address contains the secret of the page, so only its owner can read
+the file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from snowsplat.studio.local_page import open_local
+from snowsplat.util.files import atomic_path
+from snowsplat.util.run_lock import InUse, locked
+from snowsplat.util.safe_json import from_json, read_json
+
+_LOCK = ".studio.lock"
+_ADDRESS = ".studio.json"
+_SECONDS = 3.0  # in which a studio answers
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a studio listens.
+
+    Attributes:
+        url: of its page, for a browser on this computer.
+        host, port, token: as those of `WebServer`.
+        others: URLs for other computers.
+    """
+
+    url: str
+    host: str
+    port: int
+    token: str
+    others: list[str]
+
+    def answers(self, folder: Path) -> bool:
+        """Whether it is there, and has this library."""
+        try:
+            with open_local(f"{self.url}about", _SECONDS) as answer:
+                return os.path.samefile(json.load(answer)["folder"], folder)
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
+
+class Running(InUse):
+    """A studio serves the library already.
+
+    Attributes:
+        address: that of the studio.
+    """
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(f"the scenes are open already at {address.url}")
+        self.address = address
+
+
+def _address_in(folder: Path) -> Address | None:
+    """What the last studio of a library has written; None if it has ended as usual."""
+    file = folder / _ADDRESS
+    try:
+        about = os.lstat(file)
+        # Another user could lead the browser elsewhere.
+        ours = not hasattr(os, "getuid") or about.st_uid == os.getuid()
+        if not (ours and stat.S_ISREG(about.st_mode)):
+            return None
+        return from_json(Address, read_json(file))
+    except (OSError, ValueError):
+        return None
+
+
+def write_address(folder: Path, address: Address) -> None:
+    """Raises OSError: the folder is not writable."""
+    with atomic_path(folder / _ADDRESS, private=True) as temporary:
+        temporary.write_text(json.dumps(asdict(address)), "utf-8")
+
+
+@contextmanager
+def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None]:
+    """Hold the library during the block, which gets the address of a studio that was killed.
+
+    A folder that cannot be written, such as that of another user to look at, needs no lock.
+    ``wait``: seconds for a process that is just ending.
+
+    Raises:
+        Running: another studio has it, and answers.
+        InUse: another one has it, and does not answer, or only to others.
+    """
+    if not os.access(folder, os.W_OK):
+        yield None
+        return
+    with ExitStack() as stack:
+        _check_running(folder)
+        try:
+            stack.enter_context(locked(folder / _LOCK, f"{folder}: in use by", wait))
+        except InUse:
+            _check_running(folder)  # it has just started
+            raise
+        try:
+            yield _address_in(folder)
+        finally:
+            with suppress(OSError):
+                (folder / _ADDRESS).unlink(missing_ok=True)
+
+
+def _check_running(folder: Path) -> None:
+    address = _address_in(folder)
+    if address is not None and address.answers(folder):
+        raise Running(address)

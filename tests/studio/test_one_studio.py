@@ -1,0 +1,41 @@
+"""One studio per library."""
+
+import os
+
+import pytest
+
+from snowsplat.studio.one_studio import Address, only_studio, write_address
+from snowsplat.util.run_lock import InUse
+
+
+def test_one_that_does_not_answer_is_named(tmp_path):
+    def second():
+        with only_studio(tmp_path, wait=0.0):
+            pass
+
+    with only_studio(tmp_path):
+        with pytest.raises(InUse, match=f"in use by process {os.getpid()}"):
+            second()
+        # Nobody listens at port 1.
+        write_address(tmp_path, Address("http://127.0.0.1:1/x/", "127.0.0.1", 1, "x", []))
+        with pytest.raises(InUse, match="in use by process"):
+            second()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_address_of_one_that_was_killed(tmp_path):
+    address = Address("http://127.0.0.1:1/x/", "127.0.0.1", 1, "x", [])
+
+    def found() -> Address | None:
+        with only_studio(tmp_path) as killed:
+            return killed
+
+    write_address(tmp_path, address)
+    assert found() == address
+    assert found() is None  # it has ended as usual
+    (tmp_path / ".studio.json").write_text("{}")
+    assert found() is None
+    write_address(tmp_path, address)
+    (tmp_path / ".studio.json").rename(tmp_path / "elsewhere")
+    (tmp_path / ".studio.json").symlink_to(tmp_path / "elsewhere")
+    assert found() is None
