@@ -83,7 +83,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
             marked = edits.counts();
         }
         if (listed !== notes) listNotes();
-        counts.textContent = say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
+        counts.textContent = !marked[SELECTED] && !marked[DELETED] ? say("edit_first") : say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
         remove.disabled = !marked[SELECTED];
         undo.disabled = !edits.past.length;
         redo.disabled = !edits.future.length;
@@ -376,7 +376,7 @@ export function addEditor({ viewer, scene, camera, canvas, hiding, panel, presen
             await ask(`../edit?version=${version}`, method, body);
             removeEventListener("beforeunload", keep);
             // The page of the studio shows the scene in a frame; it has other figures now, too.
-            if (parent === window) location.replace("../site/index.html");
+            if (parent === window) location.replace(`../site/index.html${location.search}`);
             else parent.document.dispatchEvent(new Event("edited"));
         } catch (error) {
             tell(error instanceof Refused ? error.message : say("offline"));

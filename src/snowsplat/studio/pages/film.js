@@ -2,7 +2,7 @@
 // renders. The path through the keys is that of the studio, so the preview is what is rendered.
 
 import { action, ask, bytes, command, make, Refused } from "./page.js";
-import { say } from "./text.js";
+import { say, told } from "./text.js";
 
 const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
 const TURN = 8; // keys of a turn around the target
@@ -53,8 +53,8 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
 
     const button = (/** @type {string} */ key, /** @type {any} */ click) =>
         /** @type {HTMLButtonElement} */ (make("button", { type: "button", click }, say(key)));
-    const told = make("p", { role: "status" });
-    const tell = (/** @type {string} */ text) => (told.textContent = text);
+    const status = make("p", { role: "status" });
+    const tell = (/** @type {string} */ text) => (status.textContent = text);
 
     // The plan
 
@@ -100,7 +100,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
             speed.value = String(Math.log2(keys[chosen].speed));
             speedText.textContent = `${say("film_key", chosen + 1)}: ${say("film_speed")} ${times(keys[chosen].speed)}`;
         }
-        empty.hidden = keys.length > 0;
+        empty.hidden = canPlay();
         replace.disabled = remove.disabled = chosen < 0;
         play.disabled = render.disabled = position.disabled = !canPlay();
         play.textContent = say(playing ? "film_pause" : "film_preview");
@@ -153,7 +153,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
 
     async function begin() {
         await findPath();
-        previewing = Boolean(path);
+        previewing = Boolean(path) && !content.hidden; // the tools may have been closed meanwhile
         frame.hidden = !previewing;
     }
 
@@ -241,7 +241,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
             timer = setTimeout(look, 1000);
             return left;
         }
-        if (wasRunning) tell(now.outcome === "failed" ? now.error : now.outcome === "done" ? "" : say("film_stopped"));
+        if (wasRunning) tell(now.outcome === "failed" ? told(now.error) : now.outcome === "done" ? "" : say("film_stopped"));
         result.replaceChildren();
         if (now.bytes && !now.running) {
             const download = make("a", { href: `${ADDRESS}/file`, download: true }, say("film_download", bytes(now.bytes)));
@@ -275,7 +275,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         position,
         row(play, render, stop),
         progress,
-        told,
+        status,
         result,
     );
     const open = button("film", () => {

@@ -143,6 +143,7 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     state.loaded ? begin() : events.once('loaded:changed', begin);
 
     if (!options.ui) return;
+    nameSigns();
     const toggle = (label, content) => {
         const button = element('button', { type: 'button', textContent: label, ariaExpanded: 'false' });
         button.onclick = () => {
