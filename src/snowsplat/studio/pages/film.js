@@ -211,6 +211,10 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         if (previewing) stopPreview(), draw();
     });
 
+    addEventListener("keydown", event => {
+        if (event.key === "Escape" && previewing) stopPreview(), draw();
+    });
+
     // The video
 
     const progress = make("progress", { max: 1, value: 0, hidden: true, "aria-label": say("film_rendering") });

@@ -221,6 +221,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const map = make("img.map", { alt: say("map") });
         const mapBox = make("figure", { hidden: true }, map, make("figcaption", {}, say("map")));
         const notes = make("ul.notes");
+        const notesPart = make("section", { hidden: true }, make("h2", {}, say("log")), notes);
         const stop = make("button.plain", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
         const live = /** @type {HTMLIFrameElement} */ (make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true }));
         let listed = "";
@@ -229,6 +230,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             const state = now.state;
             showStages(stages, now);
             showFigures(figures, curve, state);
+            notesPart.hidden = !state.notes?.length;
             notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, told(line))));
             if (live.hidden === now.has_page) {
                 live.hidden = !now.has_page;
@@ -250,7 +252,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             strip,
             figures,
             curve,
-            make("section", {}, make("h2", {}, say("log")), notes),
+            notesPart,
         ];
     }
 
@@ -350,9 +352,10 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
 /** The judgement, its reasons as a list, and what would help. */
 function verdictOf(/** @type {string[]} */ lines) {
-    const reasons = lines.filter(line => line.startsWith("- ")).map(line => make("li", {}, told(line.slice(2))));
-    const others = lines.filter(line => !line.startsWith("- ")).map(line => make("p", {}, told(line)));
-    return [...others.slice(0, 1), make("ul", {}, ...reasons), ...others.slice(1)];
+    const trimmed = lines.map(line => line.trim());
+    const reasons = trimmed.filter(line => line.startsWith("- ")).map(line => make("li", {}, told(line.slice(2))));
+    const [judgement, ...advice] = trimmed.filter(line => !line.startsWith("- ")).map(line => make("p", {}, told(line)));
+    return [judgement, reasons.length > 0 && make("ul", {}, ...reasons), ...advice];
 }
 
 function factsOf(/** @type {any} */ facts) {

@@ -67,7 +67,7 @@ function tile(/** @type {any} */ scene) {
         { href: `#${encodeURIComponent(scene.name)}` },
         scene.picture ? make("img", { src: `${address}/picture`, alt: "", loading: "lazy" }) : make("div.empty"),
         make("b", {}, scene.title),
-        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString()}`}`),
+        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString(document.documentElement.lang)}`}`),
     );
 }
 
@@ -144,5 +144,8 @@ document.getElementById("language")?.addEventListener("click", () => {
     route();
 });
 dress();
-addEventListener("hashchange", route);
+addEventListener("hashchange", () => {
+    route();
+    main.focus({ preventScroll: true }); // what had the focus is gone
+});
 route();
