@@ -174,7 +174,7 @@ const TEXTS = {
     edit_two_points: ["Click two points of the scene", "点击场景中的两个点"],
     edit_no_surface: ["There is no surface; click another place", "这里没有表面；请点击别处"],
     edit_distance: ["Distance: {0}", "距离：{0}"],
-    edit_truth: ["True distance in metres", "真实距离（米）"],
+    edit_truth: ["True length (m)", "真实长度（米）"],
     edit_rescale: ["Set scale", "设定比例"],
     edit_size: ["Size × {0}: one unit is one metre", "尺寸 × {0}：一个单位为一米"],
     edit_start: ["Start with this view", "以此视角开始"],

@@ -144,6 +144,7 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
 
     if (!options.ui) return;
     nameSigns();
+    Object.assign(canvas, { role: 'img', ariaLabel: scene.title });
     const toggle = (label, content) => {
         const button = element('button', { type: 'button', textContent: label, ariaExpanded: 'false' });
         button.onclick = () => {
