@@ -1,17 +1,49 @@
-"""What a job tells in English is in Chinese in the page in Chinese."""
+"""What the program tells in English is in Chinese in the page in Chinese."""
 
+import errno
+import json
+import os
 import re
 import shutil
 import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.stage_lines import described
+from snowsplat.sfm.colmap.diagnosis import Evidence, failure
+from snowsplat.sfm.ingest.inputs import _too_few
+from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED
+from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.ingest.video_frames import SAME_VIEW
+from snowsplat.studio.app import _listing
+from snowsplat.studio.library import Library
+from snowsplat.studio.uploads import safe_path, write_part
+from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.html import CHINESE
+from snowsplat.util.run_lock import Holder
+
+_TOLD = Path(__file__).parents[2] / "src/snowsplat/studio/pages/told.js"
+
+pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+def translated(lines: list[str]) -> list[str]:
+    script = "".join(file.read_text("utf-8") for file in (CHINESE, _TOLD))
+    script += f"console.log(JSON.stringify({json.dumps(lines)}.map(snowsplatChinese)))"
+    shown = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
+    return json.loads(shown.stdout)
+
+
+def english_in(text: str) -> list[str]:
+    """The words of a translation that are no names of files, formats or measures."""
+    return re.findall("[A-Za-z]{3,}", re.sub(r"/\S+|PSNR|JPEG|PNG|WebP|TIFF|HEIC|zip", "", text))
+
+
 def test_progress_and_verdict():
     sfm = {"registered": list("abc"), "unregistered": {}, "points": 22445}
     sfm |= {"reprojection_error": 0.62, "sub_models": [3], "attempts": ["one"]}
@@ -28,10 +60,59 @@ def test_progress_and_verdict():
         Verdict.of([reason]).lines("The scene")[0],
         *("registered photos", "photos with features", "matched pairs", "verified pairs"),
     ]
-    script = f"{CHINESE.read_text('utf-8')}; console.log({lines!r}.map(snowsplatChinese).join('|'))"
-    shown = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
-    chinese = shown.stdout.strip().split("|")
-    assert len(chinese) == len(lines)
+    chinese = translated(lines)
     for text, english in zip(chinese, lines, strict=True):
-        assert not re.findall("[A-Za-z]{3,}", text.replace("PSNR", "")), english
+        assert not english_in(text), english
     assert chinese[0] == "3 张照片中有 3 张求出了位姿，22,445 个点，重投影误差 0.62 像素"
+
+
+def error_of(run: Callable[[], object]) -> str:
+    with pytest.raises((UserError, OSError, ValueError)) as caught:
+        run()
+    error = caught.value
+    return message_of(error) if isinstance(error, OSError) else str(error)
+
+
+def test_errors(tmp_path):
+    empty, raw, text = tmp_path / "1", tmp_path / "2", tmp_path / "3.txt"
+    for folder in (empty, raw):
+        folder.mkdir()
+    (raw / "a.CR2").write_bytes(b"raw")
+    text.write_text("no photo")
+    damaged, nothing = tmp_path / "4.zip", tmp_path / "5.zip"
+    damaged.write_bytes(b"PK\x03\x04 and no more")
+    with zipfile.ZipFile(nothing, "w") as archive:
+        archive.writestr("readme.txt", "no photos")
+    inputs = [empty, raw, text, damaged, nothing, tmp_path / "missing"]
+    library = Library(tmp_path / "library")
+    scene = library.new("scene", [])
+    write_part(scene, "1.jpg", 4, 0, b"1234")
+    plain, detailed = [0] * 9, [900] * 9
+    errors = [
+        *(error_of(lambda at=at: find_sources([at])) for at in inputs),
+        error_of(lambda: library.new("scene", [tmp_path / "missing"])),
+        error_of(lambda: library.find("/missing")),
+        error_of(library.new("empty", []).inputs),
+        error_of(lambda: safe_path("..")),
+        error_of(lambda: write_part(scene, "/1.jpg", 5, 0, b"12345")),
+        error_of(lambda: write_part(scene, "/2.jpg", 9, 5, b"1")),
+        error_of(lambda: _listing(tmp_path / "missing")),
+        str(failure(Evidence(plain, [], None, 36))),
+        str(failure(Evidence(detailed, [], None, 36))),
+        str(failure(Evidence(detailed, [], 0.0, 36))),
+        str(_too_few(2, [])),
+        str(_too_few(0, [("/1.jpg", BLACK), ("/2.jpg", BLACK)])),
+        str(_too_few(1, [("/1.jpg", BLURRED)] * 3)),
+        str(_too_few(1, [("/1.mp4 at 1 s", SAME_VIEW)] * 3)),
+        str(_too_few(1, [("/DSC.jpg", "has only 8x8 pixels")] * 3)),
+        f"/scene: in use by {Holder()}; wait until it ends, stop it, or use another folder",
+        f"no such film is possible: {error_of(lambda: PageFilm([]))}",
+        *(
+            message_of(OSError(number, os.strerror(number), "/full"))
+            for number in (errno.ENOSPC, errno.EACCES)
+        ),
+    ]
+    chinese = translated(errors)
+    for text, english in zip(chinese, errors, strict=True):
+        assert not english_in(text), english
+    assert translated(["a text of another version"]) == ["a text of another version"]

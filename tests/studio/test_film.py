@@ -89,10 +89,18 @@ def test_a_turn_in_the_page(studio, forked):
     assert studio.ask("scenes/tour/open", "POST", {})[0] == 200
     with Browser(900, 600, frames=4.0) as browser:
         page = browser.open(f"{studio.server.url}scenes/tour/site/index.html", timeout=60)
-        page.wait_for("!!document.querySelector('.snow-keys')", 120)
+        page.wait_for("!!document.querySelector('.snow-edit')", 120)
         press(page, "Film")
         press(page, "360° turn")
         assert page.evaluate("document.querySelectorAll('.snow-keys button').length") == 8
+        # Another tool closes the film: a preview that is still prepared does not begin.
+        press(page, "Preview")
+        press(page, "Edit")
+        assert page.evaluate("document.querySelector('.snow-film').hidden")
+        page.wait_for("document.querySelector('.snow-film [role=status]').textContent === ''", 60)
+        assert page.evaluate("document.querySelector('.snow-frame').hidden")
+        press(page, "Film")
+        assert page.evaluate("document.querySelector('.snow-edit').hidden")
         press(page, "Preview")
         page.wait_for("!document.querySelector('.snow-frame').hidden", 60)
         entity = "window.sse.viewer.app.root.findByName('camera').getPosition()"

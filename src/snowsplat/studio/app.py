@@ -62,7 +62,7 @@ from snowsplat.studio.hand_on import (
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, uploads, write_part
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import write_json
 from snowsplat.util.html import CHINESE
 from snowsplat.util.run_lock import is_locked
@@ -94,6 +94,7 @@ _REPORT_POLICY = (
 # which looks for them. Levels of detail are edited in a page of their own, with all Gaussians.
 _TOOLS = (
     '<link rel="stylesheet" href="../../../tools.css" />'
+    '<script src="../../../chinese.js"></script><script src="../../../told.js"></script>'
     '<script type="module" src="../../../tools.js" data-page="{page}" data-edited="{edited}" '
     'data-version="{version}"></script>'
 )
@@ -448,8 +449,7 @@ def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request
             codes = {UnknownScene: 404, NoSpace: 507}
             return JSONResponse({"error": str(error)}, codes.get(type(error), 400))
         except OSError as error:
-            where = f"{printable(str(error.filename))}: " if error.filename else ""
-            return JSONResponse({"error": f"{where}{error.strerror or error}"}, 500)
+            return JSONResponse({"error": printable(message_of(error))}, 500)
 
     return endpoint
 

@@ -58,7 +58,7 @@ from snowsplat.studio.hand_on import export_file
 from snowsplat.studio.job import is_running
 from snowsplat.studio.library import TASKS, Scene, safe_title
 from snowsplat.training.core.progress import Progress
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import atomic_path, write_json, write_text
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.run_lock import locked
@@ -184,14 +184,21 @@ def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[st
         return 0, {"outcome": "done", "result": result}
     except KeyboardInterrupt:
         return 130, {"outcome": "stopped"}
-    except (UserError, OSError, MemoryError) as error:
-        message = str(error) or "out of memory; choose draft, or fewer photos"
-        return 2, {"outcome": "failed", "error": printable(" ".join(message.split()))}
+    except MemoryError:
+        message = "out of memory; choose draft, or fewer photos"
+        return 2, {"outcome": "failed", "error": message}
+    except (UserError, OSError) as error:
+        return 2, {"outcome": "failed", "error": _line(error)}
     except Exception as error:
         traceback.print_exc()
         what, log = f"{type(error).__name__}: {error}", scene.log(task)
         about = f"an unexpected fault: {what}; details are in {log}"
         return 1, {"outcome": "failed", "error": printable(about)}
+
+
+def _line(error: UserError | OSError) -> str:
+    message = message_of(error) if isinstance(error, OSError) else str(error)
+    return printable(" ".join(message.split()))
 
 
 def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
@@ -436,7 +443,7 @@ def _printed(scene: Scene, words: list[str]) -> int:
     try:
         answer = _answer(scene, words)
     except (UserError, OSError) as error:
-        answer = {"error": printable(" ".join(str(error).split()))}
+        answer = {"error": _line(error)}
     print("\n" + json.dumps(answer))
     return 0
 

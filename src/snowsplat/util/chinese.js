@@ -1,6 +1,7 @@
-// `snowsplatChinese`: sentences of reports and of the progress of a job in Chinese. A text without a
-// line here remains English. In English, "#" stands for a number, and "{}" for any text, which is
-// translated, too; in Chinese, {0} is the first of both. The script is part of well-formed documents.
+// `snowsplatChinese`: sentences of reports in Chinese; `snowsplatChinese.learn` adds those of another
+// page. A text without a line here remains English. In English, "#" stands for a number, and "{}" for any
+// text, which is translated, too; in Chinese, {0} is the first of both. The script is part of well-formed
+// documents.
 globalThis.snowsplatChinese = (() => {
     const TEXTS = {
         // Both reports
@@ -242,31 +243,6 @@ globalThis.snowsplatChinese = (() => {
         'undistorting': '去畸变',
         'Next step': '下一步',
 
-        // The progress of a job in the studio
-        'registered photos': '已求出位姿的照片',
-        'photos with features': '已提取特征的照片',
-        'matched pairs': '已匹配的照片对',
-        'verified pairs': '已验证的照片对',
-        'frames': '帧',
-        'views': '视图',
-        'files': '文件',
-        '# photos (# with masks)': '{0} 张照片（{1} 张有遮罩）',
-        '{}, # skipped': '{0}，跳过 {1} 张',
-        '# of # photos placed, # points, reprojection error # px':
-            '{1} 张照片中有 {0} 张求出了位姿，{2} 个点，重投影误差 {3} 像素',
-        '# images of #x#': '{0} 张图像，{1}×{2}',
-        '# images of #x#, lens distortion removed': '{0} 张图像，{1}×{2}，已去除镜头畸变',
-        '# steps, PSNR # dB': '{0} 步，PSNR {1} dB',
-        '# steps, PSNR # dB{}': '{0} 步，PSNR {1} dB{2}',
-        ' at {}': '，{0}',
-        'test views rendered': '测试视图已渲染',
-        '# more steps with {}; the PSNR is that of the scene before': '再用{1}训练 {0} 步；PSNR 是此前场景的',
-        'all # photos': '全部 {0} 张照片',
-        'usable, with limits': '可用，有所限制',
-        'poor; expect blurred or wrong parts': '差；会有模糊或错误的部分',
-        '- {}': '– {0}',
-        'next time: {}': '下一次：{0}',
-
         // The page of an image, and that of benchmarks
         '# × # pixels, approximated by # 2D Gaussians.': '{0} × {1} 像素，由 {2} 个二维高斯近似。',
         'Gaussians, front-to-back': '高斯，从前到后混合',
@@ -294,10 +270,15 @@ globalThis.snowsplatChinese = (() => {
         '{}; # training photos, # test photos': '{0}；{1} 张训练照片，{2} 张测试照片',
     };
     const parts = { '#': '([0-9.,]+)', '{}': '(.+?)' };
-    const rules = Object.entries(TEXTS).map(([english, chinese]) => {
-        const pattern = english.replace(/\{\}|[#.*+?^$()|[\]\\]/g, (found) => parts[found] ?? '\\' + found);
-        return [new RegExp(`^${pattern}$`, 'i'), chinese];
-    });
+    const rules = [];
+    const learn = (texts) => {
+        Object.assign(TEXTS, texts);
+        for (const [english, chinese] of Object.entries(texts)) {
+            const pattern = english.replace(/\{\}|[#.*+?^$()|[\]\\]/g, (found) => parts[found] ?? '\\' + found);
+            rules.push([new RegExp(`^${pattern}$`, 'i'), chinese]);
+        }
+    };
+    learn({ ...TEXTS });
     // A clause may begin with a capital letter; a text of the table in this spelling has priority.
     const translated = (text) => {
         if (Object.hasOwn(TEXTS, text)) return TEXTS[text];
@@ -307,8 +288,9 @@ globalThis.snowsplatChinese = (() => {
         }
         return text;
     };
-    return (text) => text.replace(/\. (?=[A-Z])/g, '. \n').split('\n').map((sentence) => {
+    const inChinese = (text) => text.replace(/(e\.g)?\. (?=[A-Z])/g, (end, example) => (example ? end : '. \n')).split('\n').map((sentence) => {
         const chinese = translated(sentence.trim());
         return chinese === sentence.trim() ? sentence : chinese;
     }).join('');
+    return Object.assign(inChinese, { learn });
 })();

@@ -1,5 +1,6 @@
-// Shows a report in Chinese in a browser in Chinese; a button shows the English again. The script is
-// part of a well-formed document, after `chinese.js`.
+// Shows a report in Chinese in a browser in Chinese; a button shows the English again. The studio says
+// its language and its colours in the address. The script is part of a well-formed document, after
+// `chinese.js`.
 {
     const texts = [];
     const walker = document.createTreeWalker(document.querySelector('main'), NodeFilter.SHOW_TEXT);
@@ -18,5 +19,7 @@
         button.onclick = () => show(!chinese);
         for (const [node, english, other] of texts) node.data = chinese ? other : english;
     };
-    show(navigator.language.toLowerCase().startsWith('zh'));
+    const wanted = new URLSearchParams(location.search);
+    document.documentElement.style.colorScheme = wanted.get('theme') ?? '';
+    show((wanted.get('lang') ?? navigator.language).toLowerCase().startsWith('zh'));
 }

@@ -1,4 +1,4 @@
-"""The errors that a user can fix: the command line prints them as one line."""
+"""The errors that a user can fix, in one line."""
 
 
 class UserError(Exception):
@@ -7,6 +7,12 @@ class UserError(Exception):
     The command line prints the message and exits with status 2. Settings inside the message are in
     backquotes, "use `overwrite` to replace it"; the command line prints their flags instead.
     """
+
+
+def message_of(error: OSError) -> str:
+    """An error of the system in one line: the file, and what is wrong."""
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"
 
 
 class SettingError(UserError):

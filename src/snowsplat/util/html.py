@@ -20,10 +20,10 @@ from snowsplat.util.safe_json import printable
 CHINESE = Path(__file__).with_name("chinese.js")
 
 _STYLE = """
-:root { color-scheme: light dark; --bg: #fbfaf7; --card: #fff; --ink: #20252c; --soft: #667080;
-  --line: #e3e0d8; --accent: #b8650a; --bad: #b3261e; }
-@media (prefers-color-scheme: dark) { :root { --bg: #14171b; --card: #1c2127; --ink: #e6e9ed;
-  --soft: #98a2ae; --line: #2e353d; --accent: #ffb454; --bad: #ff8a80; } }
+:root { color-scheme: light dark; --bg: light-dark(#fbfaf7, #14171b);
+  --card: light-dark(#fff, #1c2127); --ink: light-dark(#20252c, #e6e9ed);
+  --soft: light-dark(#5d6774, #98a2ae); --line: light-dark(#e3e0d8, #2e353d);
+  --accent: light-dark(#a35808, #ffb454); --bad: light-dark(#b3261e, #ff8a80); }
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--bg); color: var(--ink); line-height: 1.5;
   font-family: system-ui, -apple-system, "Segoe UI", sans-serif; }
@@ -65,6 +65,7 @@ _LARGE = """
 const pictures = [...document.querySelectorAll('main img')];
 const dialog = document.body.appendChild(document.createElement('dialog'));
 const large = dialog.appendChild(new Image());
+large.alt = '';
 const name = dialog.appendChild(document.createElement('p'));
 let shown = 0;
 const show = (number) => {
@@ -106,7 +107,8 @@ def page(title: str, html: Iterable[str], style: str = "") -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>'
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>'
-        f"<title>{text(title)}</title><style>{_STYLE}{style}</style></head>\n"
+        f'<title>{text(title)}</title><link rel="icon" href="data:,"/>'
+        f"<style>{_STYLE}{style}</style></head>\n"
         f"<body><main>\n{body}\n</main><script>{script}</script></body></html>\n"
     )
 

@@ -212,6 +212,10 @@ def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
         assert text.startswith("Balls <&>")
         assert re.search(r"[0-9] 个高斯 · 2026-11-24 · CC0", text)
         assert not re.search(r"[A-Za-z]", text.replace("Balls <&>", "").replace("CC0", ""))
+        assert page.evaluate("document.querySelector('.sse-settings').ariaLabel") == "设置"
+        page.navigate(f"{file.as_uri()}?webgl&lang=en")
+        page.wait_for("!!document.querySelector('.snow-panel')", 60)
+        assert "Clean up" in page.evaluate("document.querySelector('.snow-panel').innerText")
         assert not page.errors
 
 
@@ -230,6 +234,10 @@ def test_a_click_on_every_control(file):
             clicked.add(new[-1])
             page.evaluate(f"{shown}[{names.index(new[-1])}].click()")
         assert {"Photos", "Clean up", "Copy link", "Photo 12 / 12"} <= clicked
+        # A screen reader has a name for each.
+        unnamed = "b => !b.ariaLabel && !b.textContent.trim()"
+        buttons = "[...document.querySelectorAll('.sse-viewer button')]"
+        assert page.evaluate(f"{buttons}.filter({unnamed}).map(b => b.className)") == []
         named = ("flyCamera", "settings", "frame", "reset", "controlsButton", "info", "infoClose")
         assert {f"sse-{name}" for name in named} <= clicked
         for key in "12ghfr":

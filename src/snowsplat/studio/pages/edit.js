@@ -89,7 +89,7 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
             paint((painted = state));
             marked = edits.counts();
         }
-        counts.textContent = say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
+        counts.textContent = !marked[SELECTED] && !marked[DELETED] ? say("edit_first") : say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
         remove.disabled = !marked[SELECTED];
         undo.disabled = !edits.past.length;
         redo.disabled = !edits.future.length;

@@ -2,7 +2,7 @@
 // renders. The path through the keys is that of the studio, so the preview is what is rendered.
 
 import { action, ask, button, bytes, command, make, Refused } from "./page.js";
-import { say } from "./text.js";
+import { say, told } from "./text.js";
 
 const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
 const TURN = 8; // keys of a turn around the target
@@ -51,8 +51,8 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     let timer;
 
-    const told = make("p", { role: "status" });
-    const tell = (/** @type {string} */ text) => (told.textContent = text);
+    const status = make("p", { role: "status" });
+    const tell = (/** @type {string} */ text) => (status.textContent = text);
 
     // The plan
 
@@ -98,7 +98,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
             speed.value = String(Math.log2(keys[chosen].speed));
             speedText.textContent = `${say("film_key", chosen + 1)}: ${say("film_speed")} ${times(keys[chosen].speed)}`;
         }
-        empty.hidden = keys.length > 0;
+        empty.hidden = canPlay();
         replace.disabled = remove.disabled = chosen < 0;
         play.disabled = render.disabled = position.disabled = !canPlay();
         play.textContent = say(playing ? "film_pause" : "film_preview");
@@ -151,7 +151,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
 
     async function begin() {
         await findPath();
-        previewing = Boolean(path);
+        previewing = Boolean(path) && !content.hidden; // the tools may have been closed meanwhile
         frame.hidden = !previewing;
     }
 
@@ -209,6 +209,10 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         if (previewing) stopPreview(), draw();
     });
 
+    addEventListener("keydown", event => {
+        if (event.key === "Escape" && previewing) stopPreview(), draw();
+    });
+
     // The video
 
     const progress = make("progress", { max: 1, value: 0, hidden: true, "aria-label": say("film_rendering") });
@@ -239,7 +243,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
             timer = setTimeout(look, 1000);
             return left;
         }
-        if (wasRunning) tell(now.outcome === "failed" ? now.error : now.outcome === "done" ? "" : say("film_stopped"));
+        if (wasRunning) tell(now.outcome === "failed" ? told(now.error) : now.outcome === "done" ? "" : say("film_stopped"));
         result.replaceChildren();
         if (now.bytes && !now.running) {
             const download = make("a", { href: `${ADDRESS}/file`, download: true }, say("film_download", bytes(now.bytes)));
@@ -273,7 +277,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         position,
         row(play, render, stop),
         progress,
-        told,
+        status,
         result,
     );
     const open = button("film", () => {

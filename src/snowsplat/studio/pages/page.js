@@ -1,6 +1,6 @@
 // Elements, requests and numbers, for all parts of the page.
 
-import { say } from "./text.js";
+import { say, told } from "./text.js";
 
 /**
  * A new element.
@@ -51,7 +51,7 @@ export async function ask(path, method = "GET", body = undefined) {
     const raw = body === undefined || body instanceof Blob;
     const response = await fetch(path, { method, body: raw ? body : JSON.stringify(body) });
     const answer = await response.json().catch(() => ({}));
-    if (!response.ok) throw new Refused(answer.error ?? `${response.status}`, response.status, answer);
+    if (!response.ok) throw new Refused(told(answer.error ?? `${response.status}`), response.status, answer);
     return answer;
 }
 
@@ -89,8 +89,14 @@ export function command(/** @type {string} */ line) {
         {},
         make("code", {}, line),
         // Browsers give the clipboard only to pages of this machine, or with https.
-        navigator.clipboard && make("button.plain", { type: "button", click: () => navigator.clipboard.writeText(line) }, say("copy")),
+        navigator.clipboard && make("button.plain", { type: "button", click: copy }, say("copy")),
     );
+
+    async function copy(/** @type {any} */ { currentTarget: button }) {
+        await navigator.clipboard.writeText(line);
+        button.textContent = say("copied");
+        setTimeout(() => (button.textContent = say("copy")), 3000);
+    }
 }
 
 /** @param {number} count of bytes */

@@ -35,7 +35,7 @@ export function addSaving({ edits, scene, placement, presentView, change, show, 
             await ask(`../edit?version=${version}`, method, body);
             removeEventListener("beforeunload", keep);
             // The page of the studio shows the scene in a frame; it has other figures now, too.
-            if (parent === window) location.replace("../site/index.html");
+            if (parent === window) location.replace(`../site/index.html${location.search}`);
             else parent.document.dispatchEvent(new Event("edited"));
         } catch (error) {
             tell(error instanceof Refused ? error.message : say("offline"));

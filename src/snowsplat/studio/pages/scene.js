@@ -1,7 +1,7 @@
 // The page of one scene: uploads, what the photos are, the progress of the job, and the result.
 
 import { action, ask, bytes, command, duration, make, notice, Refused } from "./page.js";
-import { say, told } from "./text.js";
+import { dressed, say, told } from "./text.js";
 import { chosen, dropped, Upload } from "./upload.js";
 
 const STAGES = ["photos", "poses", "images", "report", "scene", "pictures", "all", "page"];
@@ -220,11 +220,12 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const stages = make("ol.stages");
         const figures = make("dl.figures");
         const curve = make("div.curve");
-        const strip = make("div.strip", { "aria-label": say("placed") });
+        const strip = make("div.strip", { role: "group", "aria-label": say("placed"), tabindex: 0 });
         const map = make("img.map", { alt: say("map") });
         const mapBox = make("figure", { hidden: true }, map, make("figcaption", {}, say("map")));
         const notes = make("ul.notes");
-        const stop = make("button.main", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
+        const notesPart = make("section", { hidden: true }, make("h2", {}, say("log")), notes);
+        const stop = make("button.plain", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
         const live = /** @type {HTMLIFrameElement} */ (make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true }));
         let listed = "";
         let drawn = 0; // the map that is shown
@@ -232,10 +233,11 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             const state = now.state;
             showStages(stages, now);
             showFigures(figures, curve, state);
+            notesPart.hidden = !state.notes?.length;
             notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, told(line))));
             if (live.hidden === now.has_page) {
                 live.hidden = !now.has_page;
-                live.src = now.has_page ? `${address}/live/` : "about:blank";
+                live.src = now.has_page ? dressed(`${address}/live/`) : "about:blank";
             }
             mapBox.hidden = !now.map;
             if (now.map && now.map !== drawn) map.setAttribute("src", `${address}/map?${(drawn = now.map)}`);
@@ -253,7 +255,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             strip,
             figures,
             curve,
-            notes,
+            notesPart,
         ];
     }
 
@@ -280,8 +282,9 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const result = scene.state.result;
         const fact = (/** @type {string} */ key, /** @type {string} */ value) => [make("dt", {}, say(key)), make("dd", {}, value)];
         const site = `${address}/site/index.html`;
+        const shownSite = dressed(site);
         const reports = Object.entries(result.reports).map(([kind, path]) =>
-            make("a.button.plain", { href: `${address}/made/${path}`, target: "_blank", rel: "noopener" }, say(`report_${kind}`)),
+            make("a.button.plain", { href: dressed(`${address}/made/${path}`), target: "_blank", rel: "noopener" }, say(`report_${kind}`)),
         );
         const film = make("section.card", { hidden: true });
         let filmed = 0;
@@ -293,8 +296,8 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const phone = make("section.card");
         showPhone(phone, site);
         return [
-            make("iframe.viewer", { src: site, title: say("viewer"), allow: "fullscreen; xr-spatial-tracking" }),
-            make("div.row", {}, make("a.button.plain", { href: site, target: "_blank", rel: "noopener" }, say("full")), ...reports, scene.edited > 0 && make("span.soft", {}, say("edited"))),
+            make("iframe.viewer", { src: shownSite, title: say("viewer"), allow: "fullscreen; xr-spatial-tracking" }),
+            make("div.row", {}, make("a.button.plain", { href: shownSite, target: "_blank", rel: "noopener" }, say("full")), ...reports, scene.edited > 0 && make("span.soft", {}, say("edited"))),
             make(
                 "dl.figures",
                 {},
@@ -304,16 +307,22 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
             ),
             result.verdict.length > 0 &&
-                make("section.card", {}, make("h2", {}, say("verdict")), ...result.verdict.map((/** @type {string} */ line) => make("p", {}, told(line)))),
-            make("section.card", {}, make("h2", {}, say("download")), ...Object.entries(scene.exports).map(([kind, line]) => download(kind, String(line)))),
+                make("section.card", {}, make("h2", {}, say("verdict")), ...verdictOf(result.verdict)),
+            make(
+                "section.card",
+                {},
+                make("h2", {}, say("download")),
+                make("div.exports", {}, ...Object.keys(scene.exports).map(download)),
+                make("details", {}, make("summary", {}, say("command")), ...Object.values(scene.exports).map(command)),
+            ),
             film,
             phone,
             !scene.found && make("details.card", {}, make("summary", {}, say("again")), ...againPart(scene)),
         ].filter(part => part !== false);
     }
 
-    function download(/** @type {string} */ kind, /** @type {string} */ line) {
-        const button = make("button.plain", { type: "button" }, kind.toUpperCase());
+    function download(/** @type {string} */ kind) {
+        const button = make("button.plain", { type: "button", "aria-label": say("download_kind", kind.toUpperCase()) }, kind.toUpperCase());
         const about = make("span", {}, say(`kind_${kind}`));
         button.addEventListener(
             "click",
@@ -328,7 +337,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                 }
             }),
         );
-        return make("div.export", {}, button, about, command(line));
+        return make("div.export", {}, button, about);
     }
 
     const over = (/** @type {Event} */ event) => event.preventDefault();
@@ -344,12 +353,20 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     refresh();
 }
 
+/** The judgement, its reasons as a list, and what would help. */
+function verdictOf(/** @type {string[]} */ lines) {
+    const trimmed = lines.map(line => line.trim());
+    const reasons = trimmed.filter(line => line.startsWith("- ")).map(line => make("li", {}, told(line.slice(2))));
+    const [judgement, ...advice] = trimmed.filter(line => !line.startsWith("- ")).map(line => make("p", {}, told(line)));
+    return [judgement, reasons.length > 0 && make("ul", {}, ...reasons), ...advice];
+}
+
 function factsOf(/** @type {any} */ facts) {
     const words = (/** @type {any} */ value) => {
         if (value === true) return say("given");
-        if (typeof value !== "object") return String(value);
-        const parts = Object.entries(value).map(([name, what]) => [name.split("/").pop(), what]);
-        return parts.length === 1 && parts[0][1] === facts.photos ? parts[0][0] : parts.map(part => part.join(": ")).join(", ");
+        if (typeof value !== "object") return told(String(value));
+        const parts = Object.entries(value).map(([name, what]) => [name.split("/").pop()?.replace(/^(\d+)x(\d+)$/, "$1 × $2"), told(String(what))]);
+        return parts.length === 1 && parts[0][1] === String(facts.photos) ? parts[0][0] : parts.map(part => part.join(": ")).join(", ");
     };
     const known = (/** @type {any} */ value) => value && words(value) !== "unknown";
     const rows = FACTS.filter(key => known(facts[key])).flatMap(key => [make("dt", {}, say(key)), make("dd", {}, words(facts[key]))]);

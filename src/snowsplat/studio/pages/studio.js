@@ -2,7 +2,7 @@
 
 import { action, ask, make, notice } from "./page.js";
 import { showScene, upload } from "./scene.js";
-import { chosenLanguage, say, speak } from "./text.js";
+import { chosenLanguage, chosenTheme, say, speak } from "./text.js";
 import { chosen, dropped, titleOf } from "./upload.js";
 
 const main = /** @type {HTMLElement} */ (document.getElementById("main"));
@@ -27,6 +27,7 @@ function showStart(/** @type {AbortSignal} */ closed) {
         {},
         make("h1", {}, say("title")),
         make("p", {}, say("drop")),
+        make("p.soft", {}, say("advice")),
         make(
             "div.row",
             {},
@@ -66,7 +67,7 @@ function tile(/** @type {any} */ scene) {
         { href: `#${encodeURIComponent(scene.name)}` },
         scene.picture ? make("img", { src: `${address}/picture`, alt: "", loading: "lazy" }) : make("div.empty"),
         make("b", {}, scene.title),
-        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString()}`}`),
+        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString(document.documentElement.lang)}`}`),
     );
 }
 
@@ -90,8 +91,8 @@ async function begin(/** @type {import("./upload.js").Item[]} */ items) {
 function machinePart() {
     const path = /** @type {HTMLInputElement} */ (make("input", { type: "text", autocomplete: "off", spellcheck: "false", "aria-label": say("path"), placeholder: say("path") }));
     const list = make("div.folders");
-    const use = async () => {
-        const { name } = await ask("scenes", "POST", { path: path.value });
+    const use = async (/** @type {string} */ where) => {
+        const { name } = await ask("scenes", "POST", { path: where });
         location.hash = encodeURIComponent(name);
     };
     const look = async (/** @type {string} */ where) => {
@@ -100,9 +101,9 @@ function machinePart() {
         const inside = (/** @type {string} */ name) => `${found.path.replace(/[/\\]$/, "")}/${name}`;
         list.replaceChildren(
             make("button.plain", { type: "button", click: action(() => look(found.parent)) }, `↑ ${say("up")}`),
-            ...(found.photos > 0 ? [make("button.main", { type: "button", click: action(use) }, say("use_this", found.photos))] : []),
+            ...(found.photos > 0 ? [make("button.main", { type: "button", click: action(() => use(found.path)) }, say("use_this", found.photos))] : []),
             ...found.folders.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: action(() => look(inside(name))) }, `${name}/`)),
-            ...found.files.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: () => (path.value = inside(name)) }, name)),
+            ...found.files.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: action(() => use(inside(name))) }, name)),
         );
     };
     return make(
@@ -114,7 +115,7 @@ function machinePart() {
             {},
             path,
             make("button.plain", { type: "button", click: action(() => look(path.value)) }, say("browse")),
-            make("button.main", { type: "submit", click: action(use) }, say("use")),
+            make("button.main", { type: "submit", click: action(() => use(path.value)) }, say("use")),
         ),
         list,
     );
@@ -123,12 +124,13 @@ function machinePart() {
 // Language and colours are kept in the browser.
 
 const themes = ["auto", "light", "dark"];
-const chosenTheme = () => localStorage.getItem("theme") ?? "auto";
 
 function dress() {
     document.documentElement.dataset.theme = chosenTheme();
     speak(chosenLanguage());
-    /** @type {HTMLElement} */ (document.getElementById("theme")).textContent = say(chosenTheme());
+    const theme = /** @type {HTMLElement} */ (document.getElementById("theme"));
+    theme.textContent = `◐ ${say(chosenTheme())}`;
+    theme.ariaLabel = say("colours", say(chosenTheme()));
     /** @type {HTMLElement} */ (document.getElementById("language")).textContent = say("other");
 }
 
@@ -142,5 +144,8 @@ document.getElementById("language")?.addEventListener("click", () => {
     route();
 });
 dress();
-addEventListener("hashchange", route);
+addEventListener("hashchange", () => {
+    route();
+    main.focus({ preventScroll: true }); // what had the focus is gone
+});
 route();

@@ -6,9 +6,11 @@ const TEXTS = {
     other: ["中文", "English"],
     light: ["Light", "浅色"],
     dark: ["Dark", "深色"],
-    auto: ["System colours", "跟随系统"],
+    auto: ["System", "系统"],
+    colours: ["Colours: {0}", "颜色：{0}"],
     title: ["Photos in, a 3D scene out", "放入照片，得到三维场景"],
     drop: ["Drop photos, a folder, a zip file or a video here", "把照片、文件夹、zip 文件或视频拖到这里"],
+    advice: ["30 to 100 sharp photos of one object or place from all sides, or a slow video. Each photo shows most of what the one before shows.", "围绕一个物体或地方，从各个方向拍 30 到 100 张清晰的照片，或一段缓慢移动的视频。每张照片都应包含前一张的大部分内容。"],
     private: ["Everything stays on this computer.", "一切都留在这台电脑上。"],
     choose_files: ["Choose files", "选择文件"],
     choose_folder: ["Choose a folder", "选择文件夹"],
@@ -16,7 +18,7 @@ const TEXTS = {
     path: ["Folder, video or zip file", "文件夹、视频或 zip 文件"],
     browse: ["Browse", "浏览"],
     use: ["Use", "使用"],
-    use_this: ["Use this folder ({0} photos and videos)", "使用此文件夹（{0} 个照片和视频）"],
+    use_this: ["Use this folder ({0} files)", "使用此文件夹（{0} 个文件）"],
     up: ["Up", "上一级"],
     recent: ["Scenes", "场景"],
     none: ["No scenes yet.", "还没有场景。"],
@@ -96,23 +98,25 @@ const TEXTS = {
     verdict: ["Verdict", "评价"],
     report_training: ["Report on the training", "训练报告"],
     report_photos: ["Report on the cameras", "相机报告"],
-    full: ["Open alone", "单独打开"],
+    full: ["Open in a new tab", "在新标签页中打开"],
     download: ["Download", "下载"],
+    download_kind: ["Download {0}", "下载 {0}"],
     preparing: ["Preparing …", "正在准备……"],
     kind_ply: ["For every program", "通用"],
     kind_spz: ["Small, for phones and games", "小巧，适合手机和游戏"],
     kind_sog: ["Small, for the web", "小巧，适合网页"],
     kind_glb: ["glTF, for 3D programs", "glTF，适合三维软件"],
     kind_html: ["One page with a viewer", "带查看器的单个网页"],
-    kind_zip: ["A web site, for any host", "网站，可放到任意主机"],
+    kind_zip: ["A web site; unpack it on any web host", "网站，解压到任意网站主机即可"],
     phone: ["Open it on a phone in the same network", "在同一网络的手机上打开"],
     phone_how: ["To open it on phones, start the studio with: snowsplat studio --host 0.0.0.0", "要在手机上打开，请用此命令启动：snowsplat studio --host 0.0.0.0"],
     command: ["The same in a terminal", "在终端中的相同命令"],
     copy: ["Copy", "复制"],
+    copied: ["Copied", "已复制"],
     viewer: ["The scene", "场景"],
     live: ["The training, live", "实时训练画面"],
     film: ["Film", "影片"],
-    film_empty: ["Move the camera, and add views. The film passes them in their order.", "移动相机并添加视角，影片会依次经过这些视角。"],
+    film_empty: ["Move the camera, and add two or more views. The film passes them in their order.", "移动相机并添加两个或更多视角，影片会依次经过这些视角。"],
     film_add: ["Add this view", "添加此视角"],
     film_replace: ["Replace", "替换"],
     film_remove: ["Remove", "移除"],
@@ -161,6 +165,7 @@ const TEXTS = {
     edit_delete: ["Delete", "删除"],
     edit_undo: ["Undo", "撤销"],
     edit_redo: ["Redo", "重做"],
+    edit_first: ["Choose a tool to select something, then delete it. Nothing is changed before Save, and the original is kept.", "选择一个工具选中要去掉的部分，再删除。保存之前不会有任何改动，原场景也会保留。"],
     edit_counts: ["{0} selected, {1} deleted", "已选 {0}，已删 {1}"],
     edit_radius: ["Radius", "半径"],
     edit_from: ["{0} from", "{0} 从"],
@@ -170,7 +175,7 @@ const TEXTS = {
     edit_two_points: ["Click two points of the scene", "点击场景中的两个点"],
     edit_no_surface: ["There is no surface; click another place", "这里没有表面；请点击别处"],
     edit_distance: ["Distance: {0}", "距离：{0}"],
-    edit_truth: ["True distance in metres", "真实距离（米）"],
+    edit_truth: ["True length (m)", "真实长度（米）"],
     edit_rescale: ["Set scale", "设定比例"],
     edit_size: ["Size × {0}: one unit is one metre", "尺寸 × {0}：一个单位为一米"],
     edit_start: ["Start with this view", "以此视角开始"],
@@ -186,6 +191,12 @@ let column = 0;
 
 /** The language that was chosen in the browser. */
 export const chosenLanguage = () => localStorage.getItem("language") ?? (navigator.language.startsWith("zh") ? "zh" : "en");
+
+/** The colours that were chosen in the browser: "light", "dark" or "auto". */
+export const chosenTheme = () => localStorage.getItem("theme") ?? "auto";
+
+/** An address of another page of the studio, which appears in the language and the colours of this one. */
+export const dressed = (/** @type {string} */ address) => `${address}?lang=${chosenLanguage()}&theme=${chosenTheme()}`;
 
 /** @param {string} language "en" or "zh" */
 export function speak(language) {

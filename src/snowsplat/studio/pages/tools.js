@@ -14,12 +14,23 @@ function addTools(/** @type {any} */ page) {
     let picker;
     events.once("picker:ready", (/** @type {any} */ ready) => (picker = ready));
     const begin = async () => {
+        const others = new Set(page.panel.querySelectorAll("button"));
         addFilm(page, version ?? "");
         if (kind === "levels") addWholePage(page.panel);
         else addEditor(page, picker, await centersOf(app), version ?? "", edited === "true", kind === "whole");
+        oneAtATime([...page.panel.querySelectorAll("button[aria-expanded]")].filter(each => !others.has(each)));
     };
     if (state.loaded) begin();
     else events.once("loaded:changed", begin);
+}
+
+/** Film and Edit have the same place, so opening one closes the other. */
+function oneAtATime(/** @type {HTMLElement[]} */ openers) {
+    for (const opener of openers)
+        opener.addEventListener("click", () => {
+            if (opener.ariaExpanded !== "true") return;
+            for (const other of openers) if (other !== opener && other.ariaExpanded === "true") other.click();
+        });
 }
 
 /** Levels of detail have parts of the scene only. A button writes a page with the whole scene. */
@@ -31,7 +42,7 @@ function addWholePage(/** @type {HTMLElement} */ panel) {
         told.textContent = say("edit_whole");
         try {
             await ask("../whole", "POST");
-            location.href = "../whole/index.html";
+            location.href = `../whole/index.html${location.search}`;
         } catch (error) {
             told.textContent = error instanceof Refused ? error.message : say("offline");
             open.disabled = false;

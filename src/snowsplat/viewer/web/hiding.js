@@ -25,22 +25,6 @@ fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {}`
 };
 const EVERYTHING = 1e30;
 
-// The texts of the page in Chinese, for a browser in Chinese.
-const CHINESE = {
-    'Crop': '裁剪',
-    'Hide floaters': '隐藏漂浮物',
-    'Clean up': '清理',
-    'Copy link': '复制链接',
-    'A link to the present view': '当前视角的链接',
-    'Copied': '已复制',
-    'It is in the address bar': '链接在地址栏中',
-    'Photos': '照片',
-    'Photo': '照片',
-    'Scene': '场景',
-    'Gaussians': '个高斯',
-};
-const say = (english) => (navigator.language.toLowerCase().startsWith('zh') ? CHINESE[english] ?? english : english);
-
 const element = (name, properties, ...children) => {
     const made = Object.assign(document.createElement(name), properties);
     made.append(...children);

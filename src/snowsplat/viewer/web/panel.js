@@ -143,6 +143,8 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     state.loaded ? begin() : events.once('loaded:changed', begin);
 
     if (!options.ui) return;
+    nameSigns();
+    Object.assign(canvas, { role: 'img', ariaLabel: scene.title });
     const toggle = (label, content) => {
         const button = element('button', { type: 'button', textContent: label, ariaExpanded: 'false' });
         button.onclick = () => {

@@ -2,7 +2,7 @@
 
 It names the scene, has the stops along the path of the photos, and makes links to the present view.
 Its script also fits what a view must show into the window, and frames the subject. Style sheet and
-scripts are `panel.css`, `hiding.js` and `panel.js`.
+scripts are `panel.css`, `texts.js`, `hiding.js` and `panel.js`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from snowsplat.viewer.web.hiding import Hiding
 from snowsplat.viewer.web.stops import Stops
 
 _FOLDER = Path(__file__).parent
+_SCRIPTS = ("texts.js", "hiding.js", "panel.js")
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def panel_settings(
 
 def script() -> str:
     """The script of the panel, which also creates the viewer."""
-    return "".join((_FOLDER / name).read_text("utf-8") for name in ("hiding.js", "panel.js"))
+    return "".join((_FOLDER / name).read_text("utf-8") for name in _SCRIPTS)
 
 
 def style() -> str:

@@ -173,6 +173,9 @@ const switchTheme = () => {
     document.documentElement.dataset.theme = isDark() ? 'light' : 'dark';
     showTheme();
 };
+// The page of the studio says its colours in the address.
+const colours = new URLSearchParams(location.search).get('theme') ?? '';
+if (['light', 'dark'].includes(colours)) document.documentElement.dataset.theme = colours;
 
 /** @param {boolean} open */
 const openPanel = (open) => {

@@ -164,7 +164,9 @@ export const TEXTS = {
     },
 };
 
-let language = navigator.language.toLowerCase().startsWith('zh') ? 'zh' : 'en';
+// The page of the studio says its language in the address.
+const wanted = new URLSearchParams(location.search).get('lang') ?? navigator.language;
+let language = wanted.toLowerCase().startsWith('zh') ? 'zh' : 'en';
 
 /** The text of this name. @param {string} name @param {Record<string, string | number>} [values] */
 export const text = (name, values = {}) =>
