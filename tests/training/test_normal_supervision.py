@@ -16,7 +16,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.training.parts.normal_supervision import (
     NormalSupervision,
-    contradicts,
+    contradicting,
     normal_term,
     surfaces_of,
 )
@@ -91,19 +91,36 @@ def test_pixels_without_rendering_or_map_have_no_gradient() -> None:
         assert all(grad.isfinite().all() and not grad.any() for grad in grads)
 
 
-def test_a_map_contradicts_if_the_mean_direction_fits_better() -> None:
-    generator = torch.Generator().manual_seed(0)
-    true, noise, bumps = torch.randn(3, 3, 500, generator=generator)
-    true[2] = -true[2].abs()  # towards the camera
-    true = torch.nn.functional.normalize(true, dim=0)
-    noisy = torch.nn.functional.normalize(true + 0.3 * noise, dim=0)
-    assert not contradicts(noisy, true)
-    assert contradicts(noisy, true.flip(1))
-    wall = torch.tensor([[0.0], [0.0], [-1.0]]).expand(3, 500)
-    bumpy = torch.nn.functional.normalize(wall + 0.3 * bumps, dim=0)
-    assert not contradicts(bumpy, wall)  # as good as the mean direction
-    assert contradicts(bumpy, wall.roll(1, 0))
-    assert not contradicts(true[:, :0], true[:, :0])
+def rough(surfaces: Tensor, seed: int, by: float = 0.3) -> Tensor:
+    noise = torch.randn(surfaces.shape, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(surfaces + by * noise, dim=0)
+
+
+def test_a_map_of_another_photo_contradicts() -> None:
+    """Also if the rendered normals have errors, and the maps have other sizes."""
+    true = [rough(torch.zeros(3, 16, 20), seed, 1.0) for seed in range(6)]
+    shown = {i: rough(normals, 10 + i) for i, normals in enumerate(true)}
+    maps = {i: rough(normals, 20 + i) for i, normals in enumerate(true)}
+    assert contradicting(shown, maps) == []
+    maps[1], maps[2], maps[4] = maps[2], maps[1], maps[0]
+    assert contradicting(shown, maps) == [1, 2, 4]
+    for of_photo in (shown, maps):
+        of_photo[3] = of_photo[3].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    shown[5] = torch.zeros(3, 16, 20)  # nothing is rendered there: nothing is known
+    assert contradicting(shown, maps) == [1, 2, 4]
+
+
+def test_a_map_that_fits_worse_than_one_direction_contradicts() -> None:
+    wall = torch.tensor([0.0, 0.0, -1.0])[:, None, None].expand(3, 16, 20)
+    shown = {i: rough(wall, i) for i in range(3)}
+    maps = {i: wall for i in range(3)}
+    assert contradicting(shown, maps) == []  # as good as the mean direction
+    tilted = torch.tensor([0.8, 0.0, -0.6])[:, None, None].expand(3, 16, 20)
+    assert contradicting({0: shown[0]}, {0: tilted}) == [0]
+    # Another frame: all of them, also one that fits by chance.
+    shown[2] = rough(tilted, 2)
+    assert contradicting(shown, dict.fromkeys(range(3), tilted)) == [0, 1, 2]
+    assert contradicting(shown, {0: wall, 1: tilted, 2: tilted}) == [1]
 
 
 def with_normals(data: Dataset, signs: tuple[int, int, int]) -> Dataset:
