@@ -110,10 +110,19 @@ def test_a_map_of_another_photo_contradicts() -> None:
     assert contradicting(shown, maps) == [1, 2, 4]
 
 
+def test_maps_are_compared_where_both_know_the_normal() -> None:
+    """One half of a photo has no exact normals yet; the other map ends there."""
+    true = rough(torch.zeros(3, 16, 20), 0, 1.0)
+    shown = torch.cat([true[:, :10], rough(true, 1, 2.0)[:, 10:]], 1)
+    part = true.clone()
+    part[:, 11:] = 0.0
+    assert contradicting({0: shown, 1: part}, {0: rough(true, 2), 1: part}) == []
+
+
 def test_a_map_that_fits_worse_than_one_direction_contradicts() -> None:
     wall = torch.tensor([0.0, 0.0, -1.0])[:, None, None].expand(3, 16, 20)
     shown = {i: rough(wall, i) for i in range(3)}
-    maps = {i: wall for i in range(3)}
+    maps = dict.fromkeys(range(3), wall)
     assert contradicting(shown, maps) == []  # as good as the mean direction
     tilted = torch.tensor([0.8, 0.0, -0.6])[:, None, None].expand(3, 16, 20)
     assert contradicting({0: shown[0]}, {0: tilted}) == [0]

@@ -240,27 +240,28 @@ def contradicting(surfaces: Mapping[int, Tensor], stated: Mapping[int, Tensor]) 
     some = list(stated)[:: -(-len(stated) // _MOST_OTHERS)]
     ratios, others = {}, []
     for index, own in surfaces.items():
-        cosine, pixels = _mean_cosine(own, stated[index])
-        if not pixels:
-            continue
-        fits = [_mean_cosine(own, stated[k]) for k in some if k != index]
-        if cosine < _LEAST_OF_OTHERS * max((c for c, n in fits if 2 * n > pixels), default=0.0):
-            others.append(index)
-            continue
+        cosines = (own * stated[index]).sum(0)
         known = own.any(0) & stated[index].any(0)
-        ratios[index] = cosine / float(own[:, known].mean(1).norm())
+        if not known.any():
+            continue
+        if any(_fits_better(stated[k], own, cosines, known) for k in some if k != index):
+            others.append(index)
+        else:
+            ratios[index] = float(cosines[known].mean() / own[:, known].mean(1).norm())
     limit = _LEAST_COSINE
     if ratios and median(ratios.values()) < limit:
         limit = math.inf
     return sorted([*others, *(index for index, ratio in ratios.items() if ratio < limit)])
 
 
-def _mean_cosine(surfaces: Tensor, stated: Tensor) -> tuple[float, int]:
-    """The mean cosine in the pixels that both know, and their number."""
-    if stated.shape != surfaces.shape:
-        stated = interpolate(stated[None], surfaces.shape[1:], mode="nearest-exact")[0]
-    pixels = int((surfaces.any(0) & stated.any(0)).sum())
-    return float((surfaces * stated).sum()) / max(pixels, 1), pixels
+def _fits_better(other: Tensor, surfaces: Tensor, cosines: Tensor, known: Tensor) -> bool:
+    """Whether the map of another photo fits clearly better, in the pixels that both maps know."""
+    if other.shape != surfaces.shape:
+        other = interpolate(other[None], surfaces.shape[1:], mode="nearest-exact")[0]
+    both = known & other.any(0)
+    enough = 2 * both.sum() > known.sum()
+    fits = (surfaces * other).sum(0)[both].sum()
+    return bool(enough & (cosines[both].sum() < _LEAST_OF_OTHERS * fits))
 
 
 def _rotation(view: View) -> Tensor:
