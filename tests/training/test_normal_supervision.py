@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from snowsplat import Trainer, recipe
+from snowsplat.data import load_dataset
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.data.dataset import Dataset
+from snowsplat.data.lens.project import LensModel, directions
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.training.parts.normal_supervision import (
     NormalSupervision,
@@ -187,6 +193,67 @@ def test_maps_that_are_damaged_or_of_something_else_are_left_out(tmp_path) -> No
     assert "normal maps: 5 of 6 photos" in first
     assert "cannot be read as a normal map" in first
     assert second == "normal maps that contradict the photos are not used: 2"
+
+
+def inside_of_a_cube() -> Gaussians:
+    """Small ones on the faces of the cube -1..1."""
+    at = torch.linspace(-0.95, 0.95, 20)
+    a, b = torch.meshgrid(at, at, indexing="ij")
+    faces = [
+        torch.stack([a, b, torch.full_like(a, side)], -1).roll(axis, -1).reshape(-1, 3)
+        for axis in range(3)
+        for side in (-1.0, 1.0)
+    ]
+    means = torch.cat(faces)
+    rows = len(means)
+    return Gaussians(
+        means,
+        torch.full((rows, 3), math.log(0.06)),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1),
+        torch.full((rows,), 4.0),
+        torch.zeros(rows, 1, 3),
+        torch.zeros(rows, 0, 3),
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV_FISHEYE", (38.0, 38.0, 48.0, 48.0, 0.01, 0.0, 0.0, 0.0)),
+        ("EQUIRECTANGULAR", (160.0, 80.0)),
+    ],
+)
+def test_maps_of_fisheyes_and_panoramas(tmp_path, model: str, params: tuple[float, ...]) -> None:
+    """Each becomes several views; the map is in the frame of the whole photo."""
+    width, height = (160, 80) if model == "EQUIRECTANGULAR" else (96, 96)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "normals").mkdir()
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    rays = directions(LensModel(model, width, height, params), pixels.reshape(-1, 2))
+    face = np.abs(rays).argmax(1)
+    normals = -np.sign(rays[np.arange(len(rays)), face, None]) * np.eye(3)[face]
+    normals = normals.reshape(height, width, 3)
+    images = []
+    for i in range(2):
+        Image.fromarray(np.full((height, width, 3), 90, np.uint8)).save(
+            tmp_path / f"images/{i}.png"
+        )
+        np.save(tmp_path / f"normals/{i}.npy", normals * (1, -1, -1))
+        images.append(ColmapImage(f"{i}.png", 1, (1.0, 0, 0, 0, 0.1 * i, 0, 0)))
+    camera = ColmapCamera(model, width, height, params)
+    write_model(tmp_path / "sparse/0", {1: camera}, images, np.eye(3), np.zeros((3, 3), np.uint8))
+    data = load_dataset(tmp_path, hold_out=None)
+    assert len(data.train) > 4
+    config = replace(CONFIG, iterations=4, sh_degree=0)
+    trainer = Trainer(data, config, initial=inside_of_a_cube())
+    trainer.run()
+    part = trainer.part(NormalSupervision)
+    assert part.signs.tolist() == [1, -1, -1]
+    assert part.used.all()
+    for index, view in enumerate(data.train):
+        shown = render(inside_of_a_cube(), view.camera, with_depth=True)
+        batch_view = SimpleNamespace(index=index, view=view, camera=view.camera)
+        assert float(part.loss(trainer, batch_view, shown)) < 0.035
 
 
 def test_without_maps_nothing_changes(tmp_path) -> None:
