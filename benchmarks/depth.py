@@ -32,11 +32,12 @@ from snowsplat.scene.render import render
 from snowsplat.scene.surface_normals import normals_of_depth
 from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
 from snowsplat.synthetic.still_life import still_life
+from snowsplat.training.parts.normal_supervision import NormalSupervision
 
 #: Points per photo, and their error relative to the depth.
 POINTS, POINT_ERROR = 60, 0.004
 KINDS = ("none", "true", "scaled", "wrong")
-NORMALS = ("none", "true", "noisy", "wrong")
+NORMALS = ("none", "true", "noisy", "wrong", "axes")
 
 
 def write_room(folder: Path, views: int, width: int, height: int) -> None:
@@ -90,15 +91,16 @@ def write_maps(folder: Path, kind: str) -> None:
         np.save(folder / "depths" / file.name, z.astype(np.float32))
 
 
-def write_normals(folder: Path, kind: str, lens: float) -> None:
+def write_normals(folder: Path, kind: str, lens: float) -> set[str]:
     """``normals/`` of the true depths, with y up and z towards the camera, as PNG of 8 bits.
 
-    As they are; as a network estimates them (blurred noise of 12 degrees); or half of them those of
-    other photos.
+    As they are; as a network estimates them (blurred noise of 15 degrees); half of them those of
+    other photos; or all of them with y and z exchanged. Returns the names of the wrong ones.
     """
     shutil.rmtree(folder / "normals", ignore_errors=True)
+    wrong: set[str] = set()
     if kind == "none":
-        return
+        return wrong
     (folder / "normals").mkdir()
     files = sorted((folder / "truth").iterdir())
     random = torch.Generator().manual_seed(1)
@@ -113,12 +115,15 @@ def write_normals(folder: Path, kind: str, lens: float) -> None:
             coarse = torch.randn(1, 3, height // 16, width // 16, generator=random)
             noise = interpolate(coarse, (height, width), mode="bicubic")[0]
             shown = normals.any(0)
-            normals = normalize(normals + 0.21 * noise, dim=0) * shown
-        if other:
-            normals = normals.flip(2)
+            normals = normalize(normals + 0.26 * noise, dim=0) * shown
+        if kind == "axes":
+            normals = normals[[0, 2, 1]]
+        if other or kind == "axes":
+            wrong.add(file.stem)
         colors = 0.5 + 0.5 * normals * torch.tensor([1.0, -1.0, -1.0])[:, None, None]
         pixels = (255.0 * colors).round().to(torch.uint8).permute(1, 2, 0).contiguous()
         Image.fromarray(pixels.numpy()).save(folder / "normals" / f"{file.stem}.png")
+    return wrong
 
 
 def errors(trainer: Trainer, folder: Path) -> dict[str, float]:
@@ -156,13 +161,17 @@ def main() -> None:
     write_room(room, args.views, *args.size)
     for kind, normals in itertools.product(args.maps, args.normals):
         write_maps(room, kind)
-        write_normals(room, normals, phone_lens(*args.size, (0.0, 0.0, 0.0, 0.0)).focal)
+        wrong = write_normals(room, normals, phone_lens(*args.size, (0.0, 0.0, 0.0, 0.0)).focal)
         config = recipe("default", iterations=args.iterations, few_passes=0.0, **settings)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         trainer = Trainer(load_dataset(room), config, note=lambda line: print("  ", line))
         trainer.run()
         seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
         found = {"maps": kind, "normals": normals, **settings}
+        if normals != "none":
+            rows = zip(trainer.dataset.train, trainer.part(NormalSupervision).used, strict=True)
+            used = [Path(view.name).stem in wrong for view, taken in rows if taken]
+            found |= {"used": f"{used.count(False)} right, {used.count(True)} wrong"}
         found |= {"psnr": trainer.evaluate().psnr, "cpu_s": seconds}
         found |= errors(trainer, room)
         print(json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}))

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from snowsplat import Trainer, recipe
+from snowsplat.data import load_dataset
+from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
 from snowsplat.data.dataset import Dataset
+from snowsplat.data.lens.project import LensModel, directions
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.training.parts.normal_supervision import (
     NormalSupervision,
-    contradicts,
+    contradicting,
     normal_term,
     surfaces_of,
 )
@@ -91,19 +97,45 @@ def test_pixels_without_rendering_or_map_have_no_gradient() -> None:
         assert all(grad.isfinite().all() and not grad.any() for grad in grads)
 
 
-def test_a_map_contradicts_if_the_mean_direction_fits_better() -> None:
-    generator = torch.Generator().manual_seed(0)
-    true, noise, bumps = torch.randn(3, 3, 500, generator=generator)
-    true[2] = -true[2].abs()  # towards the camera
-    true = torch.nn.functional.normalize(true, dim=0)
-    noisy = torch.nn.functional.normalize(true + 0.3 * noise, dim=0)
-    assert not contradicts(noisy, true)
-    assert contradicts(noisy, true.flip(1))
-    wall = torch.tensor([[0.0], [0.0], [-1.0]]).expand(3, 500)
-    bumpy = torch.nn.functional.normalize(wall + 0.3 * bumps, dim=0)
-    assert not contradicts(bumpy, wall)  # as good as the mean direction
-    assert contradicts(bumpy, wall.roll(1, 0))
-    assert not contradicts(true[:, :0], true[:, :0])
+def rough(surfaces: Tensor, seed: int, by: float = 0.3) -> Tensor:
+    noise = torch.randn(surfaces.shape, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(surfaces + by * noise, dim=0)
+
+
+def test_a_map_of_another_photo_contradicts() -> None:
+    """Also if the rendered normals have errors, and the maps have other sizes."""
+    true = [rough(torch.zeros(3, 16, 20), seed, 1.0) for seed in range(6)]
+    shown = {i: rough(normals, 10 + i) for i, normals in enumerate(true)}
+    maps = {i: rough(normals, 20 + i) for i, normals in enumerate(true)}
+    assert contradicting(shown, maps) == []
+    maps[1], maps[2], maps[4] = maps[2], maps[1], maps[0]
+    assert contradicting(shown, maps) == [1, 2, 4]
+    for of_photo in (shown, maps):
+        of_photo[3] = of_photo[3].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    shown[5] = torch.zeros(3, 16, 20)  # nothing is rendered there: nothing is known
+    assert contradicting(shown, maps) == [1, 2, 4]
+
+
+def test_maps_are_compared_where_both_know_the_normal() -> None:
+    """One half of a photo has no exact normals yet; the other map ends there."""
+    true = rough(torch.zeros(3, 16, 20), 0, 1.0)
+    shown = torch.cat([true[:, :10], rough(true, 1, 2.0)[:, 10:]], 1)
+    part = true.clone()
+    part[:, 11:] = 0.0
+    assert contradicting({0: shown, 1: part}, {0: rough(true, 2), 1: part}) == []
+
+
+def test_a_map_that_fits_worse_than_one_direction_contradicts() -> None:
+    wall = torch.tensor([0.0, 0.0, -1.0])[:, None, None].expand(3, 16, 20)
+    shown = {i: rough(wall, i) for i in range(3)}
+    maps = dict.fromkeys(range(3), wall)
+    assert contradicting(shown, maps) == []  # as good as the mean direction
+    tilted = torch.tensor([0.8, 0.0, -0.6])[:, None, None].expand(3, 16, 20)
+    assert contradicting({0: shown[0]}, {0: tilted}) == [0]
+    # Another frame: all of them, also one that fits by chance.
+    shown[2] = rough(tilted, 2)
+    assert contradicting(shown, dict.fromkeys(range(3), tilted)) == [0, 1, 2]
+    assert contradicting(shown, {0: wall, 1: tilted, 2: tilted}) == [1]
 
 
 def with_normals(data: Dataset, signs: tuple[int, int, int]) -> Dataset:
@@ -161,6 +193,67 @@ def test_maps_that_are_damaged_or_of_something_else_are_left_out(tmp_path) -> No
     assert "normal maps: 5 of 6 photos" in first
     assert "cannot be read as a normal map" in first
     assert second == "normal maps that contradict the photos are not used: 2"
+
+
+def inside_of_a_cube() -> Gaussians:
+    """Small ones on the faces of the cube -1..1."""
+    at = torch.linspace(-0.95, 0.95, 20)
+    a, b = torch.meshgrid(at, at, indexing="ij")
+    faces = [
+        torch.stack([a, b, torch.full_like(a, side)], -1).roll(axis, -1).reshape(-1, 3)
+        for axis in range(3)
+        for side in (-1.0, 1.0)
+    ]
+    means = torch.cat(faces)
+    rows = len(means)
+    return Gaussians(
+        means,
+        torch.full((rows, 3), math.log(0.06)),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1),
+        torch.full((rows,), 4.0),
+        torch.zeros(rows, 1, 3),
+        torch.zeros(rows, 0, 3),
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV_FISHEYE", (38.0, 38.0, 48.0, 48.0, 0.01, 0.0, 0.0, 0.0)),
+        ("EQUIRECTANGULAR", (160.0, 80.0)),
+    ],
+)
+def test_maps_of_fisheyes_and_panoramas(tmp_path, model: str, params: tuple[float, ...]) -> None:
+    """Each becomes several views; the map is in the frame of the whole photo."""
+    width, height = (160, 80) if model == "EQUIRECTANGULAR" else (96, 96)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "normals").mkdir()
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    rays = directions(LensModel(model, width, height, params), pixels.reshape(-1, 2))
+    face = np.abs(rays).argmax(1)
+    normals = -np.sign(rays[np.arange(len(rays)), face, None]) * np.eye(3)[face]
+    normals = normals.reshape(height, width, 3)
+    images = []
+    for i in range(2):
+        Image.fromarray(np.full((height, width, 3), 90, np.uint8)).save(
+            tmp_path / f"images/{i}.png"
+        )
+        np.save(tmp_path / f"normals/{i}.npy", normals * (1, -1, -1))
+        images.append(ColmapImage(f"{i}.png", 1, (1.0, 0, 0, 0, 0.1 * i, 0, 0)))
+    camera = ColmapCamera(model, width, height, params)
+    write_model(tmp_path / "sparse/0", {1: camera}, images, np.eye(3), np.zeros((3, 3), np.uint8))
+    data = load_dataset(tmp_path, hold_out=None)
+    assert len(data.train) > 4
+    config = replace(CONFIG, iterations=4, sh_degree=0)
+    trainer = Trainer(data, config, initial=inside_of_a_cube())
+    trainer.run()
+    part = trainer.part(NormalSupervision)
+    assert part.signs.tolist() == [1, -1, -1]
+    assert part.used.all()
+    for index, view in enumerate(data.train):
+        shown = render(inside_of_a_cube(), view.camera, with_depth=True)
+        batch_view = SimpleNamespace(index=index, view=view, camera=view.camera)
+        assert float(part.loss(trainer, batch_view, shown)) < 0.035
 
 
 def test_without_maps_nothing_changes(tmp_path) -> None:

@@ -29,6 +29,7 @@ RUNS = [
         "exposure": "on",
         "transients": "on",
         "depth_weight": 0.5,
+        "surfaces": True,
     },
     {
         **DENSE,

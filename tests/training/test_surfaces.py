@@ -13,8 +13,7 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import quat_product
 from snowsplat.scene.surface_normals import normals_of_depth, rays_of
-from snowsplat.training.parts.surfaces import Surfaces, consistency, planes_of
-from snowsplat.util.errors import SettingError
+from snowsplat.training.parts.surfaces import consistency, planes_of, with_planes
 
 from .sphere import cameras, dataset
 
@@ -56,12 +55,13 @@ def splats_on_the_wall(at: Camera) -> tuple[Splats2D, Tensor]:
 
 def test_a_flat_wall_is_consistent_wherever_the_centres_are() -> None:
     splats, planes = splats_on_the_wall(camera())
-    assert float(consistency(splats, planes, camera())) == pytest.approx(0.0, abs=1e-12)
+    consistent = consistency(with_planes(splats, planes), camera())
+    assert float(consistent) == pytest.approx(0.0, abs=1e-12)
     tilted = torch.nn.functional.normalize(NORMAL + torch.tensor([0.2, 0.0, 0.0]), dim=0)
     x, y = splats.means2d.floor().long().unbind(1)
     distances = splats.depths * (rays_of(camera(), NORMAL)[:, y, x].T @ tilted)
     across = torch.cat([tilted.expand(len(planes), 3), distances[:, None]], dim=1)
-    assert float(consistency(splats, across, camera())) > 1e-3
+    assert float(consistency(with_planes(splats, across), camera())) > 1e-3
 
 
 def test_its_gradient_by_finite_differences() -> None:
@@ -69,29 +69,25 @@ def test_its_gradient_by_finite_differences() -> None:
     random = torch.Generator().manual_seed(0)
     planes += 0.03 * torch.randn(planes.shape, generator=random, dtype=torch.float64)
 
-    leaves = splats.packed.clone().requires_grad_(), planes.requires_grad_()
+    leaf = with_planes(splats, planes).packed.requires_grad_()
     rays = rays_of(camera(), NORMAL)
 
-    def parts(packed: Tensor, planes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rows = torch.cat([packed[:, :8], planes, packed[:, 12:]], dim=1)
-        image, alpha, _ = ops.rasterize(Splats2D(rows, None, 4), 12, 12)
+    def parts(packed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        image, alpha, _ = ops.rasterize(Splats2D(packed, None, 4), 12, 12)
         *normals, distances = image.unbind(2)
         normals = torch.stack(normals)
         return normals, normals_of_depth(distances / (normals * rays).sum(0), camera()), alpha
 
-    _, before, alpha = (tensor.detach() for tensor in parts(*leaves))
+    _, before, alpha = (tensor.detach() for tensor in parts(leaf))
     weight = -(before * torch.nn.functional.normalize(rays, dim=0)).sum(0)
 
-    def loss(packed: Tensor, planes: Tensor) -> Tensor:  # the weight and alpha are constant
-        normals, from_depth, _ = parts(packed, planes)
+    def loss(packed: Tensor) -> Tensor:  # the weight and alpha are constant
+        normals, from_depth, _ = parts(packed)
         return (weight * (alpha - (normals * from_depth).sum(0))).mean()
 
-    found = torch.autograd.grad(
-        consistency(Splats2D(leaves[0], None, 3), leaves[1], camera()), leaves
-    )
-    for one, other in zip(found, torch.autograd.grad(loss(*leaves), leaves), strict=True):
-        torch.testing.assert_close(one, other)
-    assert torch.autograd.gradcheck(loss, leaves, fast_mode=True)
+    (found,) = torch.autograd.grad(consistency(Splats2D(leaf, None, 4), camera()), leaf)
+    torch.testing.assert_close(found, *torch.autograd.grad(loss(leaf), leaf))
+    assert torch.autograd.gradcheck(loss, leaf, fast_mode=True)
 
 
 def test_planes_face_the_camera_in_its_frame() -> None:
@@ -139,11 +135,3 @@ def test_gaussians_become_flat_and_lie_in_the_sphere(tmp_path) -> None:
     (flat, along), (round_, any_way) = angle(True), angle(False)
     assert flat < round_ - 0.1
     assert along > any_way
-
-
-def test_several_processes_are_refused() -> None:
-    class Two:
-        size = 2
-
-    with pytest.raises(SettingError, match="set processes to 1"):
-        Surfaces().prepare(type("Run", (), {"shards": Two()})())

@@ -41,7 +41,8 @@ Marker: TypeAlias = Annotated[
         "LENGTH",
         default="none",
         help="Side of the black square of ArUco or AprilTag markers that lie in the scene, e.g. "
-        "0.10m, 10cm, 4in: one unit of the scene is then one metre.",
+        "0.10m, 10cm, 4in: one unit of the scene is then one metre. Markers that lie flat also "
+        "tell up.",
     ),
 ]
 Quiet: TypeAlias = Annotated[bool, switch("-q", help="Print only the result and no progress.")]

@@ -11,10 +11,11 @@ import pycolmap
 import pytest
 import torch
 
+from snowsplat.data.placement import Placement
 from snowsplat.scene.geometry import look_at
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient import orientation
-from snowsplat.sfm.orient.marker import scale_of_markers
+from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
 
 WIDTH, HEIGHT = 640, 480
 SIDE, SCALE = 0.1, 0.37  # metres; metres per unit of the model
@@ -95,8 +96,11 @@ def test_markers_tell_the_scale(tmp_path: Path, poses: list[np.ndarray]) -> None
     assert found.metres_per_unit == pytest.approx(SCALE, rel=0.005)
     assert abs(math.log(found.metres_per_unit / SCALE)) < 3 * found.error < 0.02
     assert found.name == "2 markers of 100 mm in 12 views"
+    assert np.degrees(np.arccos(found.normals[:, 2])).max() < 0.5
+    assert np.degrees(found.tilts).max() < 1
     oriented = orientation(model, photos, marker)
     assert oriented.placement.is_metric
+    assert oriented.placement.up_from[-1] == "2 markers"
     assert oriented.scene_from_sfm.scale == found.metres_per_unit
     line = oriented.placement.lines()[-1]
     assert line.startswith("metric: 1 unit is 1 m, scale from 2 markers of 100 mm in 12 views, to")
@@ -118,3 +122,43 @@ def test_what_makes_a_scale_doubtful(tmp_path: Path, poses: list[np.ndarray]) ->
     for photo in photos:
         cv2.imwrite(str(tmp_path / photo.name), np.full((HEIGHT, WIDTH), 90, np.uint8))
     assert "no photo shows a marker" in scale_of_markers(model, photos, tmp_path, SIDE)[1][0]
+
+
+def test_a_marker_that_lies_flat_tells_up() -> None:
+    """Photos from one side, all held 4 degrees to the right, leave the level open."""
+    roll = math.radians(4)
+    turned = np.array(
+        [[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]]
+    )
+    target, upwards = torch.zeros(3).double(), torch.tensor([0.0, 0.0, 1.0]).double()
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(LENS)
+    for i in range(4):
+        eye = torch.tensor([0.1 * i - 0.15, -0.5, 0.4]).double()
+        pose = pycolmap.Rigid3d(turned @ look_at(eye, target, upwards).numpy())
+        image = pycolmap.Image(name=f"{i}.png", camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pose)
+
+    def oriented(*normals: tuple[float, float, float]) -> tuple[float, Placement]:
+        """The error of the level in degrees."""
+        tilts = np.full(len(normals), 0.005)
+        marker = MarkerScale(1.0, 0.01, "markers", np.array(normals), tilts) if normals else None
+        found = orientation(model, (), (marker, []))
+        up = -found.scene_from_sfm.rotation[1]
+        return math.degrees(math.acos(float(up[2]))), found.placement
+
+    alone, _ = oriented()
+    assert alone > 3
+    table, wall, beside = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)
+    for normals in ([table], [table, wall]):
+        error, placement = oriented(*normals)
+        assert error < 0.4 * alone
+        assert placement.up_from[-1] == "the marker"
+        assert placement.level_error < 2
+        assert not placement.doubts
+    for normal in (wall, beside):
+        error, placement = oriented(normal)
+        assert error == alone
+        [doubt] = placement.doubts
+        assert doubt.startswith("the marker does not lie flat (the angle to level is ")
+        assert doubt.endswith("°), so the level is that of the way the photos were held alone")

@@ -1,4 +1,4 @@
-"""Scale from printed ArUco markers, whose side length is known.
+"""Scale and planes of printed ArUco markers, whose side length is known.
 
 A marker in several photos is a square with a pose and a side in the world of SfM: 7 unknowns, to
 which its corners in the photos are fitted by robust least squares. All dictionaries are tried. A
@@ -9,6 +9,7 @@ reliable fiducial markers under occlusion", Pattern Recognition 2014, as OpenCV 
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ import numpy as np
 
 from snowsplat.sfm.colmap.sift import read_grey
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.orient.up import tangent
 
 if TYPE_CHECKING:
     import pycolmap
@@ -58,11 +60,13 @@ _SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 
 
 @dataclass(frozen=True)
 class MarkerScale:
-    """The scale that the markers tell."""
+    """The scale that the markers tell, and how they lie."""
 
     metres_per_unit: float  # of the world of SfM
     error: float  # relative standard deviation
     name: str  # as text for users: the markers and the number of photos
+    normals: np.ndarray  # (M, 3) unit vectors in the world of SfM, away from the paper
+    tilts: np.ndarray  # (M,) their standard deviations, radians
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,14 @@ class _Square:
     error: float  # relative standard deviation of the side
     photos: int
     pixels: float  # the median side in the photos
+    normal: np.ndarray  # (3,) unit vector, away from the paper
+    tilt: float  # its standard deviation, radians
 
 
 def scale_of_markers(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], folder: Path, side: float
 ) -> tuple[MarkerScale | None, list[str]]:
-    """The scale of a model, and doubts as text for users.
+    """The scale of a model and the planes of the markers, and doubts as text for users.
 
     Args:
         photos: those of the model; panoramas are not searched.
@@ -150,7 +156,10 @@ def _combined(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | N
     what = f"{len(squares)} markers" if len(squares) > 1 else f"the marker {next(iter(squares))}"
     common = np.hypot(_COMMON, 2 * _COMMON_PIXELS / max(s.pixels for s in squares.values()))
     name = f"{what} of {1000 * side:.4g} mm in {count} views"
-    return MarkerScale(side / float(middle), float(np.hypot(error, common)), name), doubts
+    normals = np.array([square.normal for square in squares.values()])
+    tilts = np.array([square.tilt for square in squares.values()])
+    relative = float(np.hypot(error, common))
+    return MarkerScale(side / float(middle), relative, name, normals, tilts), doubts
 
 
 def _seen(
@@ -239,7 +248,7 @@ def _square(seen: list[_Seen]) -> _Square | None:
         fitted = start and _fit(chosen, *start)
         if fitted is None:
             return None
-        side, error, away = fitted
+        side, covariance, normal, away = fitted
         limits = np.array([max(_WRONG, _WRONG_SHARE * view.size) for view in chosen])
         if (away <= limits).all():
             break
@@ -248,7 +257,9 @@ def _square(seen: list[_Seen]) -> _Square | None:
     if fitted is None or (~used).mean() > _MOST_WRONG:
         return None
     pixels = float(np.median([view.size for view, use in zip(seen, used, strict=True) if use]))
-    return _Square(side, error, int(used.sum()), pixels)
+    plane = tangent(normal)
+    tilt = math.sqrt(np.linalg.eigvalsh(plane @ covariance[:3, :3] @ plane.T)[1])
+    return _Square(side, math.sqrt(covariance[6, 6]), int(used.sum()), pixels, normal, tilt)
 
 
 def _start(seen: list[_Seen]) -> tuple[np.ndarray, np.ndarray, float] | None:
@@ -277,10 +288,12 @@ def _start(seen: list[_Seen]) -> tuple[np.ndarray, np.ndarray, float] | None:
 
 def _fit(
     seen: list[_Seen], rotation: np.ndarray, centre: np.ndarray, side: float
-) -> tuple[float, float, np.ndarray] | None:
-    """Side, its relative error, and (N,) the largest distance of a corner in each view, in pixels.
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Side, covariance (7, 7), normal (3,), and (N,) the largest distance of a corner in each view,
+    in pixels.
 
-    Gauss-Newton on the reprojection errors, by rotation vector, centre and log of the side.
+    Gauss-Newton on the reprojection errors, by rotation vector (radians), centre and log of the
+    side; the covariance has the same order.
     """
     poses = np.array([view.cam_from_world for view in seen])
     measured = np.array([view.rays for view in seen])
@@ -321,4 +334,4 @@ def _fit(
     spread = max(_PIXEL, float(np.sqrt((weights * distances**2).sum() / weights.sum() / 2)))
     # The corners of one photo err together with its pose, so a photo counts as one corner.
     covariance = 4 * spread**2 * np.linalg.pinv(hessian)
-    return side, float(np.sqrt(covariance[6, 6])), distances.max(axis=1)
+    return side, covariance, -rotation[:, 2], distances.max(axis=1)

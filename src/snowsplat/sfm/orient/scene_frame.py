@@ -20,7 +20,14 @@ from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.ground import of_ground
 from snowsplat.sfm.orient.marker import MarkerScale
 from snowsplat.sfm.orient.positions import Alignment, align
-from snowsplat.sfm.orient.up import Evidence, combined, of_cameras, of_sensors, robust_mean
+from snowsplat.sfm.orient.up import (
+    Evidence,
+    combined,
+    of_cameras,
+    of_sensors,
+    robust_mean,
+    with_markers,
+)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -90,8 +97,11 @@ def orientation(
     known = [by_name.get(name) for name in cameras.names]
     cameras = _upright(cameras, known)
     up, doubts = _up(cameras, known)
-    gps, more = _gps(cameras, known, up)
     measured, of_markers = marker
+    if measured is not None:
+        up, more = with_markers(up, measured.normals, measured.tilts)
+        doubts += more
+    gps, more = _gps(cameras, known, up)
     doubts += more + of_markers
     up_from, direction, level_error = list(up.names), up.up, up.error
     if gps is not None:

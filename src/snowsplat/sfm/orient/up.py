@@ -6,6 +6,7 @@
     cameras           people hold cameras level: no roll             1.5°; along the mean viewing
                                                                      direction up to 30°
     ground            the largest plane below the cameras            3°
+    marker            the plane of a printed marker that lies flat   1.5°
 
 Each is a direction with a covariance, and they are combined by these. GPS positions are combined
 with the result in `positions`.
@@ -29,6 +30,9 @@ _GIMBAL = (math.radians(2.0), math.radians(0.5))
 _ACCELEROMETER = (math.radians(3.0), math.radians(1.0))
 # Fewer photos with a sensor may all be wrong: the accelerometer also measures the hand.
 _FEWEST = 3
+# Standard deviation of the slope of what a marker lies on, and the largest angle to level at which
+# it may lie flat.
+_PAPER, _LYING = math.radians(1.5), math.radians(20)
 # Sensors whose directions differ by more than this from their median are in contradiction.
 _LARGEST_SPREAD = math.radians(10)
 # Evidence that differs from the more accurate evidence by more standard deviations is not used.
@@ -87,6 +91,35 @@ def of_sensors(
         error = math.hypot(max(spread, each) / math.sqrt(len(ups)), all_)
         found.append(Evidence((f"the {name} of {len(ups)} photos",), mean, isotropic(mean, error)))
     return found, doubts
+
+
+def with_markers(
+    known: Evidence, normals: np.ndarray, errors: np.ndarray
+) -> tuple[Evidence, list[str]]:
+    """The mean of an up direction and the normals of the markers that lie flat, and doubts.
+
+    A marker on a wall or on a slope says nothing about up. Where ``known`` is uncertain, even a
+    wall would not contradict it, so there is a limit for the angle, too.
+
+    Args:
+        known: the up direction from other evidence.
+        normals: (M, 3) unit vectors, M at least 1.
+        errors: (M,) their standard deviations in radians.
+    """
+    angles = np.arccos((normals @ known.up).clip(-1, 1))
+    flat = angles < _LYING
+    if flat.any():
+        name = "the marker" if flat.sum() == 1 else f"{flat.sum()} markers"
+        mean, spread = robust_mean(normals[flat])
+        error = math.hypot(max(spread, float(np.median(errors[flat]))), _PAPER)
+        markers = Evidence((name,), mean, isotropic(mean, error))
+        if _apart(known, markers) < _CONTRADICTION:
+            return _mean(known, markers), []
+    what = "the marker does" if len(normals) == 1 else "the markers do"
+    return known, [
+        f"{what} not lie flat (the angle to level is {math.degrees(angles.min()):.0f}°), so the "
+        f"level is that of {' and '.join(known.names)} alone"
+    ]
 
 
 def robust_mean(units: np.ndarray) -> tuple[np.ndarray, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -17,6 +18,8 @@ from snowsplat.scene.render import RenderOutput, project
 from snowsplat.training.core.step_runner import StepRunner
 from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import Shards
+
+Each = TypeVar("Each")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +37,10 @@ class BatchView:
     background: Tensor  # (3,)
 
 
-def rounds(batch: Sequence[BatchView], size: int) -> list[Sequence[BatchView]]:
-    """The views in groups of at most ``size``: in each round, process i blends view i."""
+def rounds(batch: Sequence[Each], size: int) -> list[Sequence[Each]]:
+    """The views, or one value for each, in groups of at most ``size``: in each round, process i
+    blends view i.
+    """
     return [batch[first : first + size] for first in range(0, len(batch), size)]
 
 

@@ -12,12 +12,14 @@ between N_d and the ray: the edges of the depth map look like steep surfaces.
 Programs disagree about the axes of normal maps: y up or down, z towards the scene or the camera.
 After a share of the steps, all maps are compared with the scene, which they have not influenced yet
 (`_FROM`). The signs of the axes are those that agree with most of it, for all maps together. A map
-that then fits the scene worse than a single direction would is not used.
+that contradicts the scene then is not used: see `contradicting`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from statistics import median
 from typing import TYPE_CHECKING
 
 import torch
@@ -48,9 +50,12 @@ _RESIDUAL = 1.0 - math.cos(math.radians(15.0))
 _RELATIVE = 1.0
 #: The share of the steps after which the maps are compared with the scene, and then used.
 _FROM = 0.3
+#: A map is that of another photo if its mean cosine to the surfaces is less than this share of that
+#: of the map of another photo. It is compared with at most this number of them.
+_LEAST_OF_OTHERS, _MOST_OTHERS = 0.85, 64
 #: A map contradicts the scene if its mean cosine to the surfaces is less than this share of that of
-#: their mean direction: a wall would be 45 degrees wrong.
-_LEAST_COSINE = 0.7
+#: their mean direction: a wall would be 37 degrees wrong.
+_LEAST_COSINE = 0.8
 #: They are compared at this fraction of their size: normals of a larger surface are more exact.
 _COARSE = 4
 #: A mean of normals is one of a surface if it is at least so long.
@@ -102,28 +107,26 @@ class NormalSupervision(Part):
         if self.idle or not begun or bool(self.signs.any()):
             return
         views = run.cameras.views()
-        pairs = {}
+        surfaces, stated, agreement = {}, {}, torch.zeros(3, device=run.device)
         for index, stored in self._maps.items():
             height, width = (max(3, side // _COARSE) for side in stored.shape[1:])
             camera = views[index].camera.scaled(width, height).to(run.device)
             splats = run.shards.everywhere(project(run.gaussians, camera, run.sh_degree))
             _, alpha, depth = ops.rasterize(splats, width, height, with_depth=True)
             assert depth is not None
-            surfaces, weight = surfaces_of(depth, alpha, camera)
-            own = torch.einsum("ji,jhw->ihw", _rotation(views[index]).to(surfaces), surfaces)
-            stated = interpolate(stored[None].to(own), (height, width), mode="area")[0] / 127.0
-            length = stated.square().sum(0).sqrt()
-            known = (weight > 0.0) & (length > _SAME)
-            pairs[index] = own[:, known], stated[:, known] / length[known]
-        agreement = torch.stack([(own * stated).sum(1) for own, stated in pairs.values()]).sum(0)
+            own, weight = surfaces_of(depth, alpha, camera)
+            surfaces[index] = own * (weight > 0.0)
+            coarse = interpolate(stored[None].to(own), (height, width), mode="area")[0] / 127.0
+            length = coarse.square().sum(0).sqrt()
+            stated[index] = torch.where(length > _SAME, coarse / length, 0.0)
+            turn = _rotation(views[index]).to(own)
+            agreement += torch.einsum("ij,ihw,jhw->j", turn, surfaces[index], stated[index])
         signs = torch.where(agreement < 0.0, -1.0, 1.0)
         self.signs = signs.to("cpu", torch.int8)
-        wrong = [
-            index
-            for index, (own, stated) in pairs.items()
-            if contradicts(own, signs[:, None] * stated)
-        ]
-        if wrong:
+        for index in stated:
+            turn = _rotation(views[index]).to(signs) * signs
+            stated[index] = torch.einsum("ij,jhw->ihw", turn, stated[index])
+        if wrong := contradicting(surfaces, stated):
             self.used[wrong] = False
             names = first_names([views[index].name for index in wrong], 5)
             frame = "" if self.used.any() else "; normals must be in the frame of the camera"
@@ -219,21 +222,46 @@ def surfaces_of(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, T
     return surfaces, weight
 
 
-def contradicts(surfaces: Tensor, stated: Tensor) -> bool:
-    """Whether a map fits the surfaces worse than their mean direction does.
+def contradicting(surfaces: Mapping[int, Tensor], stated: Mapping[int, Tensor]) -> list[int]:
+    """The numbers of the photos whose map is not that of the photo, ascending.
 
-    With errors of the rendered normals, both mean cosines fall by the same factor, so their ratio
-    tells whether the map is right. It is at least 1 for an exact map. For a map of something else,
-    it is at most the length of the mean of its normals.
+    With errors of the rendered normals of a photo, the mean cosines of all maps to them fall by the
+    same factor, so their ratio tells which one fits. There are three tests:
+
+    - The map of another photo fits clearly better than its own. (Of photos side by side, both fit.)
+    - A map fits clearly worse than a single direction, the mean of the surfaces. An exact map fits
+      at least as well.
+    - Most of the maps that pass the first test fail the second one. Then all have another frame.
 
     Args:
-        surfaces: (3, P) unit normals that are rendered, of P pixels.
-        stated: (3, P) those of the map.
+        surfaces: (3, h, w) unit normals that are rendered, by the number of the photo; 0: unknown.
+        stated: the same of the maps, in the frame of the camera.
     """
-    if not surfaces.shape[1]:
-        return False
-    cosine = (surfaces * stated).sum(0).mean()
-    return bool(cosine < _LEAST_COSINE * surfaces.mean(1).norm())
+    some = list(stated)[:: -(-len(stated) // _MOST_OTHERS)]
+    ratios, others = {}, []
+    for index, own in surfaces.items():
+        cosines = (own * stated[index]).sum(0)
+        known = own.any(0) & stated[index].any(0)
+        if not known.any():
+            continue
+        if any(_fits_better(stated[k], own, cosines, known) for k in some if k != index):
+            others.append(index)
+        else:
+            ratios[index] = float(cosines[known].mean() / own[:, known].mean(1).norm())
+    limit = _LEAST_COSINE
+    if ratios and median(ratios.values()) < limit:
+        limit = math.inf
+    return sorted([*others, *(index for index, ratio in ratios.items() if ratio < limit)])
+
+
+def _fits_better(other: Tensor, surfaces: Tensor, cosines: Tensor, known: Tensor) -> bool:
+    """Whether the map of another photo fits clearly better, in the pixels that both maps know."""
+    if other.shape != surfaces.shape:
+        other = interpolate(other[None], surfaces.shape[1:], mode="nearest-exact")[0]
+    both = known & other.any(0)
+    enough = 2 * both.sum() > known.sum()
+    fits = (surfaces * other).sum(0)[both].sum()
+    return bool(enough & (cosines[both].sum() < _LEAST_OF_OTHERS * fits))
 
 
 def _rotation(view: View) -> Tensor:

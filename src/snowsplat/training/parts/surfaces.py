@@ -14,7 +14,9 @@ arXiv:2406.06521):
   w is the cosine between N_d and the ray: the edges of the depth map look like steep surfaces.
 
 The second term begins when most of the Gaussians are there. Its gradient reaches them through their
-splats as that of the photos does, and directly through n and δ.
+splats as that of the photos does, and directly through n and δ. N and Δ are a rendering of their
+own, which takes longer than a step without it. So only one step of `_EVERY` has it, with as many
+times the weight.
 """
 
 from __future__ import annotations
@@ -30,19 +32,19 @@ from snowsplat import ops
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import rotation_from_quat, transform_points
-from snowsplat.scene.render import RenderOutput
+from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
+from snowsplat.training.core.batch import rounds
 from snowsplat.training.parts.part import Part
-from snowsplat.util.errors import SettingError
 
 if TYPE_CHECKING:
     from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
     from snowsplat.training.core.view_gradient import ViewGradient
 
-#: The weight of the consistency, and the share of the steps after which it begins.
-_WEIGHT, _FROM = 0.05, 0.4
+#: The weight of the consistency, the share of the steps after which it begins, and the number of
+#: steps of which one has it.
+_WEIGHT, _FROM, _EVERY = 0.05, 0.4, 4
 #: Number of steps between two reductions of the smallest scale, the factor of each, and the ratio
 #: to the middle scale below which there is none.
 _INTERVAL, _SHRINK, _FLAT = 10, 0.97, 0.1
@@ -56,19 +58,6 @@ class Surfaces(Part):
 
     name = "surfaces"
 
-    def __init__(self) -> None:
-        # The gradients of `means` and `quats` in the present step, by view.
-        self._present: dict[BatchView, tuple[Tensor, Tensor]] = {}
-
-    def prepare(self, run: Run) -> None:
-        """Refuse what is not possible.
-
-        Raises:
-            SettingError: there are several processes.
-        """
-        if run.shards.size > 1:
-            raise SettingError("surfaces", "needs all Gaussians in one process; set processes to 1")
-
     def between(self, run: Run) -> None:
         """Flatten in place, in every `_INTERVAL`-th step."""
         times = run.schedule.multiples(run.step, _INTERVAL)
@@ -79,20 +68,6 @@ class Surfaces(Part):
             flatter = torch.maximum(smallest + times * math.log(_SHRINK), flat)
             scales.scatter_(1, scales.argmin(1, keepdim=True), flatter[:, None])
 
-    def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
-        """See the module."""
-        if run.step < run.schedule.step_of(_FROM):
-            return None
-        means = run.gaussians.means.detach().requires_grad_()
-        quats = run.gaussians.quats.detach().requires_grad_()
-        self._present[view] = means, quats
-        splats = rendered.splats
-        assert splats.ids is not None
-        rows = splats.ids.clamp(min=0).long()  # on a GPU, empty rows have the id -1
-        axis = run.gaussians.log_scales.argmin(1)
-        planes = planes_of(means[rows], quats[rows], axis[rows], view.camera)
-        return _WEIGHT * consistency(splats, planes, view.camera, run.runner.capacity)
-
     def gradients(
         self,
         run: Run,
@@ -100,14 +75,41 @@ class Surfaces(Part):
         batch: Sequence[BatchView],
         gradients: Sequence[ViewGradient],
     ) -> None:
-        """Add those of n and δ to ``.grad`` of the parameters, which the optimiser adds."""
-        parameters = run.gaussians.means, run.gaussians.quats
-        for leaves in self._present.values():
-            for parameter, leaf in zip(parameters, leaves, strict=True):
-                assert leaf.grad is not None
-                found = leaf.grad / len(batch)
-                parameter.grad = found if parameter.grad is None else parameter.grad + found
-        self._present.clear()
+        """Add those of the consistency, in one step of `_EVERY`; see the module."""
+        times = run.schedule.multiples(step, _EVERY)
+        if step <= run.schedule.step_of(_FROM) or not times:
+            return
+        weight = _WEIGHT * _EVERY * times / len(batch) ** 2  # the mean of the views, in each step
+        means = run.gaussians.means.detach().requires_grad_()
+        quats = run.gaussians.quats.detach().requires_grad_()
+        axis = run.gaussians.log_scales.argmin(1)
+        views = zip(batch, gradients, strict=True)
+        for group in rounds(list(views), run.shards.size):
+            planes, drawn = [], []
+            for view, gradient in group:
+                assert gradient.splats.ids is not None
+                rows = gradient.splats.ids.clamp(
+                    min=0
+                ).long()  # on a GPU, empty rows have the id -1
+                with torch.enable_grad():
+                    planes.append(planes_of(means[rows], quats[rows], axis[rows], view.camera))
+                drawn.append(with_planes(gradient.splats, planes[-1].detach()))
+            blended = run.shards.exchange(drawn)
+            if blended is not None:
+                blended.packed.requires_grad_()
+                camera = group[run.shards.rank][0].camera
+                with torch.enable_grad():
+                    loss = weight * consistency(blended, camera, run.runner.capacity)
+                loss.backward()
+            run.shards.return_gradients(blended, drawn, absolute=False)
+            for (_, gradient), of_view, splats in zip(group, planes, drawn, strict=True):
+                found = splats.packed.grad
+                assert found is not None
+                gradient.packed_grad[:, :COLORS] += found[:, :COLORS]
+                of_view.backward(found[:, COLORS : COLORS + splats.channels])
+        for parameter, leaf in ((run.gaussians.means, means), (run.gaussians.quats, quats)):
+            assert leaf.grad is not None
+            parameter.grad = leaf.grad if parameter.grad is None else parameter.grad + leaf.grad
 
 
 def planes_of(means: Tensor, quats: Tensor, axis: Tensor, camera: Camera) -> Tensor:
@@ -118,33 +120,39 @@ def planes_of(means: Tensor, quats: Tensor, axis: Tensor, camera: Camera) -> Ten
         quats: (M, 4).
         axis: (M,) int64, that of the smallest scale.
     """
-    cam_from_world = camera.cam_from_world.to(means)
     index = axis[:, None, None].expand(-1, 3, 1)
-    normals = rotation_from_quat(quats).gather(2, index)[..., 0]
-    normals = normals @ cam_from_world[:, :3].T
-    distances = (normals * transform_points(cam_from_world, means)).sum(1, keepdim=True)
-    return torch.where(distances > 0, -1.0, 1.0) * torch.cat([normals, distances], dim=1)
+    normals = rotation_from_quat(quats).gather(2, index)[..., 0].unbind(1)
+    # Products of matrices are rounded by another rule for each M, and each process has some rows.
+    turn, offset = camera.cam_from_world.to(means).split([3, 1], dim=1)
+    turned = [_dot(row.unbind(), normals) for row in turn]
+    distances = _dot(normals, means.unbind(1)) + _dot(turned, offset.unbind())
+    sign = torch.where(distances > 0, -1.0, 1.0)
+    return torch.stack([*turned, distances], dim=1) * sign[:, None]
 
 
-def consistency(
-    splats: Splats2D, planes: Tensor, camera: Camera, capacity: Capacity | None = None
-) -> Tensor:
-    """The mean () of w (alpha − N · N_d), differentiable in ``splats.packed`` and ``planes``.
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def with_planes(splats: Splats2D, planes: Tensor) -> Splats2D:
+    """The same splats with their planes (M, 4) in place of colours; without gradient."""
+    packed = splats.packed.detach().clone()
+    channels = planes.shape[1]
+    packed[:, COLORS : COLORS + channels] = planes
+    return Splats2D(packed, splats.ids, channels)
+
+
+def consistency(splats: Splats2D, camera: Camera, capacity: Capacity | None = None) -> Tensor:
+    """The mean () of w (alpha − N · N_d), differentiable in ``splats.packed``.
 
     Args:
-        splats: M splats of 3 colours, which are replaced.
-        planes: (M, 4), see `planes_of`.
+        splats: M splats whose 4 channels are their planes, see `planes_of`.
         camera: of the splats.
         capacity: see `ops.rasterize`.
     """
-    packed = splats.packed
-    padding = packed.new_zeros(len(packed), packed.shape[1] - COLORS - planes.shape[1])
-    packed = torch.cat([packed[:, :COLORS], planes, padding], dim=1)
-    size = camera.width, camera.height
-    drawn = Splats2D(packed, splats.ids, planes.shape[1])
-    image, alpha, _ = ops.rasterize(drawn, *size, capacity=capacity)
+    image, alpha, _ = ops.rasterize(splats, camera.width, camera.height, capacity=capacity)
     normals, distances = image.permute(2, 0, 1).split([3, 1])
-    rays = rays_of(camera, packed)
+    rays = rays_of(camera, splats.packed)
     along, lengths = (normals * rays).sum(0), rays.square().sum(0).sqrt()
     # The planes face the camera, so `along` is negative. Those seen from the side have no depth.
     shown = (along < -_SIDEWAYS * lengths) & (distances[0] < 0)
