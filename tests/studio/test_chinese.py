@@ -22,7 +22,7 @@ from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.ingest.video_frames import SAME_VIEW
 from snowsplat.studio.app import _listing
 from snowsplat.studio.library import Library
-from snowsplat.studio.uploads import safe_path, write_part
+from snowsplat.studio.uploads import Upload, safe_path, write_part
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.html import CHINESE
 from snowsplat.util.run_lock import Holder
@@ -86,7 +86,7 @@ def test_errors(tmp_path):
     inputs = [empty, raw, text, damaged, nothing, tmp_path / "missing"]
     library = Library(tmp_path / "library")
     scene = library.new("scene", [])
-    write_part(scene, "1.jpg", 4, 0, b"1234")
+    write_part(scene, Upload("1.jpg", 4, 0), b"1234")
     plain, detailed = [0] * 9, [900] * 9
     errors = [
         *(error_of(lambda at=at: find_sources([at])) for at in inputs),
@@ -94,8 +94,8 @@ def test_errors(tmp_path):
         error_of(lambda: library.find("/missing")),
         error_of(library.new("empty", []).inputs),
         error_of(lambda: safe_path("..")),
-        error_of(lambda: write_part(scene, "/1.jpg", 5, 0, b"12345")),
-        error_of(lambda: write_part(scene, "/2.jpg", 9, 5, b"1")),
+        error_of(lambda: write_part(scene, Upload("/1.jpg/2.jpg", 5, 0), b"12345")),
+        error_of(lambda: write_part(scene, Upload("/2.jpg", 9, 0, received=5), b"1")),
         error_of(lambda: _listing(tmp_path / "missing")),
         str(failure(Evidence(plain, [], None, 36))),
         str(failure(Evidence(detailed, [], None, 36))),

@@ -108,8 +108,7 @@
     '{}: cannot be shown': '{0}：无法显示',
 
     // Uploads and files
-    '{}: there is another file of this name': '{0}：已有另一个同名文件',
-    '{}: there is a folder of this name; rename the file': '{0}：已有同名文件夹，请给文件改名',
+    '{}: its time is after the year #': '{0}：时间晚于 {1} 年',
     '{}: a part of its folder is a file; rename it': '{0}：路径中有一部分是文件，请改名',
     '{}: # bytes of it have arrived': '{0}：已上传 {1} 字节',
     '{}: {} do not fit on the disk, which has {} left; free some space': '{0}：磁盘放不下 {1}，只剩 {2}，请腾出空间',
