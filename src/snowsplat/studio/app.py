@@ -260,7 +260,8 @@ class _Studio:
         return {}
 
     async def _uploads(self, request: Request, scene: Scene) -> Any:
-        return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
+        async with self._locks[scene.name, "upload"]:
+            return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
 
     async def _upload(self, request: Request, scene: Scene) -> Any:
         query = request.query_params
