@@ -228,7 +228,7 @@ class _Studio:
         }
 
     async def _remove(self, request: Request, scene: Scene) -> Any:
-        if job.is_running(scene) or job.is_running(scene, "film"):
+        if job.is_being_made(scene) or job.is_running(scene, "film"):
             raise UserError("the scene or its film is being made; stop that, then remove it")
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "upload"]:
             if is_locked(scene.edit_lock):

@@ -55,7 +55,7 @@ from snowsplat.sfm.progress import Report
 from snowsplat.sfm.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.studio.hand_on import export_file
-from snowsplat.studio.job import is_running
+from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import TASKS, Scene, safe_title
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
@@ -307,7 +307,7 @@ def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
     Raises: UserError: the scene is not finished, is being made, or was changed since then.
     """
     changes = None if undo else from_json(PageEdit, read_json(scene.edits))
-    if is_running(scene):
+    if is_being_made(scene):
         raise UserError("the scene is being made; stop it, then edit it")
     scene.check_version(version)
     finish_edit(scene)  # an earlier one
