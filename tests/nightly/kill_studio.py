@@ -148,10 +148,11 @@ class Kills:
         thread.start()
         self.pause(seconds)
         victim = self.random.choice(["server", "worker", "both"])
-        if victim != "server":
-            victim = f"{victim} {len(self.kill_workers())}"
-        if not victim.startswith("worker"):
+        hit = victim != "server" and self.kill_workers()
+        if victim != "worker":
             self.server.kill()
+        elif not hit:
+            victim = "nothing: it had ended"
         thread.join(900)
         self.note(stage, victim)
 
@@ -170,7 +171,7 @@ class Kills:
         return found
 
     def note(self, stage: str, what: str) -> None:
-        self.counts[stage] += 1
+        self.counts[stage] += not what.startswith("nothing")
         print(f"{sum(self.counts.values()):3} {stage}: killed {what}", flush=True)
 
     def check_photos(self) -> None:
