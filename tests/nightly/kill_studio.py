@@ -22,6 +22,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -250,7 +251,7 @@ class Kills:
         while True:
             status = self.ask()["status"]
             if status == "running" and left:
-                self.pause(90.0)
+                self.pause(45.0)
                 state = self.ask()["state"]
                 stages = [each["stage"] for each in state.get("stages", [])]
                 now = (state.get("now") or {}).get("stage", "begin")
@@ -265,9 +266,11 @@ class Kills:
                 if victim != "server":  # a process that is killed takes a moment to end
                     wait_for(lambda: self.status() != "running", 20)
                 after = self.ask()
-                expected = ("running", "done") if victim == "server" else ("interrupted",)
+                expected = ("running", "done") if victim == "server" else ("interrupted", "done")
                 check(after["status"] in expected, f"after a kill of {victim}: {after['status']}")
-                if victim == "server" and after["status"] == "running":
+                if after["status"] == "done":
+                    continue
+                if victim == "server":
                     answer = self.server.ask(f"{self.address}/start", "POST", {"quality": "draft"})
                     check(answer[0] == 400, "a second job was started")
                     command = [sys.executable, "-m", "snowsplat.studio", "make", self.scene.folder]
@@ -286,6 +289,7 @@ class Kills:
                 made += 1
                 if not left:
                     break
+                shutil.rmtree(self.scene.made)  # all of it again
                 self.ask("/start", "POST", {"quality": "draft", "minutes": 0.4})
             else:
                 check(not begun or status != "failed", f"{status}: {self.ask()['state']}")

@@ -9,7 +9,7 @@ import pytest
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.studio import worker
+from snowsplat.studio import changes
 from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import locked, one_run
 from snowsplat.util.safe_json import from_json, read_json
@@ -40,9 +40,9 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(worker, before, killed)
+        patch.setattr(changes, before, killed)
         with pytest.raises(Killed):
-            worker.edit_scene(finished, finished.version(), undo=False)
+            changes.edit_scene(finished, finished.version(), undo=False)
     is_edited = before != "edit"
     address = f"scenes/{finished.name}"
     about = studio.ask(address)[1]
@@ -61,7 +61,7 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
         assert len(read_sog(finished.site / "scene.sog").means) == N - 20 * is_edited
         keys = from_json(PageFilm, read_json(finished.plan)).keys
         assert np.allclose(keys[1][:3], [2, 0, -18] if is_edited else [1, 0, -9])
-        worker.show_scene(finished)
+        changes.show_scene(finished)
     assert not finished.begun.exists()
 
 

@@ -295,7 +295,7 @@ class _Studio:
             raise UserError(f"minutes: use a number above 0, at most {_LONGEST_MINUTES}")
         scene.inputs()
         if self._locks[scene.name, "edit"].locked():
-            raise UserError("an edit of the scene is being stored; start again in a moment")
+            raise UserError("the scene is being changed or exported; start again in a moment")
         async with self._locks[scene.name, "start"]:
             await _film_has_read(scene)
             if not job.is_running(scene):
