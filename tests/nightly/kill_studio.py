@@ -280,9 +280,9 @@ class Kills:
                     self.ask("/start", "POST", {"quality": "draft", "minutes": 0.4})
                     begun = True
                     wait_for(lambda: "started" in self.ask()["state"] or self.status() != "running")
+                    self.check_stages(stages)
                 self.check_one_job()
                 self.check_photos()
-                self.check_stages(stages)
             elif status == "running":
                 time.sleep(0.5)
             elif status == "done":
