@@ -279,7 +279,8 @@ class Kills:
                 else:
                     self.ask("/start", "POST", {"quality": "draft", "minutes": 0.4})
                     begun = True
-                    wait_for(lambda: "started" in self.ask()["state"] or self.status() != "running")
+                    old = after["state"].get("started")
+                    wait_for(lambda old=old: self.began() != old or self.status() != "running")
                     self.check_stages(stages)
                 self.check_one_job()
                 self.check_photos()
@@ -297,6 +298,10 @@ class Kills:
                 begun = True
         self.check_shown()
         print(f"    made {made} times", flush=True)
+
+    def began(self) -> float | None:
+        """When the job began whose state is there."""
+        return self.ask()["state"].get("started")
 
     def status(self) -> str:
         return str(self.ask()["status"])
