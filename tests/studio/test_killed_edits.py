@@ -9,9 +9,9 @@ import pytest
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.studio import worker
+from snowsplat.studio import changes
 from snowsplat.util.files import write_json
-from snowsplat.util.run_lock import locked
+from snowsplat.util.run_lock import locked, one_run
 from snowsplat.util.safe_json import from_json, read_json
 
 from .conftest import N, edit_of
@@ -40,9 +40,9 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
             raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(worker, before, killed)
+        patch.setattr(changes, before, killed)
         with pytest.raises(Killed):
-            worker.edit_scene(finished, finished.version(), undo=False)
+            changes.edit_scene(finished, finished.version(), undo=False)
     is_edited = before != "edit"
     address = f"scenes/{finished.name}"
     about = studio.ask(address)[1]
@@ -61,7 +61,7 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
         assert len(read_sog(finished.site / "scene.sog").means) == N - 20 * is_edited
         keys = from_json(PageFilm, read_json(finished.plan)).keys
         assert np.allclose(keys[1][:3], [2, 0, -18] if is_edited else [1, 0, -9])
-        worker.show_scene(finished)
+        changes.show_scene(finished)
     assert not finished.begun.exists()
 
 
@@ -80,6 +80,17 @@ def test_an_edit_waits_for_one_of_a_studio_that_was_killed(studio, finished):
         assert finished.scene_file().name == "box.ply"
     edit.join(30)
     assert answers == [(200, {"file": "box_edited.ply"})]
+
+
+def test_a_scene_that_is_made_in_a_terminal_is_left_alone(studio, finished):
+    """Its edit would be that of the scene before."""
+    address = f"scenes/{finished.name}"
+    with one_run(finished.made):
+        edit, remove = (f"{address}/edit", "POST", edit_of(NOTHING)), (address, "DELETE")
+        for request in (edit, remove):
+            status, answer = studio.ask(*request)
+            assert (status, "is being made" in answer["error"]) == (400, True)
+    assert studio.ask(f"{address}/edit", "POST", edit_of(NOTHING))[0] == 200
 
 
 def test_a_file_is_that_of_the_scene_as_it_is(studio, finished):

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from snowsplat.studio.one_studio import Address, only_studio, write_address
+from snowsplat.studio.one_studio import Address, Running, only_studio, write_address
 from snowsplat.util.run_lock import InUse
 
 
@@ -39,3 +39,16 @@ def test_the_address_of_one_that_was_killed(tmp_path):
     (tmp_path / ".studio.json").rename(tmp_path / "elsewhere")
     (tmp_path / ".studio.json").symlink_to(tmp_path / "elsewhere")
     assert found() is None
+
+
+def test_requests_to_this_computer_go_past_proxies(studio, monkeypatch):
+    """Nobody listens at port 1."""
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
+    url, token = studio.server.url, studio.server.token
+    address = Address(url, "127.0.0.1", studio.server.port, token, [])
+    assert address.answers(studio.library.folder)
+    assert not address.answers(studio.library.folder.parent)
+    write_address(studio.library.folder, address)
+    with pytest.raises(Running) as running, only_studio(studio.library.folder):
+        pass
+    assert running.value.address == address

@@ -39,15 +39,18 @@ def test_a_file_appears_when_it_is_complete(scene):
 
 
 def test_killed_before_a_complete_file_has_its_name(scene, monkeypatch):
-    """Its last part is sent again, or none."""
-    for name, start, data in (("a.jpg", 5, b"56789"), ("b.jpg", 10, b"")):
+    """Its last part is sent again, or an empty one; or it is listed."""
+    for name, start, data in (("a.jpg", 5, b"56789"), ("b.jpg", 10, b""), ("c.jpg", None, b"")):
         send(scene, name, 10, 0, b"01234")
         with monkeypatch.context() as patch:
             patch.setattr(os, "utime", lambda *_, **__: {}["killed"])
             with pytest.raises(KeyError):
                 send(scene, name, 10, 5, b"56789")
         assert not (scene.photos / name).exists()
-        assert send(scene, name, 10, start, data) == 10
+        if start is None:
+            assert received(scene)[name] == 10
+        else:
+            assert send(scene, name, 10, start, data) == 10
         assert (scene.photos / name).read_bytes() == b"0123456789"
 
 

@@ -229,7 +229,7 @@ class _Studio:
         }
 
     async def _remove(self, request: Request, scene: Scene) -> Any:
-        if job.is_running(scene) or job.is_running(scene, "film"):
+        if job.is_being_made(scene) or job.is_running(scene, "film"):
             raise UserError("the scene or its film is being made; stop that, then remove it")
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "upload"]:
             if is_locked(scene.edit_lock):
@@ -261,7 +261,8 @@ class _Studio:
         return {}
 
     async def _uploads(self, request: Request, scene: Scene) -> Any:
-        return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
+        async with self._locks[scene.name, "upload"]:
+            return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
 
     async def _upload(self, request: Request, scene: Scene) -> Any:
         query = request.query_params
@@ -295,7 +296,7 @@ class _Studio:
             raise UserError(f"minutes: use a number above 0, at most {_LONGEST_MINUTES}")
         scene.inputs()
         if self._locks[scene.name, "edit"].locked():
-            raise UserError("an edit of the scene is being stored; start again in a moment")
+            raise UserError("the scene is being changed or exported; start again in a moment")
         async with self._locks[scene.name, "start"]:
             await _film_has_read(scene)
             if not job.is_running(scene):

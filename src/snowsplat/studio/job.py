@@ -14,7 +14,7 @@ from typing import Any
 
 from snowsplat.studio.library import Scene
 from snowsplat.util.errors import UserError
-from snowsplat.util.run_lock import holder, is_locked
+from snowsplat.util.run_lock import LOCK, holder, is_locked
 
 _WORKER = [sys.executable, "-m", "snowsplat.studio"]
 # By their lock: jobs that this process has started. They are asked whether they have ended, or
@@ -48,6 +48,11 @@ def is_running(scene: Scene, task: str = "make") -> bool:
         return True
     _started.pop(lock, None)
     return is_locked(lock)
+
+
+def is_being_made(scene: Scene) -> bool:
+    """Whether its job runs, or a command in a terminal writes its output folder."""
+    return is_running(scene) or is_locked(scene.made / LOCK)
 
 
 def stop(scene: Scene, task: str = "make") -> None:

@@ -57,7 +57,10 @@ class Upload:
 
 
 def uploads(scene: Scene) -> list[Upload]:
-    """The files that have arrived, and those of which a part has."""
+    """The files that have arrived, and those of which a part has.
+
+    A file that was complete when the process was killed gets its name.
+    """
     found = []
     for folder, _, names in os.walk(scene.photos):
         for name in names:
@@ -67,6 +70,8 @@ def uploads(scene: Scene) -> list[Upload]:
             if part:
                 size, modified = int(part["size"]), int(part["modified"])
                 shown = shown.with_name(part["name"])
+                if about.st_size == size:
+                    _finish(path, path.with_name(part["name"]), modified)
                 found.append(Upload(shown.as_posix(), size, modified, about.st_size))
             elif not name.endswith(PART):
                 size, modified = about.st_size, about.st_mtime_ns // 1_000_000
@@ -120,15 +125,20 @@ def write_part(scene: Scene, file: Upload, data: bytes) -> int:
             opened.flush()
             os.fsync(opened.fileno())
     if end == size:
-        os.utime(part, ns=(file.modified * 1_000_000, file.modified * 1_000_000))
-        for other in _numbered(target):
-            if not other.exists():
-                os.replace(part, other)
-                break
-            if other.is_file() and filecmp.cmp(part, other, shallow=False):
-                part.unlink()
-                break
+        _finish(part, target, file.modified)
     return end
+
+
+def _finish(part: Path, target: Path, modified: int) -> None:
+    """Give a complete file its name, or another one with a number; unless it is there already."""
+    os.utime(part, ns=(modified * 1_000_000, modified * 1_000_000))
+    for name in _numbered(target):
+        if not name.exists():
+            os.replace(part, name)
+            return
+        if name.is_file() and filecmp.cmp(part, name, shallow=False):
+            part.unlink()
+            return
 
 
 def _numbered(path: Path) -> Iterator[Path]:

@@ -20,52 +20,43 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import shutil
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from snowsplat.pipeline.cameras_from_above import cameras_from_above, draw_level
-from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.describe_photos import describe_photos
-from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
-from snowsplat.pipeline.film import film, film_preview, moved_film, page_frames, write_keys
+from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
-from snowsplat.pipeline.output.edit_record import PageEdit, shown_file
+from snowsplat.pipeline.output.edit_record import shown_file
 from snowsplat.pipeline.output.output_folder import DATASET, SCENE
-from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of
-from snowsplat.sfm.dataset_report import REPORT, draw_from_above
+from snowsplat.sfm.dataset_report import draw_from_above
 from snowsplat.sfm.ingest.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
-from snowsplat.studio.hand_on import export_file
-from snowsplat.studio.job import is_running
-from snowsplat.studio.library import TASKS, Scene, safe_title
+from snowsplat.studio import changes
+from snowsplat.studio.changes import existing_reports, film_plan, finished
+from snowsplat.studio.library import TASKS, Scene
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError, message_of
-from snowsplat.util.files import atomic_path, write_json, write_text
+from snowsplat.util.files import write_text
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.run_lock import locked
-from snowsplat.util.safe_json import from_json, is_file, printable, read_json
+from snowsplat.util.safe_json import printable
 from snowsplat.util.stages import Outcome
-from snowsplat.viewer.web.publication import PAGE
-from snowsplat.viewer.web.publication import SCENE as SITE_SCENE
 
 # Seconds for an edit or export of a killed studio to end.
 _LONGEST_CHANGE = 600.0
@@ -220,20 +211,8 @@ def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
 
 
 def _film(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
-    file = film(_finished(scene), _plan(scene), scene.keys, scene.film, observer=recorder)
+    file = film(finished(scene), film_plan(scene), scene.keys, scene.film, observer=recorder)
     return {"bytes": file.stat().st_size}
-
-
-def _plan(scene: Scene) -> PageFilm:
-    return from_json(PageFilm, read_json(scene.plan))
-
-
-def _finished(scene: Scene) -> Path:
-    """The scene file. Raises: UserError: the scene is not finished."""
-    file = scene.scene_file()
-    if file is None:
-        raise UserError("the scene is not finished")
-    return file
 
 
 def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
@@ -246,7 +225,7 @@ def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
         "aligned": made.exposures,
         "seconds": made.seconds,
         "verdict": [] if made.verdict is None else made.verdict.lines("The scene"),
-        "reports": _reports(scene, reports),
+        "reports": existing_reports(scene, reports),
     }
 
 
@@ -268,175 +247,22 @@ def survey_photos(scene: Scene) -> dict[str, Any]:
     return {"facts": facts, "count": photos.count, "seconds": seconds}
 
 
-def export(scene: Scene, kind: str) -> dict[str, Any]:
-    """Write the scene in another format, unless that is done; returns the name of the file.
-
-    Raises: UserError: the scene is not finished.
-    """
-    file, target = _finished(scene), export_file(scene, kind)
-    # It gets the time of the scene that is read, which may be replaced meanwhile.
-    time = file.stat().st_mtime_ns
-    if not target.is_file() or target.stat().st_mtime_ns != time:
-        target.parent.mkdir(exist_ok=True)
-        if kind == "zip":
-            if not scene.is_shown():
-                show_scene(scene)
-            with atomic_path(target) as temporary:
-                archive = shutil.make_archive(str(temporary), "zip", scene.site)
-                os.replace(archive, temporary)
-        else:
-            convert(file, target, overwrite=True)
-        os.utime(target, ns=(time, time))
-    return {"file": target.name}
-
-
-@dataclass(frozen=True)
-class _Begun:
-    """What an edit changes beside the scene file, after it: what is done if its process is killed.
-
-    Attributes:
-        version: of the scene before.
-        title: the new one; "": as it is.
-        plan: that of the film; its keys are in the world of the scene before all edits.
-    """
-
-    version: str
-    title: str
-    plan: PageFilm | None
-
-
-def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
-    """Write the edited scene and its page; or remove it, and write the page of the other one.
-
-    Args:
-        version: of the scene that was edited; "": as it is.
-
-    Raises: UserError: the scene is not finished, is being made, or was changed since then.
-    """
-    changes = None if undo else from_json(PageEdit, read_json(scene.edits))
-    if is_running(scene):
-        raise UserError("the scene is being made; stop it, then edit it")
-    scene.check_version(version)
-    finish_edit(scene)  # an earlier one
-    file, plan = _finished(scene), None
-    with suppress(OSError, ValueError):  # no film is planned
-        plan = moved_film(_plan(scene), page_frames(file), [])
-    title = changes.title and safe_title(changes.title) if changes else ""
-    write_json(scene.begun, asdict(_Begun(scene.version(), title, plan)))
-    if changes is None:
-        undo_edits(file)
-    else:
-        try:
-            has_levels = not (scene.site / SITE_SCENE).is_file()
-            edit(file, scene.whole if has_levels else scene.site, changes)
-        except OtherScene as error:
-            show_scene(scene)
-            raise UserError(f"{error}. Open the page anew, then edit it") from None
-    return show_scene(scene)
-
-
-def finish_edit(scene: Scene) -> None:
-    """Do what is left of an edit whose process was killed, if the scene was edited: the title is
-    changed, and the keys of the film keep their places. Doing it again changes nothing."""
-    try:
-        begun = from_json(_Begun, read_json(scene.begun))
-    except (OSError, ValueError):  # nothing is left
-        return
-    if begun.version != scene.version():
-        if begun.title:
-            scene.change(title=begun.title)
-        if begun.plan is not None:
-            file = _finished(scene)
-            plan = moved_film(begun.plan, [], page_frames(file))
-            write_json(scene.plan, asdict(plan))
-            if is_file(scene.keys):
-                write_keys(file, plan, scene.keys)
-    scene.begun.unlink()
-
-
-def show_scene(scene: Scene) -> dict[str, Any]:
-    """Write the site of a finished scene as it is now, and its figures.
-
-    Raises: UserError: the scene is not finished.
-    """
-    finish_edit(scene)
-    file, title = _finished(scene), scene.job.title
-    shown = [scene.version(), title]
-    for folder in (scene.exports, scene.whole):  # they have another title, or other Gaussians
-        shutil.rmtree(folder, ignore_errors=True)
-    scene.site.mkdir(parents=True, exist_ok=True)
-    site = publish(file, scene.site, PublishOptions(title), overwrite=True)
-    state = scene.state()
-    if scene.found:
-        state = {"outcome": "done", "result": _found(scene)}
-    figures = {"gaussians": site.gaussians, "bytes": file.stat().st_size, "shown": shown}
-    state["result"] |= figures
-    scene.write_state(state)
-    return {"file": file.name}
-
-
-def rename(scene: Scene, title: str) -> dict[str, Any]:
-    """Change the title, also in the site if there is one."""
-    scene.change(title=safe_title(title))
-    return show_scene(scene) if scene.scene_file() else {}
-
-
-def show_whole(scene: Scene) -> dict[str, Any]:
-    """Write the page that edits a scene whose site has levels of detail, unless it is there.
-
-    Raises: UserError: the scene is not finished.
-    """
-    file, page = _finished(scene), scene.whole / PAGE
-    if not is_file(page) or page.stat().st_mtime_ns < file.stat().st_mtime_ns:
-        options = PublishOptions(scene.job.title, for_editing=True)
-        publish(file, scene.whole, options, overwrite=True)
-    return {}
-
-
-def _found(scene: Scene) -> dict[str, Any]:
-    """What a scene of the command line tells about its training."""
-    folder = training_folder(scene.folder)
-    try:
-        facts = dict(read_json(folder.path / "metrics.json"))
-    except (OSError, ValueError, TypeError):  # it was not evaluated, or not by this program
-        facts = {}
-    aligned = bool(folder.exposures())
-    psnr = facts.get("psnr_aligned" if aligned else "psnr")
-    reports = {"training": folder.report, "photos": scene.made / DATASET / REPORT}
-    return {
-        "psnr": psnr if facts.get("split") == "test" and isinstance(psnr, float) else None,
-        "aligned": aligned,
-        "seconds": None,
-        "verdict": [],
-        "reports": _reports(scene, reports),
-    }
-
-
-def _reports(scene: Scene, reports: Mapping[str, Path | None]) -> dict[str, str]:
-    """The paths of the reports that exist, in the output folder."""
-    return {
-        name: path.relative_to(scene.made).as_posix()
-        for name, path in reports.items()
-        if path is not None and path.is_relative_to(scene.made) and path.is_file()
-    }
-
-
 def _answer(scene: Scene, words: list[str]) -> dict[str, Any]:
     if words[0] == "survey":
         return survey_photos(scene)
     if words[0] == "preview":
-        return {"path": film_preview(_finished(scene), _plan(scene))}
+        return {"path": film_preview(finished(scene), film_plan(scene))}
     scene.kept.mkdir(exist_ok=True, mode=0o700)
     with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
         if words[0] == "export":
-            return export(scene, words[1])
+            return changes.export(scene, words[1])
         if words[0] == "show":
-            return show_scene(scene)
+            return changes.show_scene(scene)
         if words[0] == "rename":
-            return rename(scene, words[1])
+            return changes.rename(scene, words[1])
         if words[0] == "whole":
-            return show_whole(scene)
-        return edit_scene(scene, words[1], words[0] == "undo")
+            return changes.show_whole(scene)
+        return changes.edit_scene(scene, words[1], words[0] == "undo")
 
 
 def _printed(scene: Scene, words: list[str]) -> int:
