@@ -98,7 +98,8 @@ def test_page_is_well_formed_and_self_contained(dataset):
     text = page.read_text(encoding="utf-8")
     ET.fromstring(text)  # strict: the page is XML, too
     HTMLParser().feed(text)
-    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    icon, *sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert icon == "data:,"
     assert sources
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
     assert text.count("<script>") == 1  # that opens the pictures

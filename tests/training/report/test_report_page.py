@@ -61,7 +61,8 @@ def test_the_page_is_well_formed_and_self_contained(trained, tmp_path):
     write_training_report(page, Trained(**trained))
     text = page.read_text(encoding="utf-8")
     root = ET.fromstring(text)
-    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    icon, *sources = re.findall(r'(?:src|href)="([^"]*)"', text)
+    assert icon == "data:,"
     assert len(sources) == 3 * 5
     assert all(source.startswith("data:image/jpeg;base64,") for source in sources)
     assert "url(" not in text

@@ -18,7 +18,7 @@ const TEXTS = {
     path: ["Folder, video or zip file", "文件夹、视频或 zip 文件"],
     browse: ["Browse", "浏览"],
     use: ["Use", "使用"],
-    use_this: ["Use this folder ({0} files)", "使用此文件夹（{0} 个文件）"],
+    use_this: ["Use this folder (files: {0})", "使用此文件夹（{0} 个文件）"],
     up: ["Up", "上一级"],
     recent: ["Scenes", "场景"],
     none: ["No scenes yet.", "还没有场景。"],

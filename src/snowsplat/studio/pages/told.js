@@ -60,6 +60,7 @@
         '{0}太短：估计相机位置用了{1}；仍然训练{2}',
     '{}: repeated ({})': '{0}：重做（{1}）',
     'there is no map of the cameras: {}': '没有相机的俯视图：{0}',
+    '{}: no checkpoint yet; starting at step #': '{0}：还没有检查点，从第 {1} 步开始',
     'resuming from {}, step # of #': '从 {0} 继续，第 {1} 步，共 {2} 步',
 
     // Errors of the studio

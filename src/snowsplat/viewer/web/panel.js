@@ -89,7 +89,18 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         const longest = zoom * Math.max(...shownBy(fov, canvas));
         camera.fov = fitted = (Math.atan(longest) * 360) / Math.PI;
     });
-    new ResizeObserver(() => { zoom = zoomWithin(fov, canvas, limits); }).observe(canvas);
+    new ResizeObserver(() => {
+        zoom = zoomWithin(fov, canvas, limits);
+        closeControls();
+    }).observe(canvas);
+
+    // The list of controls would cover the scene in a window that is, or becomes, narrow; a button opens it.
+    let narrow = false;
+    const closeControls = () => {
+        const before = narrow;
+        narrow = state.loaded && canvas.clientWidth < NARROW;
+        if (narrow && !before) document.querySelector('.sse-controlsHintClose')?.click();
+    };
 
     /** Move to a view, in orbit around its target; for the view of a photo, with its limits. */
     const flyTo = (view, limitsThere = UNLIMITED) => {
@@ -123,8 +134,7 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
         // In orbit; the viewer itself would begin in its animation.
         viewer.resetCamera();
         hiding.set(linkedHiding() ?? scene.hiding.start);
-        // The list of controls would cover the scene; a button opens it.
-        if (canvas.clientWidth < NARROW) document.querySelector('.sse-controlsHintClose')?.click();
+        closeControls();
         // These follow the viewer's own handlers.
         events.on('inputEvent', (name) => {
             if (name === 'frame') flyTo(subjectView());
