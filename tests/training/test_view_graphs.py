@@ -77,7 +77,9 @@ def with_masks(trainer: Trainer) -> Trainer:
 
 @every_density_control
 def test_recordings_change_nothing(dataset: Dataset, config: TrainConfig) -> None:
-    """Over changes of the Gaussians, of the image size, of the SH degree, and of the masks."""
+    """Over changes of the Gaussians, of the image size, of the SH degree, and of the masks. A part
+    may have a rendering of its own beside them."""
+    config = replace(config, surfaces=True)
     expected = losses(with_masks(Trainer(dataset, config)), 60)
     record = Counted()
     trainer = with_masks(Trainer(dataset, config))

@@ -50,12 +50,11 @@ _RESIDUAL = 1.0 - math.cos(math.radians(15.0))
 _RELATIVE = 1.0
 #: The share of the steps after which the maps are compared with the scene, and then used.
 _FROM = 0.3
-#: A map is that of another photo if its mean cosine to the surfaces is less than this share of that
-#: of the map of another photo. It is compared with at most this number of them.
-_LEAST_OF_OTHERS, _MOST_OTHERS = 0.85, 64
 #: A map contradicts the scene if its mean cosine to the surfaces is less than this share of that of
-#: their mean direction: a wall would be 37 degrees wrong.
+#: the map of another photo, or of their mean direction (a wall would be 37 degrees wrong).
 _LEAST_COSINE = 0.8
+#: A map is compared with at most this number of maps of other photos.
+_MOST_OTHERS = 64
 #: They are compared at this fraction of their size: normals of a larger surface are more exact.
 _COARSE = 4
 #: A mean of normals is one of a surface if it is at least so long.
@@ -261,7 +260,7 @@ def _fits_better(other: Tensor, surfaces: Tensor, cosines: Tensor, known: Tensor
     both = known & other.any(0)
     enough = 2 * both.sum() > known.sum()
     fits = (surfaces * other).sum(0)[both].sum()
-    return bool(enough & (cosines[both].sum() < _LEAST_OF_OTHERS * fits))
+    return bool(enough & (cosines[both].sum() < _LEAST_COSINE * fits))
 
 
 def _rotation(view: View) -> Tensor:

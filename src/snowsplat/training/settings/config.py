@@ -171,8 +171,8 @@ class TrainConfig(Settings):
     )
     surfaces: bool = setting(
         False,
-        "Whether to train flat Gaussians that lie in the surfaces, for meshes and depths. After "
-        "40% of the steps, a step takes two to three times as long.",
+        "Whether to train flat Gaussians that lie in the surfaces, for meshes and depths. The "
+        "training takes about 1.5 times as long.",
         metavar="{on,off}",
     )
     init: str = setting(
