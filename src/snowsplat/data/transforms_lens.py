@@ -79,7 +79,9 @@ def lens_of(
         k1, k2, k3, k4, p1, p2 = _listed(where, values, 6)
         k5 = k6 = 0.0
     else:
-        k1, k2, k3, k4, k5, k6, p1, p2 = (_number(where, values, key) for key in _COEFFICIENTS)
+        k1, k2, k3, k4, k5, k6, p1, p2 = (
+            number_of(where, values, key) or 0.0 for key in _COEFFICIENTS
+        )
     radial = (k1, k2, k3, k4)
     if model in _FISHEYE or values.get("is_fisheye") or values.get("fisheye"):
         return fisheye(where, width, height, intrinsics, radial, (p1, p2))
@@ -93,10 +95,11 @@ def _model(values: Mapping[str, Any]) -> str:
     return str(values.get("camera_model") or "OPENCV").upper()
 
 
-def _number(where: str, values: Mapping[str, Any], key: str) -> float:
+def number_of(where: str, values: Mapping[str, Any], key: str) -> float | None:
+    """None: no number is stated. Raises UserError if the value is not a number or is damaged."""
     value = values.get(key)
     if value is None:
-        return 0.0
+        return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
         raise UserError(f"{where}: {key} should be a number, not {quoted(value)}; correct it")
     return float(value)
@@ -111,4 +114,4 @@ def _listed(where: str, values: Mapping[str, Any], count: int) -> tuple[float, .
             f"{_model(values)[:40]}; export the file again"
         )
     key = "distortion_params"
-    return tuple(_number(where, {key: value}, key) for value in numbers)
+    return tuple(number_of(where, {key: value}, key) or 0.0 for value in numbers)
