@@ -5,7 +5,8 @@ import itertools
 import pytest
 import torch
 
-from snowsplat.formats.packing import UP_BACK, flip_axes
+from snowsplat.formats import GaussianArrays, packing
+from snowsplat.formats.packing import UP_BACK
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
@@ -13,9 +14,7 @@ from snowsplat.scene.render import render
 
 
 def flipped(scene: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
-    arrays = (scene.means.numpy(), scene.quats.numpy(), scene.sh_rest.numpy())
-    means, quats, sh_rest = (torch.from_numpy(a) for a in flip_axes(*arrays, signs))
-    return Gaussians(means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
+    return packing.flipped(GaussianArrays.from_gaussians(scene), signs).to_gaussians()
 
 
 def test_a_camera_converted_to_y_up_z_back_sees_the_same_image(make_scene):

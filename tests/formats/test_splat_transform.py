@@ -5,7 +5,7 @@ import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.packing import UP_BACK, flip_axes
+from snowsplat.formats.packing import flipped
 from snowsplat.formats.spz import write_spz
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
@@ -29,9 +29,7 @@ def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
 
 def as_it_reads_spz(scene: Gaussians) -> Gaussians:
     """The scene as splat-transform reads it from an .spz file: it does not convert the frame."""
-    turned = flip_axes(scene.means.numpy(), scene.quats.numpy(), scene.sh_rest.numpy(), UP_BACK)
-    means, quats, sh_rest = (torch.from_numpy(array) for array in turned)
-    return Gaussians(means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest)
+    return flipped(GaussianArrays.from_gaussians(scene)).to_gaussians()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

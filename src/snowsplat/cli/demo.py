@@ -48,7 +48,9 @@ class Demo:
                 result = demo(self.output, observer=observer)
         except KeyboardInterrupt as stopped:
             print(with_flags(str(stopped) or "stopped"))
-            return self._stopped()
+            words = ["snowsplat", "demo", "-o", str(self.output)] + ["--open"] * self.open
+            print(f"resume with: {shlex.join(words)}")
+            return 130
         print_summary(result.made)
         _print_errors(result.errors)
         if not result.accurate:
@@ -64,11 +66,6 @@ class Demo:
             print("with your own photos: snowsplat make PHOTOS")
             return 0
         return View(scene).run()
-
-    def _stopped(self) -> int:
-        words = ["snowsplat", "demo", "-o", str(self.output)] + ["--open"] * self.open
-        print(f"resume with: {shlex.join(words)}")
-        return 130
 
 
 def _print_errors(errors: PoseErrors) -> None:

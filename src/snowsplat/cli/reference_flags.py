@@ -8,7 +8,7 @@ from the reference implementation" shows this table.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -180,19 +180,3 @@ def _count(flag: ReferenceFlag, rest: Sequence[str]) -> int:
     if flag.values != "+":
         return flag.values
     return next((i for i, text in enumerate(rest) if text.startswith("-")), len(rest))
-
-
-def table(subcommand: str) -> Iterator[tuple[str, str]]:
-    """For the guide: the spellings of each flag, and what becomes of it, as Markdown."""
-    for flag in PROGRAMS[subcommand][1]:
-        note = flag.note.replace("|", "\\|")
-        what = {
-            "own": "the same",
-            "becomes": f"`{' '.join(flag.new)}`" if flag.new else "the same",
-            "ignored": "no effect",
-            "refused": "refused",
-        }[flag.outcome]
-        if flag.only_with:
-            what += f" with `{flag.only_with}`; otherwise no effect"
-        separator = ": " if flag.only_with or flag.outcome in ("ignored", "refused") else "; "
-        yield " ".join(f"`{s}`" for s in flag.spellings), what + separator * bool(note) + note

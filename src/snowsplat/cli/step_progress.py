@@ -39,8 +39,10 @@ class StepProgress:
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if self.stream.isatty():
+            # Never truncated, because a truncated number is misleading.
+            whole = Column(no_wrap=True, min_width=2 * len(str(total)) + 1)
             self._bar = Progress(
-                TextColumn("{task.completed}/{task.total}", table_column=_whole(total)),
+                TextColumn("{task.completed}/{task.total}", table_column=whole),
                 BarColumn(bar_width=None),
                 TextColumn("{task.description}"),
                 console=Console(file=self.stream),
@@ -115,11 +117,6 @@ def print_above(bar: Progress | None, line: str, stream: TextIO) -> None:
         bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
     else:
         print(line, file=stream, flush=True)
-
-
-def _whole(total: int) -> Column:
-    """A column that is never truncated, because a truncated number is misleading."""
-    return Column(no_wrap=True, min_width=2 * len(str(total)) + 1)
 
 
 def held_out_line(step: int, evaluation: Evaluation) -> str:

@@ -50,7 +50,9 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
     axes = torch.stack(
         [camera.cam_from_world.detach()[2, :3].to(torch.float64) for camera in cameras]
     )
-    tangent = torch.tensor([_half_view(camera) for camera in cameras]).median()
+    # The tangent of half the smaller field of view.
+    halves = [0.5 * min(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras]
+    tangent = torch.tensor(halves).median()
     middle = centres.mean(0)
     spread = float((centres - middle).norm(dim=1).max()) or 1.0
 
@@ -71,11 +73,6 @@ def scene_bounds(cameras: Sequence[Camera], points: Tensor | None = None) -> Ten
         centre = middle + direction / direction.norm() * distance
         return _cube(centre, _SHARE_OF_VIEW * distance * float(tangent))
     return _cube(middle, _GUESSED_EXTENTS * EXTENT_FACTOR * spread)
-
-
-def _half_view(camera: Camera) -> float:
-    """The tangent of half the smaller field of view."""
-    return 0.5 * min(camera.width / camera.fx, camera.height / camera.fy)
 
 
 def _cube(centre: Tensor, half: float) -> Tensor:

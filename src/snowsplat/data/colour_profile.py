@@ -71,7 +71,8 @@ def to_srgb(image: Image.Image, path: Path) -> Image.Image:
         _tell(f"{path}: its colour profile {transform}, so it is not used", profile)
     if not isinstance(transform, ImageCms.ImageCmsTransform):
         return _as_mode(image, plain_mode)
-    converted = _apply(transform, image)
+    given = image.convert("RGBA") if image.mode in ("RGBa", "PA", "P") else image
+    converted = transform.apply(_as_mode(given, transform.input_mode))
     if plain_mode == "RGBA":
         converted.putalpha(image.convert("RGBA").getchannel("A"))
     converted = converted.getchannel("G") if grey else converted
@@ -84,12 +85,6 @@ def _as_mode(image: Image.Image, mode: str) -> Image.Image:
         image.load()
         return image
     return image.convert(mode)
-
-
-def _apply(transform: ImageCms.ImageCmsTransform, image: Image.Image) -> Image.Image:
-    """A new image of mode RGB, in sRGB."""
-    given = image.convert("RGBA") if image.mode in ("RGBa", "PA", "P") else image
-    return transform.apply(_as_mode(given, transform.input_mode))
 
 
 @lru_cache(maxsize=32)

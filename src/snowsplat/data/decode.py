@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -36,6 +36,11 @@ _BAND_PIXELS = 1 << 20
 _SAMPLES = 2
 #: Suffixes that are tried if a dataset names its images without a suffix.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".avif")
+
+
+def is_photo(name: str) -> bool:
+    """Whether a file name has the suffix of a photo."""
+    return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True)

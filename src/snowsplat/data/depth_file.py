@@ -33,8 +33,9 @@ def read_depth_file(path: Path) -> np.ndarray:
         UserError: the file is missing, damaged, not a map of one channel, or has no known suffix.
     """
     values = np.squeeze(read_map(path, "depth map", _channel))
-    if values.ndim == 3 and values.shape[2] in (3, 4) and _is_grey(values):
-        values = values[..., 0]
+    if values.ndim == 3 and values.shape[2] in (3, 4):
+        grey = (values[..., :1] == values[..., :3]).all()
+        values = values[..., 0] if grey else values
     if values.ndim != 2 or values.dtype.kind not in "fiub":
         raise UserError(
             f"{path}: has the shape {values.shape} and the type {values.dtype}; a depth map has "
@@ -114,7 +115,3 @@ def _ray_lengths(width: int, height: int, camera: Camera) -> Tensor:
     u = (torch.arange(width, dtype=torch.float64) + 0.5 - scaled.cx) / scaled.fx
     v = (torch.arange(height, dtype=torch.float64) + 0.5 - scaled.cy) / scaled.fy
     return (1.0 + u.square() + v.square()[:, None]).sqrt()
-
-
-def _is_grey(values: np.ndarray) -> bool:
-    return bool((values[..., :1] == values[..., :3]).all())

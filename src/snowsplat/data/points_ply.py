@@ -6,7 +6,7 @@ import numpy as np
 
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
-from snowsplat.util.ply import header, open_table
+from snowsplat.util.ply import header_of, open_table
 
 _POSITION = ["x", "y", "z"]
 _NORMAL = ["nx", "ny", "nz"]
@@ -30,7 +30,7 @@ def write_points(path: Path | str, xyz: np.ndarray, rgb: np.ndarray) -> None:
         ("uchar" if _POINT[name] == np.uint8 else "float", name) for name in _POINT.names or ()
     ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(header(len(rows), kinds))
+        file.write(header_of([("vertex", len(rows), kinds)]))
         file.write(rows.tobytes())
 
 

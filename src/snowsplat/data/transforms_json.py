@@ -36,7 +36,7 @@ from snowsplat.data.files.photos import find_photos, warn_of_missing
 from snowsplat.data.imports.values import load_json
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.points_ply import read_points as read_points_ply
-from snowsplat.data.transforms_lens import is_panorama, lens_of
+from snowsplat.data.transforms_lens import is_panorama, lens_of, number_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
@@ -183,7 +183,7 @@ def _posed_image(
         _mask(where, root, values.maps[0]),  # masks belong to frames, not to files
         split,
         depth=_depth_map(root, values.maps[0]),
-        depth_unit=_number(where, values, "integer_depth_scale") or 1.0,
+        depth_unit=number_of(where, values, "integer_depth_scale") or 1.0,
         lens=None if is_pinhole(lens) else lens,
     )
 
@@ -269,17 +269,6 @@ def _depth_map(root: Path, frame: Mapping[str, Any]) -> Path | None:
     return None
 
 
-def _number(where: str, values: Mapping[str, Any], key: str) -> float | None:
-    value = values.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise UserError(f"{where}: {key} should be a number, not {quoted(value)}")
-    if not abs(value) < 1e9:  # NaN, or damaged
-        raise UserError(f"{where}: {key} is {str(value)[:40]}, which is not valid; correct it")
-    return float(value)
-
-
 def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
     """The camera of a frame, without the distortion of its lens.
 
@@ -288,7 +277,7 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
         values: the entries of the frame and, for those that it does not have, of the file.
         image: the image file, which provides the size if ``values`` has none.
     """
-    width, height = _number(where, values, "w"), _number(where, values, "h")
+    width, height = number_of(where, values, "w"), number_of(where, values, "h")
     if width is None or height is None:
         header = read_header(image)
         width, height = header.width, header.height
@@ -306,7 +295,7 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
         raise UserError(
             f"{where}: the focal lengths {fx:g} and {fy:g} pixels are not valid; correct them"
         )
-    cx, cy = _number(where, values, "cx"), _number(where, values, "cy")
+    cx, cy = number_of(where, values, "cx"), number_of(where, values, "cy")
     return Camera(
         width,
         height,
@@ -321,9 +310,9 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
 def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float | None:
     """Focal length in pixels along an axis ("x" or "y"), or None. It is read from ``fl_x``,
     ``camera_angle_x`` (radians) or ``x_fov`` (degrees)."""
-    pixels = _number(where, values, f"fl_{axis}")
-    angle = _number(where, values, f"camera_angle_{axis}")
-    degrees = _number(where, values, f"{axis}_fov")
+    pixels = number_of(where, values, f"fl_{axis}")
+    angle = number_of(where, values, f"camera_angle_{axis}")
+    degrees = number_of(where, values, f"{axis}_fov")
     if angle is None and degrees is not None:
         angle = math.radians(degrees)
     if angle is None or (pixels is not None and not 0 < angle < math.pi):

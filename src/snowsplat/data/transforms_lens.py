@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
+from snowsplat.data.imports.lenses import Intrinsics, equirectangular, fisheye, perspective
 from snowsplat.data.lens.project import LensModel
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
@@ -42,10 +41,6 @@ _FISHEYE = frozenset(
 #: Project Aria's model, in nerfstudio's and in COLMAP's name; it has a list of coefficients.
 _ARIA = ("FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE")
 _ARIA_COEFFICIENTS = 12
-# The largest relative error of the rational function that replaces a polynomial.
-_FIT_ERROR = 1e-5
-# Of the squared tangent of the half field of view, and of the magnification: larger is damaged.
-_LARGEST = 1e6
 
 
 def is_panorama(values: Mapping[str, Any]) -> bool:
@@ -55,11 +50,7 @@ def is_panorama(values: Mapping[str, Any]) -> bool:
 
 
 def lens_of(
-    where: str,
-    values: Mapping[str, Any],
-    width: int,
-    height: int,
-    intrinsics: tuple[float, float, float, float],
+    where: str, values: Mapping[str, Any], width: int, height: int, intrinsics: Intrinsics
 ) -> LensModel:
     """The lens of a frame.
 
@@ -72,7 +63,7 @@ def lens_of(
     Raises: UserError: the model is not known, or a coefficient is not a number.
     """
     if is_panorama(values):
-        return LensModel("EQUIRECTANGULAR", width, height, (float(width), float(height)))
+        return equirectangular(where, width, height)
     model = _model(values)
     if any(key.startswith("ftheta_p") for key in values):
         model = "F-Theta"
@@ -88,30 +79,27 @@ def lens_of(
         k1, k2, k3, k4, p1, p2 = _listed(where, values, 6)
         k5 = k6 = 0.0
     else:
-        k1, k2, k3, k4, k5, k6, p1, p2 = (_number(where, values, key) for key in _COEFFICIENTS)
+        k1, k2, k3, k4, k5, k6, p1, p2 = (
+            number_of(where, values, key) or 0.0 for key in _COEFFICIENTS
+        )
+    radial = (k1, k2, k3, k4)
     if model in _FISHEYE or values.get("is_fisheye") or values.get("fisheye"):
-        if p1 or p2:
-            numbers = (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
-            return LensModel("THIN_PRISM_FISHEYE", width, height, (*intrinsics, *numbers))
-        return LensModel("OPENCV_FISHEYE", width, height, (*intrinsics, k1, k2, k3, k4))
-    if k4 and not (k5 or k6) and model != "FULL_OPENCV":
-        fx, fy, cx, cy = intrinsics
-        corner = max(cx, width - cx) / fx, max(cy, height - cy) / fy
-        k1, k2, k3, k4, k5, k6 = _rational(where, (k1, k2, k3, k4), corner[0] ** 2 + corner[1] ** 2)
-    if k3 or k4 or k5 or k6:
+        return fisheye(where, width, height, intrinsics, radial, (p1, p2))
+    if k5 or k6 or (k4 and model == "FULL_OPENCV"):
         numbers = (k1, k2, p1, p2, k3, k4, k5, k6)
         return LensModel("FULL_OPENCV", width, height, (*intrinsics, *numbers))
-    return LensModel("OPENCV", width, height, (*intrinsics, k1, k2, p1, p2))
+    return perspective(where, width, height, intrinsics, radial, (p1, p2))
 
 
 def _model(values: Mapping[str, Any]) -> str:
     return str(values.get("camera_model") or "OPENCV").upper()
 
 
-def _number(where: str, values: Mapping[str, Any], key: str) -> float:
+def number_of(where: str, values: Mapping[str, Any], key: str) -> float | None:
+    """None: no number is stated. Raises UserError if the value is not a number or is damaged."""
     value = values.get(key)
     if value is None:
-        return 0.0
+        return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
         raise UserError(f"{where}: {key} should be a number, not {quoted(value)}; correct it")
     return float(value)
@@ -126,30 +114,4 @@ def _listed(where: str, values: Mapping[str, Any], count: int) -> tuple[float, .
             f"{_model(values)[:40]}; export the file again"
         )
     key = "distortion_params"
-    return tuple(_number(where, {key: value}, key) for value in numbers)
-
-
-def _rational(
-    where: str, polynomial: tuple[float, ...], largest: float
-) -> tuple[float, float, float, float, float, float]:
-    """k1 … k6 of OpenCV's rational function that equals 1 + k1·s + k2·s² + k3·s³ + k4·s⁴.
-    ``largest``: of s, the squared distance from the optical axis at z = 1."""
-    impossible = UserError(
-        f"{where}: the lens distortion k4 = {polynomial[3]:g} cannot be undone; undistort the "
-        "photos with the program that made the file"
-    )
-    s = np.linspace(0.0, 1.5 * largest, 200)[1:]
-    wanted = np.polynomial.polynomial.polyval(s, (1.0, *polynomial))
-    if largest > _LARGEST or np.abs(wanted).max() > _LARGEST:
-        raise impossible
-    powers = s[:, None] ** [1, 2, 3]
-    matrix = np.hstack([powers, -wanted[:, None] * powers])
-    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    found = np.linalg.lstsq(matrix / scale, wanted - 1.0, rcond=None)[0] / scale
-    divisor = 1.0 + powers @ found[3:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        made = (1.0 + powers @ found[:3]) / divisor
-    if not (divisor.min() > 0 and np.abs(made - wanted).max() <= _FIT_ERROR):
-        raise impossible
-    k1, k2, k3, k4, k5, k6 = found.tolist()
-    return k1, k2, k3, k4, k5, k6
+    return tuple(number_of(where, {key: value}, key) or 0.0 for value in numbers)

@@ -95,7 +95,10 @@ def read_gltf(path: Path | str) -> GaussianArrays:
                 f"{EXTENSION}"
             )
         else:
-            parts = [(_with_logarithms(part), matrix) for part, matrix in parts]
+            parts = [
+                (replace(part, log_scales=packing.log_scales(part.log_scales)), matrix)
+                for part, matrix in parts
+            ]
         placed = [transformed(part, matrix) for part, matrix in parts]
     except Damaged as error:
         raise UserError(f"{path}: {error}; copy or export it again") from None
@@ -104,21 +107,9 @@ def read_gltf(path: Path | str) -> GaussianArrays:
     for note in sorted(notes):
         logger.warning("%s: %s", path, note)
     scene = GaussianArrays.cat(placed)
-    means, quats, sh_rest = packing.flip_axes(
-        scene.means, scene.quats, scene.sh_rest, packing.UP_BACK
-    )
     if any(any(part.origin) for part in placed):
-        means = np.concatenate([part.world_means() for part in placed]) * packing.UP_BACK
-    found = decoded(
-        path,
-        means,
-        scene.log_scales,
-        quats,
-        scene.opacity_logits,
-        scene.sh_dc,
-        sh_rest,
-        antialiased=scene.antialiased,
-    )
+        scene = replace(scene, means=np.concatenate([part.world_means() for part in placed]))
+    found = decoded(path, *packing.flipped(scene), antialiased=scene.antialiased)
     try:
         metres = stored_metres(document.json["asset"]["extras"]["metres_per_unit"])
     except (KeyError, IndexError, TypeError):
@@ -161,12 +152,8 @@ def _parts(
 
 def _unpacked(path: Path, document: Document, view: int) -> GaussianArrays:
     """As `_splats`, of an .spz file."""
-    scene = parse_spz(path, bytes(glb.view(document, view)))
-    means, quats, sh_rest = packing.flip_axes(
-        scene.means, scene.quats, scene.sh_rest, packing.UP_BACK
-    )
-    scales = np.exp(scene.log_scales)
-    return replace(scene, means=means, log_scales=scales, quats=quats, sh_rest=sh_rest)
+    scene = packing.flipped(parse_spz(path, bytes(glb.view(document, view))))
+    return replace(scene, log_scales=np.exp(scene.log_scales))
 
 
 def _check(primitive: dict[str, Any], extension: dict[str, Any], notes: set[str]) -> None:
@@ -195,10 +182,6 @@ def _are_logarithms(scales: list[np.ndarray]) -> bool:
     low = min((float(part.min(initial=0)) for part in values), default=0.0)
     high = max((float(part.max(initial=0)) for part in values), default=0.0)
     return low < -_ROUNDING * high
-
-
-def _with_logarithms(part: GaussianArrays) -> GaussianArrays:
-    return replace(part, log_scales=packing.log_scales(part.log_scales))
 
 
 def transformed(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
@@ -287,8 +270,8 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
-    means, quats, sh_rest = packing.flip_axes(means, quats, sh_rest, packing.UP_BACK)
+    scene = packing.flipped(packing.packable(path, gaussians))
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = scene
     opacity = (1 / (1 + np.exp(-opacity_logits))).astype("<f4")
     cut = packing.Cut(path, "glTF", len(means))
     packing.cut_scales(cut, log_scales, *LOG_SCALES, step=0)
@@ -317,8 +300,8 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
         splats = {"kernel": "ellipse", "colorSpace": _SPACES[0]}
         primitive = {"mode": _POINTS, "extensions": {EXTENSION: splats}}
         node = _node(gaussians.origin, gaussians.metres_per_unit or 1.0)
-        scene, arrays = glb.contents(node, primitive, attributes)
-        document |= scene
+        contents, arrays = glb.contents(node, primitive, attributes)
+        document |= contents
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.writelines(glb.pack(document, arrays))
     cut.report(".ply keeps them")

@@ -233,10 +233,8 @@ def from_largest_of_four(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return unit_quats(quats)
 
 
-def flip_axes(
-    means: np.ndarray, quats: np.ndarray, sh_rest: np.ndarray, signs: tuple[int, int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Multiply each axis by its sign, ±1: positions (N, 3), quaternions wxyz (N, 4), SH (N, K, 3).
+def flipped(gaussians: GaussianArrays, signs: tuple[int, int, int] = UP_BACK) -> GaussianArrays:
+    """The Gaussians with each axis multiplied by its sign, ±1; float64 positions stay float64.
 
     A rotation R becomes M R M, where M is the diagonal matrix of the signs. That is a rotation
     again, even if M is a reflection.
@@ -246,8 +244,10 @@ def flip_axes(
     # The sign change of each real spherical harmonic: up to even polynomials, they are products of
     # x, y, z in the order y z x | xy yz 1 xz 1 | y xyz y z x z x.
     sh_signs = (y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x)
-    return (
-        means * np.array(signs, np.float32),
-        quats * np.array(quat_signs, np.float32),
-        sh_rest * np.array(sh_signs[: sh_rest.shape[1]], np.float32)[:, None],
+    rest = np.array(sh_signs[: gaussians.sh_rest.shape[1]], np.float32)[:, None]
+    return replace(
+        gaussians,
+        means=gaussians.means * np.array(signs, np.float32),
+        quats=gaussians.quats * np.array(quat_signs, np.float32),
+        sh_rest=gaussians.sh_rest * rest,
     )

@@ -31,7 +31,7 @@ from snowsplat.scene.origin import HERE, Origin, added, stored_origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
-from snowsplat.util.ply import PlyTable, header, open_table
+from snowsplat.util.ply import PlyTable, header_of, open_table
 
 logger = logging.getLogger(__name__)
 
@@ -261,7 +261,7 @@ def write_ply_parts(
     written = 0
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         comments = scene_comments(antialiased, HERE if exact else origin, metres_per_unit)
-        file.write(header(count, kinds, comments))
+        file.write(header_of([("vertex", count, kinds)], comments))
         for part in parts:
             for start in range(0, len(part.means), _WRITE_ROWS):
                 chunk = part.select(slice(start, start + _WRITE_ROWS))

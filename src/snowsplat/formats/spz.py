@@ -99,22 +99,16 @@ def parse_spz(path: Path, data: bytes) -> GaussianArrays:
         )
     position, alpha, color, scales, rotation, sh = rows
     sh_rest = sh.reshape(len(sh), sh.shape[1] // 3, 3)[:, : SH_REST_COUNTS[-1]]
-    means, quats, sh_rest = packing.flip_axes(
+    stored = GaussianArrays(
         _unpack_positions(position, header),
-        _unpack_rotations(rotation),
-        (sh_rest.astype(np.float32) - 128) / 128,
-        _signs(path, contents.extensions),
-    )
-    return decoded(
-        path,
-        means,
         scales.astype(np.float32) / 16 - 10,
-        quats,
+        _unpack_rotations(rotation),
         packing.opacity_logits(alpha[:, 0]),
         (color.astype(np.float32)[:, None] - 127.5) / _COLOR_STEP,
-        sh_rest,
-        antialiased=bool(header.flags & ANTIALIASED),
+        (sh_rest.astype(np.float32) - 128) / 128,
     )
+    scene = packing.flipped(stored, _signs(path, contents.extensions))
+    return decoded(path, *scene, antialiased=bool(header.flags & ANTIALIASED))
 
 
 def _leaves(path: Path, rows: list[np.ndarray], children: np.ndarray) -> list[np.ndarray]:
@@ -193,8 +187,8 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     if version not in WRITTEN_VERSIONS:
         raise ValueError(f"version {version} of .spz cannot be written; use 2, 3 or 4")
     path = Path(path)
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = packing.packable(path, gaussians)
-    means, quats, sh_rest = packing.flip_axes(means, quats, sh_rest, packing.UP_BACK)
+    scene = packing.flipped(packing.packable(path, gaussians))
+    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = scene
     bits = _fractional_bits(means)
     cut = packing.Cut(path, "SPZ", len(means))
     columns = [

@@ -101,12 +101,7 @@ def read_usd(path: Path | str) -> GaussianArrays:
             f"{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)"
         )
     scene = GaussianArrays.cat(parts)
-    means, quats, sh_rest = packing.flip_axes(
-        scene.world_means(), scene.quats, scene.sh_rest, packing.UP_BACK
-    )
-    found = decoded(
-        path, means, scene.log_scales, quats, scene.opacity_logits, scene.sh_dc, sh_rest
-    )
+    found = decoded(path, *packing.flipped(replace(scene, means=scene.world_means())))
     # A file of ours is in metres; another unit is that of another program that has edited it.
     return replace(found, metres_per_unit=metres and metres * unit)
 
@@ -162,10 +157,8 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    scene = packing.packable(path, gaussians)
-    means, quats, sh_rest = packing.flip_axes(
-        scene.means, scene.quats, scene.sh_rest, packing.UP_BACK
-    )
+    scene = packing.flipped(packing.packable(path, gaussians))
+    means, quats, sh_rest = scene.means, scene.quats, scene.sh_rest
     cut = packing.Cut(path, "USD", len(means))
     packing.cut_scales(cut, scene.log_scales, *LOG_SCALES, step=0)
     scales = np.exp(np.clip(scene.log_scales, *LOG_SCALES))

@@ -134,12 +134,7 @@ def make_dataset(
             paths = [str(path.absolute()) for path in sources.inputs]
             stages.about = {"inputs": paths, "in_place": in_place}
             stages.save()  # from here on the folder is recognised as a dataset
-            photos = survey(sources, options.gather)
-            size, effort = options.gather.size, options.sfm.effort
-            threads = thread_count(options.sfm.threads)
-            left = SfmTimeLeft(photos, size, effort, threads, later or Later())
-            alone = later is None
-            return _run(stages, sources, folder, options, watcher, in_place, left, alone)
+            return _run(stages, sources, folder, options, watcher, later)
 
 
 def _run(
@@ -148,10 +143,11 @@ def _run(
     folder: Path,
     options: DatasetOptions,
     watcher: Watcher,
-    in_place: bool,
-    left: SfmTimeLeft,
-    alone: bool,
+    later: Later | None,
 ) -> dict[str, Outcome]:
+    surveyed = survey(sources, options.gather)
+    size, effort, threads = options.gather.size, options.sfm.effort, options.sfm.threads
+    left = SfmTimeLeft(surveyed, size, effort, thread_count(threads), later or Later())
     outcomes: dict[str, Outcome] = {}
 
     def stage(name: str, settings: dict[str, Any], outputs: Sequence[str], work: Any) -> None:
@@ -174,7 +170,7 @@ def _run(
         chosen_photos = replace(chosen_photos, as_stored=True)
 
     def gather_photos(report: Report) -> dict[str, Any]:
-        return _gather(sources, folder, chosen_photos, report, in_place)
+        return _gather(sources, folder, chosen_photos, report, stages.about["in_place"])
 
     chosen = asdict(chosen_photos)
     for name, default in (("photos", None), ("panoramas", False), ("as_stored", False)):
@@ -214,17 +210,17 @@ def _run(
     def write(report: Report) -> dict[str, Any]:
         sfm, coverage = outcomes["poses"].result, measure_coverage(folder / "sparse" / "0")
         bad = problems(folder / "input", coverage.names)
-        verdict = capture_verdict(coverage, sfm, bad)
+        verdict, values = capture_verdict(coverage, sfm, bad), asdict(options)
         facts = {
             "inputs": stages.about["inputs"],
-            "settings": _settings_as_json(options),
+            "settings": values.pop("gather") | values.pop("sfm") | values,
             "gathered": outcomes["photos"].result,
             "sfm": sfm,
             "undistorted": outcomes["images"].result,
             "seconds": {name: outcome.seconds for name, outcome in outcomes.items()},
             "problems": bad,
             "verdict": verdict.as_json(),
-            "alone": alone,
+            "alone": later is None,
         }
         return {"file": write_report(folder, facts).name, "verdict": facts["verdict"]}
 
@@ -393,9 +389,3 @@ def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
     except ValueError:
         raise UserError(f"{folder / RECORD}: damaged; delete it to start again") from None
     return photos
-
-
-def _settings_as_json(options: DatasetOptions) -> dict[str, Any]:
-    """The options of all stages in one dict, as the report shows them."""
-    values = asdict(options)
-    return {**values.pop("gather"), **values.pop("sfm"), **values}

@@ -62,11 +62,11 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     photos = _photos_with_poses(dataset, facts["gathered"]["photos"])
     name = _name(facts["inputs"])
     xyz, rgb = _points(dataset)
-    more = advice(photos, xyz)
+    more, judged = advice(photos, xyz), verdict.Verdict.from_json(facts["verdict"])
     placement = placement_of(facts["undistorted"])
     body = [
         _headline(name, facts),
-        _verdict(facts["verdict"]),
+        "" if judged is None else judged.html("the photos"),
         _cards(facts),
         _your_photos(dataset, [photo.name for photo in photos], facts, more),
         _maps(photos, xyz, rgb, more.places, placement),
@@ -131,11 +131,6 @@ def _headline(name: str, facts: dict[str, Any]) -> str:
             "photos); only the largest is used. Take more photos in between to connect them.</p>"
         )
     return "\n".join(lines)
-
-
-def _verdict(values: dict[str, Any]) -> str:
-    judged = verdict.Verdict.from_json(values)
-    return "" if judged is None else judged.html("the photos")
 
 
 def _cards(facts: dict[str, Any]) -> str:

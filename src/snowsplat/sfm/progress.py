@@ -33,10 +33,6 @@ def silent(done: int, total: int, what: str = "", left: float | None = None) -> 
 Figures = Callable[[float, float], None]
 
 
-def ignored(cpu_seconds: float, features: float) -> None:
-    """A `Figures` that does nothing."""
-
-
 class Placed(Protocol):
     """Receives the photos that have a pose so far, and some points (P, 3), every two seconds.
 
@@ -44,7 +40,3 @@ class Placed(Protocol):
     """
 
     def __call__(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None: ...
-
-
-def unseen(photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
-    """A `Placed` that does nothing."""

@@ -89,18 +89,14 @@ def draw_scene(
         np.abs((high - low) @ np.stack([projection.right, projection.down], 1))
         for projection in _PROJECTIONS
     ]
-    scale = min(_fit(extent) for extent in extents)
+    room = np.array([_WIDTH, _HEIGHT]) - 2 * _MARGIN
+    scale = min(float((room / extent).min()) for extent in extents)
     depth = _frustum_depth(centres, high - low)
     what = photos, xyz[shown], rgb[shown], marks, (low + high) / 2
     return [
         _draw(projection, *what, extent * scale, scale, depth, unit)
         for projection, extent in zip(_PROJECTIONS, extents, strict=True)
     ]
-
-
-def _fit(extent: np.ndarray) -> float:
-    """The largest scale at which a scene of this extent (2,) fits into a drawing."""
-    return min((_WIDTH - 2 * _MARGIN) / extent[0], (_HEIGHT - 2 * _MARGIN) / extent[1])
 
 
 def _box(centres: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -85,11 +85,7 @@ def _light_of_hlg(signal: np.ndarray) -> np.ndarray:
     return 1000 * scene**1.2 / _WHITE
 
 
-def _srgb(light: np.ndarray) -> np.ndarray:
-    return np.rint(255 * from_linear(light)).astype(np.uint8)
-
-
 _SIGNALS = np.linspace(0, 1, _STEPS)
 _LIGHT_OF_PQ = _light_of_pq(_SIGNALS).astype(np.float32)
 _LIGHT_OF_HLG = _light_of_hlg(_SIGNALS).astype(np.float32)
-_SRGB = _srgb(_SIGNALS)
+_SRGB = np.rint(255 * from_linear(_SIGNALS)).astype(np.uint8)

@@ -229,11 +229,6 @@ def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Elemen
     return format, elements
 
 
-def header(count: int, properties: list[tuple[str, str]], comments: Sequence[str] = ()) -> bytes:
-    """The header of a little-endian file of vertices; ``properties`` are pairs (PLY type, name)."""
-    return header_of([("vertex", count, properties)], comments)
-
-
 def header_of(
     elements: Sequence[tuple[str, int, list[tuple[str, str]]]], comments: Sequence[str] = ()
 ) -> bytes:

@@ -8,7 +8,7 @@ For the photo ``images/sub/IMG.jpg``, these are masks:
 - beside the photo: the names of these that are no name of a photo, and ``IMG.png``, if the file
   looks like a mask.
 
-The format may be any of `IMAGE_SUFFIXES`; letters may be in upper or lower case.
+The format may be any of `decode.IMAGE_SUFFIXES`; letters may be in upper or lower case.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.dataset import PosedImage
-from snowsplat.data.decode import IMAGE_SUFFIXES
+from snowsplat.data.decode import is_photo
 from snowsplat.data.files.listing import (
     PHOTO_FOLDERS,
     files_below,
@@ -70,8 +70,9 @@ def find_masks(root: Path, photos: Sequence[str]) -> FoundMasks:
     left = [photo for photo in photos if photo not in found.beside]
     listed: set[Path] = set()
     for folder in sorted(_ancestors(by_folder), key=lambda f: (-f.count("/"), not f, f)):
+        above = f"{folder}/" if folder else ""
         for masks in _mask_folders(root / folder):
-            inside = {p: p[len(folder) :].lstrip("/") for p in left if _is_below(p, folder)}
+            inside = {p: p[len(above) :] for p in left if p.startswith(above)}
             listed |= _find_in(masks, inside, found)
     # In ``input``, a dataset keeps its original photos; masks beside it are those of other images.
     if root.name.casefold() in PHOTO_FOLDERS - {"input"}:
@@ -107,11 +108,7 @@ def _find_in(folder: Path, photos: dict[str, str], found: FoundMasks) -> set[Pat
 
     ``photos``: photo -> its path relative to the parent of ``folder``.
     """
-    masks = [
-        file
-        for file in files_below(folder, lambda _, subfolders: subfolders)
-        if PurePosixPath(file).suffix.lower() in IMAGE_SUFFIXES
-    ]
+    masks = list(filter(is_photo, files_below(folder, lambda _, subfolders: subfolders)))
     by_key: dict[tuple[str, str], Path] = {}  # folder and base; a name without words comes first
     for rank in range(3):
         for file in masks:
@@ -176,10 +173,6 @@ def _parent(path: str) -> str:
     return path.rpartition("/")[0]
 
 
-def _is_below(path: str, folder: str) -> bool:
-    return not folder or path.startswith(f"{folder}/")
-
-
 def is_marked(path: str) -> bool:
     """Whether a name says that the file is a mask: IMG_mask.png, mask_IMG.png …"""
     return len(list(_bases_of_mask(PurePosixPath(path).name))) > 1
@@ -227,9 +220,4 @@ def _base(root: Path, image: PosedImage) -> Path:
 
 def _images_in(folder: Path) -> list[str]:
     with os.scandir(folder) as entries:
-        return [
-            entry.name
-            for entry in entries
-            if not entry.name.startswith(".")
-            and os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
-        ]
+        return [e.name for e in entries if not e.name.startswith(".") and is_photo(e.name)]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from snowsplat.data.decode import IMAGE_SUFFIXES
+from snowsplat.data.decode import is_photo
 from snowsplat.data.files.listing import files_below, folder_kind, original_of
 from snowsplat.data.files.masks import is_marked
 from snowsplat.data.files.matching import match_names
@@ -27,11 +27,7 @@ def photos_below(root: Path) -> list[str]:
     def enter(_: Path, names: list[str]) -> list[str]:
         return [n for n in names if folder_kind(n) == "photos" and original_of(n, names) is None]
 
-    return [
-        file
-        for file in files_below(root, enter)
-        if PurePosixPath(file).suffix.lower() in IMAGE_SUFFIXES and not is_marked(file)
-    ]
+    return [file for file in files_below(root, enter) if is_photo(file) and not is_marked(file)]
 
 
 def warn_of_missing(

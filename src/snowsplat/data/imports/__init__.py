@@ -35,10 +35,6 @@ from snowsplat.util.safe_json import quoted
 logger = logging.getLogger(__name__)
 
 
-def _nowhere(folder: Path) -> Path | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Kind:
     """How the files of a program are found and read.
@@ -56,7 +52,7 @@ class Kind:
     patterns: tuple[str, ...]
     is_one: Callable[[Path], bool]
     read: Callable[[Path, PhotoFolder], Reconstruction]
-    photos: Callable[[Path], Path | None] = _nowhere
+    photos: Callable[[Path], Path | None] = lambda folder: None
     metres_per_unit: float | None = None
 
     def find(self, folder: Path) -> Iterator[Path]:

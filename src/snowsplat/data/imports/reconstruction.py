@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from snowsplat.data.dataset import Points, safe_name
-from snowsplat.data.decode import IMAGE_SUFFIXES
+from snowsplat.data.decode import IMAGE_SUFFIXES, is_photo
 from snowsplat.data.files.listing import folded
 from snowsplat.data.files.photos import photos_below
 from snowsplat.data.lens.project import LensModel
@@ -97,11 +97,6 @@ class PhotoFolder:
                 for key in {name, _stem(name)}:
                     self._by_name.setdefault(key, []).append(below + photo)
         return self._by_name
-
-
-def is_photo(name: str) -> bool:
-    """Whether a file name has the suffix of a photo."""
-    return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
 
 
 def _stem(name: str) -> str:

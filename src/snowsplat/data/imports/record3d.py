@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from snowsplat.data.decode import is_photo
 from snowsplat.data.imports.lenses import Intrinsics, perspective
-from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot, is_photo
+from snowsplat.data.imports.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.imports.values import (
     damaged,
     from_opengl,

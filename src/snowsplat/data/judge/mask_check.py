@@ -13,6 +13,7 @@ from snowsplat.data.decode import ImageSource, load_mask
 from snowsplat.data.files.mask_look import INVERT, doubt_about_masks, look_of
 from snowsplat.data.image_file import scaled_size
 from snowsplat.data.judge.finding import Finding
+from snowsplat.data.judge.rig import Rig
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 
@@ -53,14 +54,11 @@ def _points_kept(used: Sequence[tuple[Camera, np.ndarray]], points: Points) -> f
     """The share of the points in the photos that lie on pixels that masks keep."""
     chosen = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
     xyz = points.xyz.numpy()[chosen].astype(np.float64)
+    rig = Rig.of([camera for camera, _ in used])
     seen, kept = 0, 0
-    for camera, mask in used:
-        pose = camera.cam_from_world.detach().numpy().astype(np.float64)
-        x, y, z = pose[:3, :3] @ xyz.T + pose[:3, 3:]
-        front = z > 1e-9 * (np.abs(x) + np.abs(y)) + 1e-12
-        column = np.floor(camera.fx * x[front] / z[front] + camera.cx)
-        row = np.floor(camera.fy * y[front] / z[front] + camera.cy)
-        inside = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
-        seen += int(inside.sum())
-        kept += int(mask[row[inside].astype(int), column[inside].astype(int)].sum())
+    for view, (_, mask) in enumerate(used):
+        _, where, _ = rig.inside(view, xyz)
+        column, row = (where * mask.shape[::-1]).astype(int).T
+        seen += len(where)
+        kept += int(mask[row, column].sum())
     return kept / seen if seen >= _FEWEST_SEEN else None

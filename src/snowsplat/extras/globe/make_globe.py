@@ -102,7 +102,9 @@ def make_globe(
         KeyboardInterrupt: Ctrl-C; no incomplete file is left.
     """
     options, scene = options or GlobeOptions(), Path(scene)
-    target = _default_page(scene) if page is None else Path(page)
+    beside = scene.with_name(f"{scene_name(scene)}_globe.html")
+    default = scene / "globe.html" if scene.is_dir() else beside
+    target = default if page is None else Path(page)
     if target.suffix.lower() != ".html":
         raise UserError(f"{target}: the name of the page must end in .html")
     if video is not None and Path(video).suffix.lower() != ".mp4":
@@ -131,9 +133,3 @@ def _write(video: GlobeVideo, file: Path, observer: Observer) -> None:
             report(i + 1, video.count, "frames")
     result = {"files": [str(file)], "frames": video.count, "size": [video.width, video.height]}
     observer.end("video", Outcome(result, time.monotonic() - started, False))
-
-
-def _default_page(scene: Path) -> Path:
-    if scene.is_dir():
-        return scene / "globe.html"
-    return scene.with_name(f"{scene_name(scene)}_globe.html")

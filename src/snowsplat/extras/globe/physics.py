@@ -219,7 +219,9 @@ class Snow:
             self._fly_step(seconds, loose & flying)
             self.remembering += seconds
             if self.remembering > REMEMBER_SECONDS:
-                self._stand()
+                self.position[:], self.velocity[:] = self.home, 0
+                self.angle[:], self.morph[:], self.resting[:] = 0, 0, False
+                self.loosening, self.remembering = 0.0, None
 
     def flow(self, position: np.ndarray) -> np.ndarray:
         """(3, M): the velocity of the liquid at ``position`` (3, M) for the strength 1."""
@@ -312,11 +314,6 @@ class Snow:
         self.position[:, rows], self.velocity[:, rows] = x, v
         self.angle[rows] *= (1 - s) ** 2
         self.morph[rows] *= 1 - s
-
-    def _stand(self) -> None:
-        self.position[:] = self.home
-        self.velocity[:], self.angle[:], self.morph[:], self.resting[:] = 0, 0, 0, False
-        self.loosening, self.remembering = 0.0, None
 
 
 def flow_grid(time: float) -> np.ndarray:

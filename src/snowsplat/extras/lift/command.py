@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -14,9 +14,6 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
-
-if TYPE_CHECKING:
-    from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult
 
 
 @dataclass
@@ -90,13 +87,28 @@ class Lift(Reports):
             raise UserError(
                 "`size` and `focal` are those of the dataset with `refine`; leave them out"
             )
-        from snowsplat.extras.lift.lift_photo import DepthSource
+        from snowsplat.extras.lift.lift import LiftOptions
+        from snowsplat.extras.lift.lift_photo import DepthSource, lift_photo
 
         source = DepthSource(self.depth, self.model, self.depth_is, self.near, self.far)
+        what = self.photo, self.output, source
+        options = LiftOptions(self.edge, self.max_gaussians)
+        given: dict[str, Any] = {
+            "swing": self.swing,
+            "threads": self.threads,
+            "overwrite": self.overwrite,
+        }
         if self.refine is None:
-            result = self._lift(self.photo, self.output, source)
+            size = 640 if self.size is None else self.size
+            result = lift_photo(*what, options, size=size, focal=self.focal, **given)
         else:
-            result = self._refine(self.photo, self.output, source, self.refine)
+            from snowsplat.extras.lift.refine_photo import refine_photo
+
+            if self.iterations is not None:
+                given["iterations"] = self.iterations
+            given["hold_out"] = 8 if self.eval else None
+            with TerminalObserver(self.quiet) as observer:
+                result = refine_photo(*what, self.refine, options, observer=observer, **given)
         self.report = result
         if result.alignment is not None:
             fit = result.alignment
@@ -119,38 +131,3 @@ class Lift(Reports):
             print(f"{result.swing}: the video")
         print(see_and_share(self.output))
         return 0
-
-    def _lift(self, photo: Path, output: Path, source: DepthSource) -> LiftResult:
-        from snowsplat.extras.lift.lift import LiftOptions
-        from snowsplat.extras.lift.lift_photo import lift_photo
-
-        return lift_photo(
-            photo,
-            output,
-            source,
-            LiftOptions(self.edge, self.max_gaussians),
-            size=640 if self.size is None else self.size,
-            focal=self.focal,
-            swing=self.swing,
-            threads=self.threads,
-            overwrite=self.overwrite,
-        )
-
-    def _refine(self, photo: Path, output: Path, source: DepthSource, dataset: Path) -> LiftResult:
-        from snowsplat.extras.lift.lift import LiftOptions
-        from snowsplat.extras.lift.refine_photo import refine_photo
-
-        with TerminalObserver(self.quiet) as observer:
-            return refine_photo(
-                photo,
-                output,
-                source,
-                dataset,
-                LiftOptions(self.edge, self.max_gaussians),
-                iterations=1000 if self.iterations is None else self.iterations,
-                hold_out=8 if self.eval else None,
-                swing=self.swing,
-                threads=self.threads,
-                overwrite=self.overwrite,
-                observer=observer,
-            )

@@ -19,13 +19,14 @@ from typing import Any
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 from snowsplat.sfm.colmap.placed import read_placed
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.progress import Figures, Placed, Report, ignored, unseen
+from snowsplat.sfm.progress import Figures, Placed, Report
 from snowsplat.util.errors import SettingError, UserError
 
 # Bytes by which the database may grow in one transaction.
 _DATABASE_GROWTH = 8_000_000
 _MODULE = "snowsplat.sfm.colmap.worker"
 _POLL_SECONDS = 0.5
+_Watchers = tuple[Report, Figures, Placed]
 
 
 class Crashed(Exception):
@@ -50,8 +51,8 @@ def estimate_poses(
     photos: list[Photo],
     options: SfmOptions,
     report: Report,
-    figures: Figures = ignored,
-    placed: Placed = unseen,
+    figures: Figures = lambda cpu_seconds, features: None,
+    placed: Placed = lambda photos, points: None,
 ) -> SfmResult:
     """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
 
@@ -88,14 +89,14 @@ def estimate_poses(
         "photos": [dataclasses.asdict(photo) for photo in photos],
         "options": dataclasses.asdict(options),
     }
-    threads = thread_count(options.threads)
+    threads, watchers = thread_count(options.threads), (report, figures, placed)
     try:
-        return _run({**job, "reduced": False}, log, threads, report, figures, placed)
+        return _run({**job, "reduced": False}, log, threads, watchers)
     except Crashed as crash:
         first = crash
         _check_disk(distorted)
     try:
-        result = _run({**job, "reduced": True}, log, 1, report, figures, placed)
+        result = _run({**job, "reduced": True}, log, 1, watchers)
     except Crashed as crash:
         _check_disk(distorted)
         advice = "report it"
@@ -126,9 +127,7 @@ def _last_line(log: Path) -> str:
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none")
 
 
-def _run(
-    job: dict[str, Any], log: Path, threads: int, report: Report, figures: Figures, placed: Placed
-) -> SfmResult:
+def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> SfmResult:
     with (
         open(log, "ab") as log_file,
         subprocess.Popen(
@@ -142,7 +141,7 @@ def _run(
         ) as child,
     ):
         try:
-            answer = _communicate(child, job, report, figures, placed)
+            answer = _communicate(child, job, watchers)
             code = child.wait()
         finally:
             child.kill()
@@ -154,17 +153,14 @@ def _run(
 
 
 def _communicate(
-    child: subprocess.Popen[str],
-    job: dict[str, Any],
-    report: Report,
-    figures: Figures,
-    placed: Placed,
+    child: subprocess.Popen[str], job: dict[str, Any], watchers: _Watchers
 ) -> dict[str, Any]:
     """Send the job, report progress until the child ends, and return its last line.
 
     ``report`` is called in this thread, so it needs no lock and Ctrl-C interrupts it. A second
     thread reads the lines.
     """
+    report, figures, placed = watchers
     lines: queue.Queue[str | None] = queue.Queue()
 
     def listen() -> None:

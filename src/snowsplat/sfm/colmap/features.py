@@ -20,31 +20,14 @@ from snowsplat.sfm.progress import Report
 SEED = 1
 
 
-@dataclass(frozen=True)
 class Folders:
     """Paths inside a dataset."""
 
-    dataset: Path
-
-    @property
-    def images(self) -> Path:
-        return self.dataset / "input"
-
-    @property
-    def distorted(self) -> Path:
-        return self.dataset / "distorted"
-
-    @property
-    def masks(self) -> Path:
-        return self.distorted / "masks"
-
-    @property
-    def database(self) -> Path:
-        return self.distorted / "database.db"
-
-    @property
-    def sparse(self) -> Path:
-        return self.distorted / "sparse"
+    def __init__(self, dataset: Path) -> None:
+        self.images, self.distorted = dataset / "input", dataset / "distorted"
+        self.masks = self.distorted / "masks"
+        self.database = self.distorted / "database.db"
+        self.sparse = self.distorted / "sparse"
 
 
 @dataclass(frozen=True)

@@ -36,14 +36,12 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap import camera_groups
 from snowsplat.sfm.colmap.consistency import CONSISTENT, agreement_of_model
@@ -341,7 +339,12 @@ class PoseEstimation:
         fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
         open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
         extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
-        choice = choose_pairs(self.photos, pairing, self._similarity(database))
+        indices = range(len(self.photos))
+        choice = choose_pairs(
+            self.photos,
+            pairing,
+            lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices]),
+        )
         choice = choice.whole() if reserve else choice
         scales = [
             max(photo.width, photo.height) / detection_size(effort.image_size, photo.panorama)
@@ -367,10 +370,6 @@ class PoseEstimation:
         set_cameras(matched.database, self.photos, lens)
         error, pairs = _MAX_ERROR * matched.scale, matched.choice.pairs
         verify_pairs(matched.database, pairs, error, self.threads, self.progress)
-
-    def _similarity(self, database: Path) -> Callable[[], NDArray[np.floating]]:
-        indices = range(len(self.photos))
-        return lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices])
 
     def _try(
         self,
