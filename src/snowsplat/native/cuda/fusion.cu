@@ -18,8 +18,14 @@ SNOW_INLINE void fuse(const FuseDepthParams<T>& p) {
     at[c] = row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3];
   }
   const T u = at[0] / at[2], v = at[1] / at[2];
-  if (at[2] > T(0) && u >= T(0) && v >= T(0) && u < T(p.width) && v < T(p.height))
-    fuse_sample(p, u, v, at[2], p.sums + i * (2 + p.channels));
+  if (!(at[2] > T(0) && u >= T(0) && v >= T(0) && u < T(p.width) && v < T(p.height))) return;
+  const PixelIndex<T> pixels(int(p.width), int(p.height), u, v);
+  T s, *sums = p.sums + i * (2 + p.channels);
+  const T w = weight_of_sample(pixels.load(p.depth), at[2], p.weight[pixels.nearest()],
+                               T(p.truncation), p.channels > 0, s);
+  if (!(w > T(0))) return;
+  sums[0] += w, sums[1] += w * s;
+  add_colours(p, pixels, w, sums + 2);
 }
 
 }  // namespace snow
