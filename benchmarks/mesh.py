@@ -4,8 +4,9 @@
     python benchmarks/mesh.py --out OUT --scenes table --methods mean poisson --surfaces
 
 The photos are ray traced; poses are exact, points have errors of some millimetres. A point of the
-mesh is accurate if a true surface is within 0.5% of the extent, the longest side of the box of the
-true points; a true point that two photos show is complete if the mesh is within the same distance.
+mesh is accurate if a true surface that a photo shows is within 0.5% of the extent, the longest side
+of the box of the true points; a true point that two photos show is complete if the mesh is within
+the same distance. Rays decide what a photo shows. Only the photos of the training count.
 Methods: `median`, that of `snowsplat mesh`; `mean`, with the mean depth of each pixel; `reference`,
 the median with the field of the PyTorch reference; `poisson`, Open3D's surface of the points.
 """
@@ -80,7 +81,7 @@ def sampled(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarr
 
 
 def near_cameras(points: np.ndarray, scene: TrainedScene, reach: float) -> np.ndarray:
-    """(P,) bool: whether a photo shows the place of a point from nearer than ``reach``."""
+    """(P,) bool: whether a point is in a photo, hidden or not, and within the reach."""
     near = np.zeros(len(points), bool)
     for view in scene.dataset.train:
         pixel, depth = view.camera.project(torch.from_numpy(points))
@@ -98,7 +99,7 @@ def score(
     reach: float,
     seconds: float,
 ) -> Score:
-    """``truth``: points that a photo shows, and those that two photos show."""
+    """``truth``: of `true_points`."""
     limit = _THRESHOLD * float(np.ptp(truth[1], axis=0).max())
     vertices, faces = mesh
     faces = faces[near_cameras(vertices.astype(np.float64), scene, reach)[faces].all(1)]

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
@@ -156,6 +157,23 @@ def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
         assert float((each.depth[:10] > 0).float().mean()) > 0.2
     far = confirmed_by_photos(dataset.train, maps, 1.0, lambda *_: None)
     assert all(torch.equal(a.depth, b.depth) for a, b in zip(far, maps, strict=True))
+
+
+def test_depths_next_to_confirmed_ones_lose_the_same_error(dataset: Dataset) -> None:
+    weight = torch.full((HEIGHT, WIDTH), 255, dtype=torch.uint8)
+    maps = [
+        surface_depth.DepthMap(camera, (1.02 / true_inverse_depth(camera)).float(), weight)
+        for camera in CAMERAS
+    ]
+    found = confirmed_by_photos(dataset.train, maps, 100.0, lambda *_: None)
+    errors = []
+    for each, camera in zip(found, CAMERAS, strict=True):
+        confirmed = each.weight == 255
+        near = max_pool2d(confirmed.float()[None], 3, 1, 1)[0] > 0
+        error = (each.depth * true_inverse_depth(camera) - 1.0).abs()
+        errors.append(error[near & ~confirmed])
+    assert len(torch.cat(errors)) > 100
+    assert float(torch.cat(errors).median()) < 0.008
 
 
 def test_views_without_sources_or_points_have_no_map(dataset: Dataset) -> None:

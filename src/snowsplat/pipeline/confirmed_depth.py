@@ -7,6 +7,10 @@ correlates best with others. Where the map of another photo has the same depth, 
 replaces that of the Gaussians; where the two agree, their mean does, because their errors are not
 the same. Elsewhere, for example on a wall of one colour, the depth of the Gaussians remains, and
 has less weight.
+
+Neighbouring Gaussians have about the same error: on an opaque object, what is behind the first ones
+costs nothing, and the median lies behind the surface. So the mean difference of the two depths
+around a pixel is first subtracted from the depth of the Gaussians, confirmed or not.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.surface.depth import DepthMap
@@ -37,6 +41,9 @@ _SOURCES = 4
 _SAMPLE, _POINTS = 300, 10_000
 #: The two depths agree if they differ by less than this share.
 _AGREE = 0.03
+#: The mean difference is that of 3×3 cells, each this share of the longer side of the map; the two
+#: depths agree in at least the second share of the pixels there.
+_CELL, _FEWEST = 1 / 40, 0.05
 #: Of 255: the least weight of a depth that photos confirm.
 _CONFIRMED = 128
 #: The factor of the weight of all others.
@@ -109,12 +116,24 @@ def _corrected(each: DepthMap, inverse: Tensor, far: float) -> DepthMap:
     known = surface & (inverse * far > 1.0)
     swept = 1.0 / inverse
     agree = (each.depth / swept - 1.0).abs() < _AGREE
-    swept = torch.where(agree, 0.5 * (swept + each.depth), swept)
-    depth = torch.where(known, swept, each.depth)
+    own = each.depth * torch.exp(-_difference(each.depth, swept, known & agree))
+    swept = torch.where(agree, 0.5 * (swept + own), swept)
+    depth = torch.where(known, swept, own)
     doubtful = (_UNCONFIRMED * each.weight).ceil().to(torch.uint8)
     weight = torch.where(surface, doubtful, each.weight)
     weight = torch.where(known, each.weight.clamp(min=_CONFIRMED), weight)
     return DepthMap(each.camera, depth, weight)
+
+
+def _difference(depth: Tensor, swept: Tensor, agree: Tensor) -> Tensor:
+    """(H, W): the logarithm of depth / swept, mean of the pixels around that agree; 0: too few."""
+    ratio = torch.where(agree, (depth / swept).log(), 0.0)
+    cell = max(1, round(_CELL * max(depth.shape)))
+    grid = [math.ceil(side / cell) for side in depth.shape]
+    shares = adaptive_avg_pool2d(torch.stack([agree.to(ratio), ratio])[None], grid)
+    share, total = avg_pool2d(shares, 3, stride=1, padding=1)[0]
+    mean = torch.where(share >= _FEWEST, total / share, 0.0)
+    return interpolate(mean[None, None], list(depth.shape), mode="bilinear")[0, 0]
 
 
 def _enlarged(inverse: Tensor, size: Sequence[int]) -> Tensor:
