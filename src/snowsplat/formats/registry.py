@@ -60,7 +60,7 @@ class Format:
     read: Callable[[Path], GaussianArrays] | None
     write: Callable[..., None] | None
     loses: str
-    marks_antialiased: bool
+    marks_antialiased: bool = False
     version: Callable[[Path], str] | None = None
     stores_origin: bool = False
     bytes: Callable[[Path], int] | None = None
@@ -94,7 +94,7 @@ FORMATS: list[Format] = [
         True,
         spz_version,
     ),
-    Format("gsplat checkpoint", (".pt",), is_checkpoint, read_checkpoint, None, "nothing", False),
+    Format("gsplat checkpoint", (".pt",), is_checkpoint, read_checkpoint, None, "nothing"),
     Format(
         "USD",
         (".usd", ".usdc", ".usda", ".usdz"),
@@ -102,7 +102,6 @@ FORMATS: list[Format] = [
         read_usd,
         write_usd,
         "nothing except for rounding",
-        False,
         stores_origin=True,
     ),
     Format(
@@ -144,8 +143,7 @@ FORMATS: list[Format] = [
         read_gltf,
         write_glb,
         "nothing except for rounding",
-        False,
-        lambda _: "2, KHR_gaussian_splatting",
+        version=lambda _: "2, KHR_gaussian_splatting",
         stores_origin=True,
     ),
     Format(
@@ -155,8 +153,7 @@ FORMATS: list[Format] = [
         read_gltf,
         None,
         "nothing except for rounding",
-        False,
-        lambda _: "2, KHR_gaussian_splatting",
+        version=lambda _: "2, KHR_gaussian_splatting",
         stores_origin=True,
     ),
     Format(
@@ -166,7 +163,6 @@ FORMATS: list[Format] = [
         read_splat,
         write_splat,
         "all SH, colours beyond black and white; rotations, colours and opacity have 8 bits",
-        False,
     ),
     Format(
         "ksplat",
@@ -175,7 +171,6 @@ FORMATS: list[Format] = [
         read_ksplat,
         None,
         "precision: SH have 8 to 32 bits, all other values 16 or 32",
-        False,
     ),
     Format(
         "RAD",
@@ -184,7 +179,6 @@ FORMATS: list[Format] = [
         None,
         None,
         "not known",
-        False,
         instead="use the file that Spark made it from, or the .spz of its build-lod --unlod --spz",
     ),
     Format(
@@ -194,7 +188,6 @@ FORMATS: list[Format] = [
         None,
         None,
         "not known",
-        False,
         instead="export the scene as .ply, or convert it with splat-transform",
     ),
 ]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snowsplat.scene.origin import HERE, Origin
+from snowsplat.util.components import components
 
 
 @dataclass(frozen=True)
@@ -70,29 +71,9 @@ def largest_parts(faces: np.ndarray, count: int, share: float) -> np.ndarray:
 
     ``faces``: (F, 3) rows of ``count`` vertices.
     """
-    label = _parts(faces, count)[faces[:, 0]]
+    label = components(faces.T, count)[faces[:, 0]]
     size = np.bincount(label, minlength=count)[label]
     return np.asarray(size >= share * size.max(initial=0))
-
-
-def _parts(faces: np.ndarray, count: int) -> np.ndarray:
-    """(V,): the same number for the vertices of each connected part.
-
-    Each vertex takes the smallest label of its triangles; then labels point to labels, which
-    shortens all paths, so that the number of rounds is logarithmic in practice.
-    """
-    label = np.arange(count, dtype=np.int32)
-    while True:
-        low = label[faces].min(1)
-        new = label.copy()
-        for corner in range(3):
-            np.minimum.at(new, label[faces[:, corner]], low)
-            np.minimum.at(new, faces[:, corner], low)
-        while not np.array_equal(shorter := new[new], new):
-            new = shorter
-        if np.array_equal(new, label):
-            return label
-        label = new
 
 
 def filled_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,8 +38,8 @@ from snowsplat.data.lens.project import directions
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
 from snowsplat.sfm.colmap.features import SEED
 from snowsplat.sfm.colmap.lens import is_fisheye, lens_of, pixels_per_radian
-from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.colmap.view_graph import VerifiedPair, database_names, following_pairs
+from snowsplat.util.components import components
 
 Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
@@ -445,7 +445,7 @@ def _components(linked: NDArray[np.bool_]) -> list[list[int]]:
     """The connected components of a graph of N nodes, as sorted lists of nodes. ``linked``: (N, N)
     symmetric, whether two nodes have an edge."""
     first, second = np.nonzero(linked)
-    label = components(first, second, len(linked))
+    label = components((first, second), len(linked))
     return [np.flatnonzero(label == node).tolist() for node in np.unique(label)]
 
 

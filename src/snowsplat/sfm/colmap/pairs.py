@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 from snowsplat.sfm.colmap.database import Pair
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.colmap.retrieval import nearest
-from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.components import components
 
 # Share of `Effort.neighbours` that is used for similar photos if all photos already have pairs from
 # one video or from GPS.
@@ -86,7 +86,7 @@ class PairChoice:
         clear = [(p.first, p.second) for p in verified if p.inliers >= _CLEAR_MATCHES]
         first, second = np.array(clear, np.int64).reshape(-1, 2).T
         partners = np.bincount(np.concatenate([first, second]), minlength=count)
-        groups = np.unique(components(first, second, count)[partners > 0])
+        groups = np.unique(components((first, second), count)[partners > 0])
         weak = (partners < _CLEAR_PAIRS) | (len(groups) > 1)
         return self._with({(i, j) for i, j in self.reserve if weak[i] or weak[j]})
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.pairs import numbered_series
-from snowsplat.sfm.colmap.tracks import components
 from snowsplat.sfm.colmap.view_graph import ViewGraph
+from snowsplat.util.components import components
 
 _MIN_MATCHES = 100  # number of verified matches of a strong pair
 # Two photos of the subset that follow each other by name are at most this number of positions apart
@@ -54,7 +54,7 @@ def spread_subset(graph: ViewGraph, count: int) -> set[int]:
                 return True
         near = np.flatnonzero(strong[index])
         edges = np.nonzero(strong[np.ix_(near, near)])
-        return len(near) < 2 or bool(components(edges[0], edges[1], len(near)).any())
+        return len(near) < 2 or bool(components(edges, len(near)).any())
 
     # The number of matches of the second strongest pair of each photo. It is small for a photo at
     # the end of a walk, which may have one strong pair only.

@@ -11,12 +11,11 @@ number in "Efficient and robust large-scale structure from motion via track sele
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Ints = NDArray[np.integer[Any]]
+from snowsplat.util.components import Ints, components
 
 #: A pair of photos keeps at least this share of its matches, and at least this number, or all. The
 #: share keeps the order of the pairs: those of photos that only look alike have few matches.
@@ -48,7 +47,7 @@ def of_long_tracks(
     pair = np.repeat(np.arange(len(matches)), sizes)
     first = np.concatenate([rows[:, 0] + start[i] for i, _, rows in matches]).astype(np.int64)
     second = np.concatenate([rows[:, 1] + start[j] for _, j, rows in matches]).astype(np.int64)
-    track = components(first, second, total)
+    track = components((first, second), total)
     of_match = track[first]
     length = _lengths(track, photo)[of_match]
     order = np.lexsort((first, -length, pair))  # the first features of a photo are the largest
@@ -58,21 +57,6 @@ def of_long_tracks(
     kept = np.maximum(least, share * np.array(sizes))
     chosen[of_match[rank < kept[pair]]] = True
     return np.split(chosen[of_match], np.cumsum(sizes)[:-1])
-
-
-def components(first: Ints, second: Ints, count: int) -> Ints:
-    """(count,) the smallest node in the component of each node; ``first``, ``second``: edges."""
-    label = np.arange(count)
-    while True:
-        least = np.minimum(label[first], label[second])
-        smaller = label.copy()
-        for nodes in (first, second, label[first], label[second]):
-            np.minimum.at(smaller, nodes, least)
-        while not np.array_equal(smaller, shorter := smaller[smaller]):
-            smaller = shorter
-        if np.array_equal(smaller, label):
-            return label
-        label = smaller
 
 
 def _lengths(track: Ints, photo: Ints) -> Ints:
