@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 #: The weight of the consistency, the share of the steps after which it begins, and the number of
 #: steps of which one has it.
-_WEIGHT, _FROM, _EVERY = 0.1, 0.4, 2
+_WEIGHT, _FROM, _EVERY = 0.1, 0.4, 4
 #: Number of steps between two reductions of the smallest scale, the factor of each, and the ratio
 #: to the middle scale below which there is none.
 _INTERVAL, _SHRINK, _FLAT = 10, 0.97, 0.1
