@@ -110,7 +110,7 @@ def test_planes_face_the_camera_in_its_frame() -> None:
 
 
 CONFIG = replace(
-    recipe("default", iterations=60, init="points", max_gaussians=600, transients="off", sky=False),
+    recipe("default", iterations=80, init="points", max_gaussians=600, transients="off", sky=False),
     coarse_to_fine=(0, 0),
     few_passes=0.0,
     surfaces=True,

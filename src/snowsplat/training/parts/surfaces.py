@@ -44,11 +44,10 @@ if TYPE_CHECKING:
 
 #: The weight of the consistency, the share of the steps after which it begins, and the number of
 #: steps of which one has it.
-_WEIGHT, _FROM, _EVERY = 0.1, 0.4, 2
+_WEIGHT, _FROM, _EVERY = 0.1, 0.4, 4
 #: Number of steps between two reductions of the smallest scale, the factor of each, and the ratio
 #: to the middle scale below which there is none.
 _INTERVAL, _SHRINK, _FLAT = 10, 0.97, 0.1
-
 #: The least cosine between the rendered normal and the ray of a pixel that has a depth.
 _SIDEWAYS = 0.05
 
@@ -79,7 +78,8 @@ class Surfaces(Part):
         times = run.schedule.multiples(step, _EVERY)
         if step <= run.schedule.step_of(_FROM) or not times:
             return
-        weight = _WEIGHT * _EVERY * times / len(batch) ** 2  # the mean of the views, in each step
+        # The gradient is that of the mean of the batch, of whose steps `times` have the term.
+        weight = _WEIGHT / len(batch) * (_EVERY * times / len(batch))
         means = run.gaussians.means.detach().requires_grad_()
         quats = run.gaussians.quats.detach().requires_grad_()
         axis = run.gaussians.log_scales.argmin(1)
@@ -88,9 +88,8 @@ class Surfaces(Part):
             planes, drawn = [], []
             for view, gradient in group:
                 assert gradient.splats.ids is not None
-                rows = gradient.splats.ids.clamp(
-                    min=0
-                ).long()  # on a GPU, empty rows have the id -1
+                # On a GPU, empty rows have the id -1.
+                rows = gradient.splats.ids.clamp(min=0).long()
                 with torch.enable_grad():
                     planes.append(planes_of(means[rows], quats[rows], axis[rows], view.camera))
                 drawn.append(with_planes(gradient.splats, planes[-1].detach()))

@@ -172,7 +172,7 @@ class TrainConfig(Settings):
     surfaces: bool = setting(
         False,
         "Whether to train flat Gaussians that lie in the surfaces, for meshes and depths. The "
-        "training takes about 1.5 times as long.",
+        "training takes about 1.3 times as long.",
         metavar="{on,off}",
     )
     init: str = setting(
