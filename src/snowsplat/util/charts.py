@@ -8,12 +8,12 @@ from html import escape
 
 # Size of the chart in SVG units.
 _WIDTH = 520
-_HEIGHT = 230
+_HEIGHT = 236
 # Margins around the plot area in SVG units; tick labels and the x label are in them.
 _LEFT = 58
 _RIGHT = 14
 _TOP = 10
-_BOTTOM = 34
+_BOTTOM = 40
 # Approximate number of ticks per axis.
 _TICKS_X = 6
 _TICKS_Y = 5
@@ -22,7 +22,7 @@ _TICKS_Y = 5
 STYLE = """
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(340px, 100%), 1fr));
   gap: 22px 28px; } .charts figure { max-width: 620px; }
-svg.chart { width: 100%; height: auto; display: block; }
+svg.chart { width: 100%; height: auto; display: block; overflow: visible; }
 .chart text { fill: var(--soft); font-size: 12px; font-variant-numeric: tabular-nums; }
 .chart .grid { stroke: var(--line); } .chart .dot { fill: var(--accent); }
 .chart .curve { fill: none; stroke: var(--accent); stroke-width: 2; stroke-linejoin: round; }

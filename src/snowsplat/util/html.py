@@ -30,7 +30,8 @@ body { margin: 0; background: var(--bg); color: var(--ink); line-height: 1.5;
 main { max-width: 1120px; margin: 0 auto; padding: 32px 20px 64px; }
 h1 { font-size: 1.7rem; margin: 0; overflow-wrap: anywhere; }
 h2 { font-size: 1.05rem; margin: 36px 0 10px; }
-p { margin: 6px 0; } .soft, figcaption { color: var(--soft); } .bad { color: var(--bad); }
+p { margin: 6px 0; } p, li { overflow-wrap: anywhere; }
+.soft, figcaption { color: var(--soft); } .bad { color: var(--bad); }
 .cards { display: flex; flex-wrap: wrap; gap: 12px; margin: 22px 0; }
 .card { flex: 1 1 150px; background: var(--card); border: 1px solid var(--line);
   border-radius: 8px; padding: 12px 16px; }

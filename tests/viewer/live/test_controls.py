@@ -453,10 +453,10 @@ def test_keys(page):
     type_key(page, "f", "KeyF", lambda: page.evaluate(NOWHERE))
     framed = settled(page)
     type_key(page, "r", "KeyR", lambda: differ(scene(page), framed) > 1)
-    scheme = "getComputedStyle(document.body).colorScheme"
-    before = page.evaluate(scheme)
-    type_key(page, "l", "KeyL", lambda: page.evaluate(scheme) != before)
-    type_key(page, "l", "KeyL", lambda: page.evaluate(scheme) == before)
+    colour = "getComputedStyle(document.body).backgroundColor"
+    before = page.evaluate(colour)
+    type_key(page, "l", "KeyL", lambda: page.evaluate(colour) != before)
+    type_key(page, "l", "KeyL", lambda: page.evaluate(colour) == before)
     paused = step_of(page)
     type_key(page, " ", "Space", lambda: step_of(page) > paused)
 
