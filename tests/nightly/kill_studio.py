@@ -1,14 +1,14 @@
 """Kills the studio, its jobs and its browser at random moments, and checks that nothing is lost.
 
-    PYTHONPATH=src python tests/nightly/kill_studio.py PHOTOS --kills 50
+    PYTHONPATH=src python tests/nightly/kill_studio.py --kills 50 --photos FOLDER
 
-PHOTOS is a folder of about 20 photos. The real `snowsplat studio` runs in a new library: a scene is
-uploaded by a page, looked at, made, edited, filmed and handed on. In each of these stages, a random
-process (the server, a process of the worker, the browser) gets SIGKILL at a random moment. Then the
-studio is started again, what was interrupted is continued, and everything that was there before the
-kill must be there: photos, finished stages, edits, the film and its plan. At no time do two
-processes make one scene. The last line counts the kills; the exit code is 1 if something was lost
-or done twice.
+FOLDER has about 20 photos; without it, they are rendered. The real `snowsplat studio` runs in a new
+library: a scene is uploaded, looked at, made, edited, filmed and handed on. In each of these stages,
+a random process (the server, a process of the worker, the browser) gets SIGKILL at a random moment.
+Then the studio is started again, what was interrupted is continued, and everything that was there
+before the kill must be there: photos, finished stages, edits, the film and its plan. At no time do
+two processes make one scene. The last line counts the kills; the exit code is 1 if something was
+lost or done twice.
 """
 
 from __future__ import annotations
@@ -39,13 +39,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from browser import Browser, BrowserError
+from browser import Browser, BrowserError, chromium
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.film import moved_film, page_frames
 from snowsplat.pipeline.output.edit_record import read_record
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.studio.library import Library, Scene
+from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.safe_json import from_json
 
 SHARES = {"upload": 8, "survey": 4, "make": 16, "edit": 9, "film": 5, "export": 5, "browser": 3}
@@ -191,7 +192,6 @@ class Kills:
     def upload(self, kills: int) -> None:
         """By two clients at once, which continue where the other one was."""
         done = threading.Event()
-        lost: list[BaseException] = []
 
         def client() -> None:
             for name, data in self.photos.items():
@@ -228,7 +228,7 @@ class Kills:
             for file in self.ask("/uploads"):
                 before = arrived.get(file["path"], 0)
                 check(file["received"] >= before, f"bytes of {file['path']} are lost")
-        check(done.wait(900) and not lost, "the upload did not end")
+        check(done.wait(900), "the upload did not end")
         self.check_photos()
 
     def survey(self, kills: int) -> None:
@@ -251,7 +251,7 @@ class Kills:
         while True:
             status = self.ask()["status"]
             if status == "running" and left:
-                self.pause(45.0)
+                self.pause(60.0)
                 state = self.ask()["state"]
                 stages = [each["stage"] for each in state.get("stages", [])]
                 now = (state.get("now") or {}).get("stage", "begin")
@@ -452,20 +452,23 @@ class Kills:
     def _all_there(self, scene: Scene) -> bool:
         if not scene.photos.is_dir():
             return False
-        there = {path.name: path.read_bytes() for path in scene.photos.iterdir()}
-        check(set(there.values()) <= set(self.photos.values()) or len(there) < 999, "damaged")
-        return there == self.photos
+        return {path.name: path.read_bytes() for path in scene.photos.iterdir()} == self.photos
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("photos", type=Path)
+    parser.add_argument("--photos", type=Path)
     parser.add_argument("--kills", type=int, default=sum(SHARES.values()))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=SHARES, nargs="+", default=list(SHARES))
     words = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="kill-studio-"))
-    kills = Kills(words.photos, folder, words.seed)
+    photos = words.photos or folder / "rendered"
+    if words.photos is None:
+        write_synthetic_photos(photos, n_views=16, width=320, height=240)
+    kills = Kills(photos, folder, words.seed)
+    if chromium() is None:
+        words.only = [stage for stage in words.only if stage != "browser"]
     try:
         for stage, share in SHARES.items():
             count = max(1, round(words.kills * share / sum(SHARES.values())))
@@ -479,6 +482,7 @@ def main() -> int:
         kills.kill_workers()
         kills.server.kill()
         print(f"{sum(kills.counts.values())} kills: {dict(kills.counts)}", flush=True)
+    shutil.rmtree(folder)
     return 0
 
 

@@ -137,6 +137,14 @@ def test_box_and_level_by_clicks(studio, finished):
         for _ in range(2):
             key(page, "y", control=True)
         assert faces(page) == end
+        x, y, width, height = page.evaluate(
+            "(({ x, y, width, height }) => [x, y, width, height])"
+            "(document.querySelector('.snow-sides input').getBoundingClientRect())"
+        )
+        page.drag(x + width / 2, y + height / 2, x + width / 4, y + height / 2)
+        assert faces(page)[0] != end[0]
+        press(page, "Undo")
+        assert faces(page) == end
         press(page, "Select what is outside")
         shown = page.evaluate("document.querySelector('.snow-edit > p').textContent")
         assert 10 < int(shown.split()[0].replace(",", "")) < len(floor) / 2

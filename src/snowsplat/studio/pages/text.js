@@ -42,7 +42,7 @@ const TEXTS = {
     uploading: ["{0} of {1} have arrived", "已上传 {0}，共 {1}"],
     files: ["{0} of {1} files", "{0} / {1} 个文件"],
     left: ["about {0} left", "大约还需 {0}"],
-    not_arrived: ["{0} files have not arrived completely, and are not used: drop them again.", "有 {0} 个文件没有传完，不会被使用：请再次拖入这些文件。"],
+    not_arrived: ["Files that have not arrived completely: {0}. They are not used; drop them again.", "有 {0} 个文件没有传完，不会被使用：请再次拖入这些文件。"],
     no_files: ["Drop the photos here, or the same ones again: what has arrived is kept.", "请把照片拖到这里；如果上传中断，请再次拖入同样的照片，已上传的部分会保留。"],
     arrived: ["{0} files have arrived.", "已上传 {0} 个文件。"],
     offline: ["The studio does not answer; trying again …", "工作室没有响应，正在重试……"],
