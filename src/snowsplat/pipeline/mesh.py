@@ -14,7 +14,7 @@ from torch import Tensor
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
-from snowsplat.pipeline.confirmed_depth import confirmed_by_photos
+from snowsplat.pipeline.confirmed_depth import confirm_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
@@ -178,7 +178,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
         with observer.waiting("stereo") as report:
-            maps = confirmed_by_photos(views, maps, far, report)
+            confirm_by_photos(views, maps, far, report)
         with observer.waiting("fusion") as report:
             voxel, keys, closer = _voxel(maps, options)
             if not len(keys):
