@@ -28,6 +28,7 @@ from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
 from snowsplat.util.process import single_threaded
+from snowsplat.util.process_memory import return_unused
 
 #: Memory: pixels of all depth maps, with 5 bytes each, and blocks of 512 voxels with 8 bytes each.
 _MOST_PIXELS, _MOST_BLOCKS = 120_000_000, 100_000
@@ -177,8 +178,10 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
     with single_threaded():
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
+        return_unused()  # after each stage with temporary tensors for every photo
         with observer.waiting("stereo") as report:
             confirm_by_photos(views, maps, far, report)
+        return_unused()
         with observer.waiting("fusion") as report:
             voxel, keys, closer = _voxel(maps, options)
             if not len(keys):
@@ -187,11 +190,13 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
                     "`voxel`"
                 )
             volume = fused(maps, voxel, keys, report)
+        return_unused()
         with observer.waiting("triangles"):
             vertices, faces = zero_level(volume)
             del volume
             found = len(faces)
             vertices, faces = _cleaned(vertices, faces, options)
+        return_unused()
         with observer.waiting("colours") as report:
             photos = _photos(views, maps, scene.gaussians.means.device, report)
             colors = vertex_colors(vertices, faces, photos, _SAME_PLACE * voxel)
