@@ -78,6 +78,7 @@ def confirm_by_photos(
                 if finer is not None:
                     inverse = torch.where(finer > 0, finer, _enlarged(inverse, finer.shape))
                 found[i] = inverse
+        del swept
         pictures = [picture.half for picture in pictures]
     for i, inverse_depth in enumerate(found):
         if inverse_depth is not None:
