@@ -25,13 +25,14 @@ from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.fusion import consistent
 from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_maps
 from snowsplat.training.starts.source_views import source_views
+from snowsplat.util.process_memory import return_unused
 
 #: All maps of a sweep together have at most this number of pixels, of nine bytes.
 _MOST_PIXELS = 24_000_000
 #: Each sweep has half the size of the one before, so larger windows, in which faint texture suffices.
 _SWEEPS = 2
 #: For photos that are decoded ahead; each is used once.
-_PHOTO_BYTES = 64 << 20
+PHOTO_BYTES = 32 << 20
 #: Each map is checked with those of this number of other views.
 _SOURCES = 4
 #: Points of the scene: with the first number, other views are chosen; with the second, the range
@@ -67,6 +68,7 @@ def confirm_by_photos(
     sources = source_views([view.camera for view in views], sample, _SOURCES)
     ranges = depth_ranges(views, points)
     pictures = _pictures(views, report)
+    return_unused()
     found: list[Tensor | None] = [None] * len(maps)  # (h, w) inverse depths; 0: not confirmed
     for number in range(_SWEEPS):
         report(number, _SWEEPS, "comparisons of photos")
@@ -74,7 +76,7 @@ def confirm_by_photos(
         for i, known in enumerate(consistent(swept, sources)):
             each, finer = swept[i], found[i]
             if each is not None:
-                inverse = torch.where(known, each.inverse_depth, 0.0)
+                inverse = each.inverse_depth.masked_fill_(~known, 0.0)  # not used again
                 if finer is not None:
                     inverse = torch.where(finer > 0, finer, _enlarged(inverse, finer.shape))
                 found[i] = inverse
@@ -91,7 +93,7 @@ def _pictures(views: Sequence[View], report: Report) -> list[Picture]:
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     side = min(LONGER_SIDE, int(longest * min(1.0, math.sqrt(_MOST_PIXELS / pixels))))
     found = []
-    with ImageLoader(views, budget_bytes=_PHOTO_BYTES) as loader:
+    with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
         for i, view in enumerate(views):
             report(i, len(views), "photos")
             loader.prefetch(views[i : i + 4])

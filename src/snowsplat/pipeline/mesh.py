@@ -14,7 +14,8 @@ from torch import Tensor
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
-from snowsplat.pipeline.confirmed_depth import confirm_by_photos
+from snowsplat.ops import scratch
+from snowsplat.pipeline.confirmed_depth import PHOTO_BYTES, confirm_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
@@ -45,6 +46,7 @@ _SAME_PLACE = 2.0
 _TRANSPARENT = 16  # of 255: a pixel of a photo with less alpha shows nothing
 _OPAQUE = (".jpg", ".jpeg")  # other photos can have transparent pixels
 _SAMPLE_VIEWS = 32  # that determine the usual depth
+_SAMPLE_STEP = 3  # of the pixels that determine it
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,8 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
     with single_threaded():
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
-        return_unused()  # after each stage with temporary tensors for every photo
+        scratch.release()  # 0.1 GB, which the next stages do not use
+        return_unused()
         with observer.waiting("stereo") as report:
             confirm_by_photos(views, maps, far, report)
         return_unused()
@@ -224,7 +227,7 @@ def _depth_maps(
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
         far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
     maps = []
-    with ImageLoader(views) as loader:
+    with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
         for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
             report(i, len(cameras), "photos")
             found = renderer.render(camera, far)
@@ -244,7 +247,8 @@ def _usual_depth(maps: Sequence[DepthMap]) -> float:
     """The median, over views, of the median depth. Raises UserError: no view shows a surface."""
     medians = []
     for each in maps:
-        known = each.depth[each.depth.isfinite() & (each.depth > 0)]
+        sample = each.depth[::_SAMPLE_STEP, ::_SAMPLE_STEP]
+        known = sample[sample.isfinite() & (sample > 0)]
         if len(known):
             medians.append(float(known.median()))
     if not medians:
@@ -303,7 +307,7 @@ def _photos(
     views: Sequence[View], maps: Sequence[DepthMap], device: torch.device, report: Report
 ) -> Iterator[tuple[DepthMap, Tensor, Tensor | None]]:
     """The depth maps with their photos at the same size."""
-    with ImageLoader(views) as loader:
+    with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
         for i, (view, each) in enumerate(zip(views, maps, strict=True)):
             report(i, len(views), "photos")
             loader.prefetch(views[i : i + 4])
