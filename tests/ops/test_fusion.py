@@ -100,6 +100,26 @@ def test_native_agrees_with_the_reference(
     assert torch.equal(run(native.ops, native.dtype), found)
 
 
+@pytest.mark.parametrize(("width", "height"), [(1, 9), (2, 2), (33, 17)])
+def test_small_images(native: Variant, width: int, height: int) -> None:
+    """In those that are one pixel wide, nothing is interpolated; 17 is more than a patch."""
+    to_image, _, weight, image = _random_view(0, width, height)
+    depth = torch.full((height, width), 3.0, dtype=torch.float64)
+    origins = 0.8 * normal(generator(1), 200, 3).double()
+
+    def run(of: object, dtype: torch.dtype) -> Tensor:
+        sums = torch.zeros(200, 8, 8, 8, 5, dtype=dtype)
+        maps = [t.to(dtype) for t in (to_image, depth, weight)]
+        rows, colours = origins.to(dtype), image.to(dtype)
+        of.fuse_depth(sums, rows, 0.05, *maps, 0.4, colours)  # type: ignore[attr-defined]
+        return sums
+
+    expected = run(reference, torch.float64)
+    assert (expected[..., 0] > 0).any()
+    close = torch.isclose(run(native.ops, native.dtype).double(), expected, rtol=1e-3, atol=1e-3)
+    assert close.all(-1).double().mean() > 0.995
+
+
 def test_wrong_input() -> None:
     sums, points, depth = torch.zeros(2, 1, 1, 1, 2), torch.zeros(2, 3), torch.ones(6, 8)
     wrong = {

@@ -16,7 +16,7 @@ from torch.nn.functional import max_pool2d
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.decode import ImageSource
 from snowsplat.data.image_loader import ImageLoader
-from snowsplat.pipeline.confirmed_depth import confirmed_by_photos
+from snowsplat.pipeline.confirmed_depth import confirm_by_photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
@@ -145,7 +145,8 @@ def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
         depth = (0.96 / true_inverse_depth(camera)).to(torch.float32)
         depth[:10], depth[-10:] = 0.0, math.inf
         maps.append(surface_depth.DepthMap(camera, depth, weight))
-    found = confirmed_by_photos(dataset.train, maps, 100.0, lambda *_: None)
+    found, far = list(maps), list(maps)
+    confirm_by_photos(dataset.train, found, 100.0, lambda *_: None)
     for each, camera in zip(found, CAMERAS, strict=True):
         error = (each.depth * true_inverse_depth(camera) - 1.0).abs()
         confirmed = each.weight == 255
@@ -155,7 +156,7 @@ def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
         assert each.depth[-10:].isinf().all()
         assert (each.weight[-10:] == 255).all()
         assert float((each.depth[:10] > 0).float().mean()) > 0.2
-    far = confirmed_by_photos(dataset.train, maps, 1.0, lambda *_: None)
+    confirm_by_photos(dataset.train, far, 1.0, lambda *_: None)
     assert all(torch.equal(a.depth, b.depth) for a, b in zip(far, maps, strict=True))
 
 

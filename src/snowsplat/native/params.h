@@ -253,8 +253,9 @@ struct RasterizeForwardParams {
   SNOW_FIELDS(n, frame, channels, background, image, alpha)
 };
 
-// rasterize_median has the same parameters. The image has the channels of the last splat of each pixel
-// that is blended with T >= 1/2; 0 if there is none. The background is not used.
+// rasterize_median has the same parameters. The image is (2, channels, height, width): the channels of
+// the last splat of each pixel that is blended with T >= 1/2, 0 if there is none; and those of
+// rasterize_fwd without a background.
 
 // rasterize_count: the number of splats that are blended in each pixel.
 template <class T>

@@ -102,18 +102,17 @@ def rasterize_median(splats: Splats2D, width: int, height: int) -> tuple[Tensor,
         raise ValueError(f"rasterize_median: at most {GROUP_CHANNELS} channels, got {channels}")
     columns = _channel_groups(channels, False, packed.device)[0][1]
     frame = _bin_splats(packed, width, height, columns, False, None)
-    planes = [packed.new_empty(channels, height, width) for _ in range(2)]
+    planes = packed.new_empty(2, channels, height, width)
     alpha = packed.new_empty(height, width)
-    for name, image in zip(("rasterize_median", "rasterize_fwd"), planes, strict=True):
-        params = RasterizeForwardParams(
-            n=frame.tiles,
-            frame=frame.params,
-            channels=channels,
-            background=packed.new_zeros(channels),
-            image=image,
-            alpha=alpha,
-        )
-        launch(variant(name, packed), params)
+    params = RasterizeForwardParams(
+        n=frame.tiles,
+        frame=frame.params,
+        channels=channels,
+        background=packed.new_zeros(channels),
+        image=planes,
+        alpha=alpha,
+    )
+    launch(variant("rasterize_median", packed), params)
     return planes[0].permute(1, 2, 0), planes[1].permute(1, 2, 0), alpha
 
 

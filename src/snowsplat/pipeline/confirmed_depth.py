@@ -1,4 +1,4 @@
-"""`confirmed_by_photos`: the depth maps of a scene, corrected where photos confirm another depth.
+"""`confirm_by_photos`: the depth maps of a scene, corrected where photos confirm another depth.
 
 A training makes images like the photos, and many arrangements of Gaussians do. On a wall with
 little texture, they are in front of the wall, because those in front hide those behind. A plane
@@ -27,13 +27,16 @@ from snowsplat.surface.depth import DepthMap
 from snowsplat.surface.volume import Report
 from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.fusion import consistent
-from snowsplat.training.starts.plane_sweep import depth_maps
+from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_maps
 from snowsplat.training.starts.source_views import source_views
+from snowsplat.util.process_memory import return_unused
 
 #: All maps of a sweep together have at most this number of pixels, of nine bytes.
 _MOST_PIXELS = 24_000_000
-#: The sizes of the sweeps. The second one has larger windows, in which faint texture suffices.
-_REDUCTIONS = (1, 2)
+#: Each sweep has half the size of the one before, so larger windows, in which faint texture suffices.
+_SWEEPS = 2
+#: For photos that are decoded ahead; each is used once.
+PHOTO_BYTES = 32 << 20
 #: Each map is checked with those of this number of other views.
 _SOURCES = 4
 #: Points of the scene: with the first number, other views are chosen; with the second, the range
@@ -53,10 +56,10 @@ _UNCONFIRMED = 0.25
 _SMOOTH = 0.01
 
 
-def confirmed_by_photos(
-    views: Sequence[View], maps: Sequence[DepthMap], far: float, report: Report
-) -> list[DepthMap]:
-    """The maps, corrected by the depths that two photos confirm.
+def confirm_by_photos(
+    views: Sequence[View], maps: list[DepthMap], far: float, report: Report
+) -> None:
+    """Replaces maps by maps with the depths that two photos confirm.
 
     Pixels that show no surface, and views that share no surface with others, remain as they are.
 
@@ -70,25 +73,39 @@ def confirmed_by_photos(
     points = _points_of(maps)
     sample = points[:: math.ceil(max(1, len(points)) / _SAMPLE)]
     sources = source_views([view.camera for view in views], sample, _SOURCES)
-    pixels = sum(each.depth.numel() for each in maps)
-    longest = max(max(each.depth.shape) for each in maps)
-    side = min(LONGER_SIDE, int(longest * min(1.0, math.sqrt(_MOST_PIXELS / pixels))))
+    ranges = depth_ranges(views, points)
+    pictures = _pictures(views, report)
+    return_unused()
     found: list[Tensor | None] = [None] * len(maps)  # (h, w) inverse depths; 0: not confirmed
-    with ImageLoader(views) as loader:
-        for number, reduction in enumerate(_REDUCTIONS):
-            report(number, len(_REDUCTIONS), "comparisons of photos")
-            swept = depth_maps(views, sources, loader, points, max(1, side // reduction))
-            for i, known in enumerate(consistent(swept, sources)):
-                each, finer = swept[i], found[i]
-                if each is not None:
-                    inverse = torch.where(known, each.inverse_depth, 0.0)
-                    if finer is not None:
-                        inverse = torch.where(finer > 0, finer, _enlarged(inverse, finer.shape))
-                    found[i] = inverse
-    return [
-        each if inverse is None else _corrected(each, inverse, far)
-        for each, inverse in zip(maps, found, strict=True)
-    ]
+    for number in range(_SWEEPS):
+        report(number, _SWEEPS, "comparisons of photos")
+        swept = swept_maps(pictures, ranges, sources)
+        for i, known in enumerate(consistent(swept, sources)):
+            each, finer = swept[i], found[i]
+            if each is not None:
+                inverse = each.inverse_depth.masked_fill_(~known, 0.0)  # not used again
+                if finer is not None:
+                    inverse = torch.where(finer > 0, finer, _enlarged(inverse, finer.shape))
+                found[i] = inverse
+        del swept
+        pictures = [picture.half for picture in pictures]
+    for i, inverse_depth in enumerate(found):
+        if inverse_depth is not None:
+            maps[i] = _corrected(maps[i], inverse_depth, far)
+
+
+def _pictures(views: Sequence[View], report: Report) -> list[Picture]:
+    """The photos at the size of the first sweep."""
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    longest = max(max(view.camera.width, view.camera.height) for view in views)
+    side = min(LONGER_SIDE, int(longest * min(1.0, math.sqrt(_MOST_PIXELS / pixels))))
+    found = []
+    with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
+        for i, view in enumerate(views):
+            report(i, len(views), "photos")
+            loader.prefetch(views[i : i + 4])
+            found.append(Picture.from_view(view, loader, max(1, side)))
+    return found
 
 
 def _points_of(maps: Sequence[DepthMap]) -> Tensor:

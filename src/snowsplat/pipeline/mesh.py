@@ -14,7 +14,8 @@ from torch import Tensor
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
-from snowsplat.pipeline.confirmed_depth import confirmed_by_photos
+from snowsplat.ops import scratch
+from snowsplat.pipeline.confirmed_depth import PHOTO_BYTES, confirm_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
@@ -28,6 +29,7 @@ from snowsplat.training.starts.photos import reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
 from snowsplat.util.process import single_threaded
+from snowsplat.util.process_memory import return_unused
 
 #: Memory: pixels of all depth maps, with 5 bytes each, and blocks of 512 voxels with 8 bytes each.
 _MOST_PIXELS, _MOST_BLOCKS = 120_000_000, 100_000
@@ -44,6 +46,7 @@ _SAME_PLACE = 2.0
 _TRANSPARENT = 16  # of 255: a pixel of a photo with less alpha shows nothing
 _OPAQUE = (".jpg", ".jpeg")  # other photos can have transparent pixels
 _SAMPLE_VIEWS = 32  # that determine the usual depth
+_SAMPLE_STEP = 3  # of the pixels that determine it
 
 
 @dataclass(frozen=True)
@@ -177,8 +180,11 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
     with single_threaded():
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
+        scratch.release()  # 0.1 GB, which the next stages do not use
+        return_unused()
         with observer.waiting("stereo") as report:
-            maps = confirmed_by_photos(views, maps, far, report)
+            confirm_by_photos(views, maps, far, report)
+        return_unused()
         with observer.waiting("fusion") as report:
             voxel, keys, closer = _voxel(maps, options)
             if not len(keys):
@@ -187,11 +193,13 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
                     "`voxel`"
                 )
             volume = fused(maps, voxel, keys, report)
+        return_unused()
         with observer.waiting("triangles"):
             vertices, faces = zero_level(volume)
             del volume
             found = len(faces)
             vertices, faces = _cleaned(vertices, faces, options)
+        return_unused()
         with observer.waiting("colours") as report:
             photos = _photos(views, maps, scene.gaussians.means.device, report)
             colors = vertex_colors(vertices, faces, photos, _SAME_PLACE * voxel)
@@ -219,7 +227,7 @@ def _depth_maps(
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
         far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
     maps = []
-    with ImageLoader(views) as loader:
+    with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
         for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
             report(i, len(cameras), "photos")
             found = renderer.render(camera, far)
@@ -239,7 +247,8 @@ def _usual_depth(maps: Sequence[DepthMap]) -> float:
     """The median, over views, of the median depth. Raises UserError: no view shows a surface."""
     medians = []
     for each in maps:
-        known = each.depth[each.depth.isfinite() & (each.depth > 0)]
+        sample = each.depth[::_SAMPLE_STEP, ::_SAMPLE_STEP]
+        known = sample[sample.isfinite() & (sample > 0)]
         if len(known):
             medians.append(float(known.median()))
     if not medians:
@@ -298,7 +307,7 @@ def _photos(
     views: Sequence[View], maps: Sequence[DepthMap], device: torch.device, report: Report
 ) -> Iterator[tuple[DepthMap, Tensor, Tensor | None]]:
     """The depth maps with their photos at the same size."""
-    with ImageLoader(views) as loader:
+    with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
         for i, (view, each) in enumerate(zip(views, maps, strict=True)):
             report(i, len(views), "photos")
             loader.prefetch(views[i : i + 4])

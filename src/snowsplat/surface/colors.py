@@ -59,6 +59,7 @@ def _spread(colors: np.ndarray, weight: np.ndarray, faces: np.ndarray) -> np.nda
     """(V, 3) uint8: colours divided by their weight; neighbours' where it is 0."""
     known = weight > 0
     colors = np.where(known[:, None], colors / np.where(known, weight, 1)[:, None], 0)
+    faces = faces[~known[faces].all(1)]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     for _ in range(_ROUNDS):

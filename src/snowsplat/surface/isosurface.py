@@ -11,15 +11,12 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import torch
 
 from snowsplat.surface.volume import SIDE, Volume, block_coordinates, block_keys
 
 _CHUNK = 2048  # blocks at a time
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # (8, 3): z, y, x
-#: The pairs of corners of the twelve edges of a cell.
-_EDGES = np.array(
-    [(a, b) for a in range(8) for b in range(a) if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
-)
 #: Smallest sum of weights of a voxel: that of one view from the front that no other one confirms.
 _LEAST_WEIGHT = 0.25
 
@@ -41,15 +38,19 @@ def zero_level(
         field = _with_borders(volume, own, least_weight)
         with np.errstate(invalid="ignore"):
             negative, known = field < 0, np.isfinite(field)
-        corners = [_shifted(negative, *corner) for corner in _CORNERS]
-        mixed = np.logical_or.reduce(corners) & ~np.logical_and.reduce(corners)
+        mixed, inside = np.zeros((2, len(own), SIDE, SIDE, SIDE), bool)
+        inside[:] = True
+        for corner in _CORNERS:
+            mixed |= _shifted(negative, *corner)
+            inside &= _shifted(negative, *corner)
+        mixed &= ~inside
         for corner in _CORNERS:
             mixed &= _shifted(known, *corner)
         index = np.argwhere(mixed)
         base = SIDE * own[index[:, 0]]  # x, y, z
         corner = base + index[:, :0:-1]
         cells.append(block_keys(corner))
-        places.append((_crossings(field, index) + corner).astype(np.float32))
+        places.append(_crossings(field, index) + corner.astype(np.float32))
         for axis in range(3):
             step = np.eye(3, dtype=int)[2 - axis]
             before, after = _shifted(negative, 0, 0, 0), _shifted(negative, *step)
@@ -74,8 +75,8 @@ def _with_borders(volume: Volume, own: np.ndarray, least_weight: float) -> np.nd
         there = volume.keys[row] == keys
         to = tuple(slice(SIDE, None) if d else slice(0, SIDE) for d in (dz, dy, dx))
         of = tuple(slice(0, 1) if d else slice(None) for d in (dz, dy, dx))
-        source, target = (slice(None), *of), (there.nonzero()[0], *to)
-        sums = volume.sums[row[there]][source].cpu().numpy()
+        target = (there.nonzero()[0], *to)
+        sums = volume.sums[(torch.from_numpy(row[there]), *of)].cpu().numpy()
         weight = sums[..., 0]
         enough = weight >= least_weight
         values = np.where(enough, sums[..., 1] / np.where(enough, weight, 1), np.nan)
@@ -89,15 +90,24 @@ def _shifted(values: np.ndarray, dz: int, dy: int, dx: int) -> np.ndarray:
 
 
 def _crossings(field: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """(K, 3): the mean crossing of the edges of cells (K, 4), x, y, z in voxels from the corner."""
-    block, z, y, x = index.T
-    values = np.stack([field[block, z + dz, y + dy, x + dx] for dz, dy, dx in _CORNERS], 1)
-    a, b = values[:, _EDGES[:, 0]], values[:, _EDGES[:, 1]]
-    crosses = (a < 0) != (b < 0)
-    share = np.where(crosses, a / np.where(crosses, a - b, 1), 0)[..., None]
-    first, second = _CORNERS[_EDGES[:, 0]], _CORNERS[_EDGES[:, 1]]
-    points = np.where(crosses[..., None], first + share * (second - first), 0)
-    return np.asarray((points.sum(1) / crosses.sum(1)[:, None])[:, ::-1])
+    """(K, 3) float32: the mean crossing of the edges of cells (K, 4), x, y, z from the corner."""
+    block, *first = index.T
+    values = {
+        corner: field[(block, *(own + step for own, step in zip(first, corner, strict=True)))]
+        for corner in itertools.product((0, 1), repeat=3)
+    }
+    total, count = np.zeros((3, len(index)), np.float32), np.zeros(len(index), np.float32)
+    for corner, axis in itertools.product(values, range(3)):
+        if corner[axis]:
+            continue  # the edge begins at the other corner
+        a, b = values[corner], values[(*corner[:axis], 1, *corner[axis + 1 :])]
+        crosses = (a < 0) != (b < 0)
+        count += crosses
+        total[axis] += np.where(crosses, a / np.where(crosses, a - b, 1), 0)
+        for other in range(3):
+            if corner[other]:
+                total[other] += crosses
+    return np.asarray((total / count)[::-1].T)
 
 
 def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> np.ndarray:

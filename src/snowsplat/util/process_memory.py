@@ -36,16 +36,20 @@ def peak_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def reset_peak() -> None:
-    """Return unused memory to the system, and reset `peak_bytes` to the resident memory (on Linux).
-
-    The allocator of the C library keeps freed memory. If it were not returned to the system first,
-    memory of an earlier task would count for the next one.
-    """
+def return_unused() -> None:
+    """Return freed memory to the system (on Linux); the allocator of the C library keeps it."""
     gc.collect()
     with suppress(OSError, AttributeError, TypeError):  # another C library
         import ctypes
 
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def reset_peak() -> None:
+    """Return unused memory to the system, and reset `peak_bytes` to the resident memory (on Linux).
+
+    If freed memory were not returned first, that of an earlier task would count for the next one.
+    """
+    return_unused()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")

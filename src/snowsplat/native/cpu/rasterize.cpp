@@ -199,7 +199,8 @@ struct alignas(64) Slot {
 };
 
 // kCount: the value of a pixel is the number of splats that are composited. kMedian: the values are
-// those of the splat at which the transmittance falls below 1/2.
+// those of the splat at which the transmittance falls below 1/2, and after them, those of
+// kFrontToBack without a background.
 enum class Blend { kFrontToBack, kAdditive, kCount, kMedian };
 
 template <class V, int C, Blend kBlend, class T = typename V::Scalar>
@@ -207,17 +208,17 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
                   T* alpha) {
   using TileV = Tile<V>;
   using Bits = typename TileV::Bits;
-  constexpr int B = TileV::kBlocks;
+  constexpr int B = TileV::kBlocks, K = kBlend == Blend::kMedian ? 2 * C : C;
   const TileV tile(index, f.tiles_x, f.width, f.height);
   struct Block {
-    V transmittance, color[C], rest;  // rest: the transmittance of each lane when it was finished
+    V transmittance, color[K], rest;  // rest: the transmittance of each lane when it was finished
   };
   alignas(64) Block block[B];
   Bits open_blocks = 0;  // the bits of the blocks with lanes that are not finished
   for (int b = 0; b < B; b++) {
     const int n = tile.lanes(b);
     block[b].transmittance = block[b].rest = zero_unless(V::first(n), V(1.f));
-    for (int k = 0; k < C; k++) block[b].color[k] = V(0.f);
+    for (int k = 0; k < K; k++) block[b].color[k] = V(0.f);
     if (n) open_blocks |= Bits(1) << b;
   }
   const uint32_t end = f.tile_start[index + 1];
@@ -243,8 +244,8 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
       uint64_t list = lists.list[b];
       if (!list) continue;
       const V X = V::iota() + V(T(b / kTile * V::width));
-      V transmittance = block[b].transmittance, rest = block[b].rest, color[C];
-      for (int k = 0; k < C; k++) color[k] = block[b].color[k];
+      V transmittance = block[b].transmittance, rest = block[b].rest, color[K];
+      for (int k = 0; k < K; k++) color[k] = block[b].color[k];
       while (list) {
         const int j = first_bit(list);
         list &= list - 1;
@@ -274,12 +275,15 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
           color[0] += zero_unless(is_blended(power) & open, V(1.f));
         else if constexpr (kBlend == Blend::kMedian) {
           const auto chosen = is_blended(power) & open & (front >= V(0.5f));
-          for (int k = 0; k < C; k++) color[k] = select(chosen, V(r.color[k]), color[k]);
+          for (int k = 0; k < C; k++) {
+            color[k] = select(chosen, V(r.color[k]), color[k]);
+            color[C + k] += weight * V(r.color[k]);
+          }
         } else
           for (int k = 0; k < C; k++) color[k] += weight * V(r.color[k]);
       }
       block[b].transmittance = transmittance, block[b].rest = rest;
-      for (int k = 0; k < C; k++) block[b].color[k] = color[k];
+      for (int k = 0; k < K; k++) block[b].color[k] = color[k];
     }
   }
   f.tile_end[index] = i < end ? i : end;
@@ -291,9 +295,14 @@ void forward_tile(const Frame<V>& f, int64_t index, int channels, const T* backg
     const V rest = block[b].rest;
 #pragma GCC unroll 4
     for (int k = 0; k < C; k++)
-      if (k < channels)
-        (kBlend == Blend::kMedian ? block[b].color[k] : block[b].color[k] + rest * V(background[k]))
-            .store_first(image + k * plane + at, n);
+      if (k < channels) {
+        if constexpr (kBlend == Blend::kMedian) {
+          block[b].color[k].store_first(image + k * plane + at, n);
+          block[b].color[C + k].store_first(image + (channels + k) * plane + at, n);
+        } else {
+          (block[b].color[k] + rest * V(background[k])).store_first(image + k * plane + at, n);
+        }
+      }
     if (alpha) (V(1.f) - rest).store_first(alpha + at, n);
   }
 }
@@ -463,9 +472,9 @@ int64_t forward(const RasterizeForwardParams<T>& p) {
 template <class V, class T = typename V::Scalar>
 int64_t median(const RasterizeForwardParams<T>& p) {
   const Frame<V> f(p.frame);
-  for_tiles(0, p.n, [&](int64_t t) {
-    forward_tile<V, 4, Blend::kMedian, T>(f, t, int(p.channels), nullptr, p.image, p.alpha);
-  });
+  const auto tile =
+      p.channels <= 3 ? forward_tile<V, 3, Blend::kMedian> : forward_tile<V, 4, Blend::kMedian>;
+  for_tiles(0, p.n, [&](int64_t t) { tile(f, t, int(p.channels), nullptr, p.image, p.alpha); });
   return 0;
 }
 

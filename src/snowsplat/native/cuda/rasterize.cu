@@ -172,7 +172,8 @@ struct ForwardMemory {
 };
 
 // kCount: the value of a pixel is the number of splats that are composited. kMedian: the values are
-// those of the splat at which the transmittance falls below 1/2.
+// those of the splat at which the transmittance falls below 1/2, and after them, those of
+// kFrontToBack without a background.
 enum class Blend { kFrontToBack, kAdditive, kCount, kMedian };
 
 template <int C, Blend kBlend, class T>
@@ -182,7 +183,7 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   const PixelPosition position(int(f.width), int(f.height));
   const int thread = int(threadIdx.x), warp = warp_id(), lane = lane_id();
   Pixel<T> pixel(position);
-  T color[C] = {};
+  T color[kBlend == Blend::kMedian ? 2 * C : C] = {};
   const uint32_t end = f.tile_start[blockIdx.x + 1];
   uint32_t base = f.tile_start[blockIdx.x], visited_end = base;
   bool warp_unfinished = __any_sync(kAllLanes, pixel.unfinished());
@@ -228,10 +229,12 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
                                            color_23.y};
 #pragma unroll
           for (int k = 0; k < C; k++) {
-            if constexpr (kBlend == Blend::kMedian)
+            if constexpr (kBlend == Blend::kMedian) {
               color[k] = blended && front >= T(0.5) ? splat[k] : color[k];
-            else
+              color[C + k] += weight * splat[k];
+            } else {
               color[k] += weight * splat[k];
+            }
           }
         }
       }
@@ -257,11 +260,14 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   const T transmittance = pixel.transmittance();
 #pragma unroll
   for (int k = 0; k < C; k++)
-    if (k < channels)
+    if (k < channels) {
+      if constexpr (kBlend == Blend::kMedian)
+        image[(channels + k) * position.pixel_count + position.index] = color[C + k];
       image[k * position.pixel_count + position.index] =
           kBlend == Blend::kCount || kBlend == Blend::kMedian
               ? color[k]
               : color[k] + transmittance * background[k];
+    }
   if (alpha) alpha[position.index] = T(1) - transmittance;
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -45,46 +46,72 @@ def depth_maps(
 ) -> list[DepthMap | None]:
     """The depth map of each view; None for views without source views or visible points.
 
-    The depth of a pixel is that with the highest mean correlation to the two best source views. A
-    sweep at half the size searches the whole range; a second one refines its result.
+    See `swept_maps`.
 
     Args:
         sources: the source views of each view; see `source_views`.
         points: (P, 3) in the world frame. Those that a view shows determine its range of depths.
         longer_side: the maximum size of the maps, in pixels.
     """
-    return in_threads(
-        lambda i: _depth_map(views[i], [views[j] for j in sources[i]], images, points, longer_side),
-        range(len(sources)),
-    )
+    pictures = in_threads(lambda view: Picture.from_view(view, images, longer_side), views)
+    return swept_maps(pictures, depth_ranges(views, points), sources)
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """A photo at the size of the depth map."""
+class Picture:
+    """A photo at the size of its depth map."""
 
     camera: Camera
-    luminance: Tensor  # (H, W) float32
+    luminance: Tensor  # (H, W) float32, 0 to 1
     usable: Tensor | None  # (H, W) bool: False for masked and transparent pixels
 
     @staticmethod
-    def from_view(view: View, images: Photos, longer_side: int) -> _Picture:
+    def from_view(view: View, images: Photos, longer_side: int) -> Picture:
         photo = photo_for_map(view, images, longer_side)
         luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
         height, width = luminance.shape
-        return _Picture(view.camera.scaled(width, height), luminance, usable_pixels(photo))
+        return Picture(view.camera.scaled(width, height), luminance, usable_pixels(photo))
+
+    @cached_property
+    def half(self) -> Picture:
+        """The picture at half the size."""
+        camera = self.camera.downscaled(2)
+        size = (camera.height, camera.width)
+        luminance, usable = self.luminance, self.usable
+        luminance = interpolate(luminance[None, None], size, mode="area")[0, 0]
+        if usable is not None:
+            usable = interpolate(usable[None, None].float(), size, mode="area")[0, 0] > 0.5
+        return Picture(camera, luminance.contiguous(), usable)
 
 
-def _depth_map(
-    view: View, source_views: list[View], images: Photos, points: Tensor, longer_side: int
-) -> DepthMap | None:
-    span = _inverse_depths(view.camera, points)
-    if span is None or not source_views:
-        return None
-    picture = _Picture.from_view(view, images, longer_side)
-    sources = [_Picture.from_view(source, images, longer_side) for source in source_views]
+def swept_maps(
+    pictures: Sequence[Picture],
+    ranges: Sequence[tuple[float, float] | None],
+    sources: Sequence[Sequence[int]],
+) -> list[DepthMap | None]:
+    """The depth map of each picture; None without source views or a range.
+
+    The depth of a pixel is that with the highest mean correlation to the two best source views. A
+    sweep at half the size searches the whole range; a second one refines its result.
+
+    Args:
+        ranges: the least and the largest inverse depth of each picture; see `depth_ranges`.
+        sources: the source views of each; indices.
+    """
+
+    def swept(i: int) -> DepthMap | None:
+        span, chosen = ranges[i], sources[i]
+        if span is None or not chosen:
+            return None
+        return _swept(pictures[i], [pictures[j] for j in chosen], span)
+
+    return in_threads(swept, range(len(pictures)))
+
+
+def _swept(picture: Picture, sources: list[Picture], span: tuple[float, float]) -> DepthMap:
     low, high = span
-    coarse, fine = _Level(picture, sources, 2), _Level(picture, sources, 1)
+    coarse = _Level(picture.half, [source.half for source in sources])
+    fine = _Level(picture, sources)
     shift = round(coarse.displacement(low, high))
     planes = min(max(shift, _PLANES[0]), _PLANES[1])
     rough, _ = coarse.sweep(low, high, planes)
@@ -97,9 +124,15 @@ def _depth_map(
     return DepthMap(picture.camera, torch.where(known, inverse, 0.0))
 
 
+def depth_ranges(views: Sequence[View], points: Tensor) -> list[tuple[float, float] | None]:
+    """The range of inverse depths of each view, from the points, (P, 3), that it shows; or None."""
+    points = points.to(torch.float64)
+    return [_inverse_depths(view.camera, points) for view in views]
+
+
 def _inverse_depths(camera: Camera, points: Tensor) -> tuple[float, float] | None:
     """The range of inverse depths of the visible points; None if there are too few."""
-    pixel, depth = camera.project(points.to(torch.float64))
+    pixel, depth = camera.project(points)
     inside = (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
     inverse = 1.0 / depth[inside & (depth > 0)]
     if len(inverse) < _FEWEST_POINTS:
@@ -109,14 +142,13 @@ def _inverse_depths(camera: Camera, points: Tensor) -> tuple[float, float] | Non
 
 
 class _Level:
-    """A view and its source views, reduced by a factor, as `ops.plane_sweep` needs them."""
+    """A view and its source views at one size, as `ops.plane_sweep` needs them."""
 
-    def __init__(self, picture: _Picture, sources: list[_Picture], factor: int) -> None:
-        camera, self.image = _reduced(picture, factor)
-        reduced = [_reduced(source, factor) for source in sources]
-        self.sources = _stacked([image for _, image in reduced])
+    def __init__(self, picture: Picture, sources: list[Picture]) -> None:
+        self.image = picture.luminance
+        self.sources = _stacked([source.luminance for source in sources])
         self.source_from_pixel = torch.stack(
-            [_source_from_pixel(camera, source) for source, _ in reduced]
+            [_source_from_pixel(picture.camera, source.camera) for source in sources]
         )
 
     def displacement(self, low: float, high: float) -> float:
@@ -155,15 +187,6 @@ def _stacked(images: list[Tensor]) -> Tensor:
     for row, image in zip(stack, images, strict=True):
         row[: image.shape[0], : image.shape[1]] = image
     return stack
-
-
-def _reduced(picture: _Picture, factor: int) -> tuple[Camera, Tensor]:
-    camera = picture.camera.downscaled(factor)
-    size = (camera.height, camera.width)
-    image = picture.luminance
-    if factor > 1:
-        image = interpolate(image[None, None], size, mode="area")[0, 0]
-    return camera, image.contiguous()
 
 
 def _source_from_pixel(camera: Camera, source: Camera) -> Tensor:
