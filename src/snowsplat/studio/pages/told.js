@@ -93,7 +93,6 @@
     'an edit of the scene is being stored; start again in a moment': '正在保存对场景的编辑，请稍后再开始',
     'the scene is being changed or exported; start again in a moment': '正在改变或导出场景，请稍后再开始',
     'the scene is being changed; remove it in a moment': '正在改变场景，请稍后再删除',
-    '{}: its time is after the year 9999': '{0}：文件的时间晚于公元 9999 年',
     'a film is being rendered; wait until it ends, or stop it': '正在渲染影片，请等待结束，或停止它',
     'the scene was changed in another page; open this page anew': '场景已在另一个页面中改变，请重新打开此页面',
     'this scene is being made already': '这个场景已经在制作中',
