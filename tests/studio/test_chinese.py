@@ -57,6 +57,8 @@ def test_progress_and_verdict():
         *described("scene", {"iteration": 900, "psnr": 28.3}),
         *described("pictures", {}),
         *described("all", {"steps": 90, "photos": 50}),
+        *described("all", {"steps": 90, "photos": 50, "left_out": 2}),
+        *described("all", {"steps": 0, "why_not": "something moves in the photos"}),
         Verdict.of([reason]).lines("The scene")[0],
         *("registered photos", "photos with features", "matched pairs", "verified pairs"),
     ]

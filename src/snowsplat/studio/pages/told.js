@@ -49,8 +49,19 @@
     'COLMAP model {}: # photos to train on, # held out, #x#, # points':
         'COLMAP 模型 {0}：{1} 张照片用于训练，{2} 张留出，{3}×{4}，{5} 个点',
     'computing depth maps for the initialisation': '正在计算初始化所需的深度图',
-    'exposure: photos differ by # EV (standard deviation, from points); one gain for each photo and channel is learnt':
-        '曝光：各张照片相差 {0} EV（标准差，由点估计）；将为每张照片的每个通道学习一个增益',
+    'exposure: {}; {}': '曝光：{0}；{1}',
+    'photos differ by # EV (standard deviation, from {})': '各张照片相差 {0} EV（标准差，由{1}得出）',
+    'photos differ by # EV (standard deviation, from {}), but not by the same in all parts of the scene, as shiny surfaces do':
+        '各张照片相差 {0} EV（标准差，由{1}得出），但在场景各处并不相同，像是反光的表面',
+    'points': '点',
+    'not known, because there are neither points nor EXIF data': '未知，因为既没有点，也没有 EXIF 数据',
+    'one gain for each photo and channel is learnt': '将为每张照片的每个通道学习一个增益',
+    'no gains are learnt': '不学习增益',
+    'no last part with the held-out photos: {}': '最后没有用留出照片再训练：{0}',
+    'something moves in the photos': '照片中有东西在移动',
+    'it would use each photo less than twice': '每张照片用不到两次',
+    '# of # photos (the scene does not explain the other)': '{1} 张照片中的 {0} 张（场景不能解释另一张）',
+    '# of # photos (the scene does not explain the others)': '{1} 张照片中的 {0} 张（场景不能解释其余的）',
     'training on {}; memory: {} at most (# Gaussians {}, images {}, photos {})':
         '训练设备：{0}；内存最多 {1}（{2} 个高斯 {3}，图像 {4}，照片 {5}）',
     'the photos show the sky (#% of them): the training starts with it': '照片拍到了天空（占 {0}%）：训练开始时就加入天空',
@@ -80,6 +91,8 @@
     'the scene is made from {}; add the photos there': '场景由 {0} 制作，请把照片添加到那里',
     'minutes: use a number above 0, at most #': '分钟数：请填写大于 0、不超过 {0} 的数',
     'an edit of the scene is being stored; start again in a moment': '正在保存对场景的编辑，请稍后再开始',
+    'the scene is being changed or exported; start again in a moment': '正在改变或导出场景，请稍后再开始',
+    'the scene is being changed; remove it in a moment': '正在改变场景，请稍后再删除',
     'a film is being rendered; wait until it ends, or stop it': '正在渲染影片，请等待结束，或停止它',
     'the scene was changed in another page; open this page anew': '场景已在另一个页面中改变，请重新打开此页面',
     'this scene is being made already': '这个场景已经在制作中',

@@ -54,6 +54,6 @@ const nameSigns = () => {
     for (const [name, label] of Object.entries(SIGNS)) {
         const button = document.querySelector(`button.sse-${name}`);
         if (button) button.ariaLabel = say(label);
-        button?.querySelector('svg').setAttribute('aria-hidden', 'true');
     }
+    for (const sign of document.querySelectorAll('.sse-viewer svg')) sign.setAttribute('aria-hidden', 'true');
 };
