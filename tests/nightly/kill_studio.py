@@ -2,13 +2,13 @@
 
     PYTHONPATH=src python tests/nightly/kill_studio.py --kills 50 --photos FOLDER
 
-FOLDER has about 20 photos; without it, they are rendered. The real `snowsplat studio` runs in a new
-library: a scene is uploaded, looked at, made, edited, filmed and handed on. In each of these stages,
-a random process (the server, a process of the worker, the browser) gets SIGKILL at a random moment.
-Then the studio is started again, what was interrupted is continued, and everything that was there
-before the kill must be there: photos, finished stages, edits, the film and its plan. At no time do
-two processes make one scene. The last line counts the kills; the exit code is 1 if something was
-lost or done twice.
+FOLDER has about 20 photos; without it, they are rendered. The real `snowsplat studio` runs in a
+new library: a scene is uploaded, looked at, made, edited, filmed and handed on. In each of these
+stages, a random process (the server, a process of the worker, the browser) gets SIGKILL at a
+random moment. Then the studio is started again, what was interrupted is continued, and everything
+that was there before the kill must be there: photos, finished stages, edits, the film and its
+plan. At no time do two processes make one scene. The last line counts the kills; the exit code is
+1 if something was lost or done twice.
 """
 
 from __future__ import annotations
