@@ -50,9 +50,9 @@ _SMOOTH = 0.01
 
 
 def confirm_by_photos(
-    views: Sequence[View], maps: list[DepthMap], far: float, report: Report
+    views: Sequence[View], maps: Sequence[DepthMap], far: float, report: Report
 ) -> None:
-    """Replaces maps by maps with the depths that two photos confirm.
+    """Corrects maps, in place, by the depths that two photos confirm.
 
     Pixels that show no surface, and views that share no surface with others, remain as they are.
 
@@ -84,7 +84,7 @@ def confirm_by_photos(
         pictures = [picture.half for picture in pictures]
     for i, inverse_depth in enumerate(found):
         if inverse_depth is not None:
-            maps[i] = _corrected(maps[i], inverse_depth, far)
+            _correct(maps[i], inverse_depth, far)
 
 
 def _pictures(views: Sequence[View], report: Report) -> list[Picture]:
@@ -119,19 +119,18 @@ def _points_of(maps: Sequence[DepthMap]) -> Tensor:
     return torch.cat(found)
 
 
-def _corrected(each: DepthMap, inverse: Tensor, far: float) -> DepthMap:
-    """The map with the confirmed inverse depths (h, w); 0: not confirmed."""
+def _correct(each: DepthMap, inverse: Tensor, far: float) -> None:
+    """Corrects a map by the confirmed inverse depths (h, w); 0: not confirmed."""
     inverse = _enlarged(inverse, each.depth.shape).to(each.depth.device)
     surface = each.depth.isfinite()
     known = surface & (inverse * far > 1.0)
     swept = 1.0 / inverse
     agree = (each.depth / swept - 1.0).abs() < _AGREE
     swept = torch.where(agree, 0.5 * (swept + each.depth), swept)
-    depth = torch.where(known, swept, each.depth)
     doubtful = (_UNCONFIRMED * each.weight).ceil().to(torch.uint8)
     weight = torch.where(surface, doubtful, each.weight)
-    weight = torch.where(known, each.weight.clamp(min=_CONFIRMED), weight)
-    return DepthMap(each.camera, depth, weight)
+    each.weight.copy_(torch.where(known, each.weight.clamp(min=_CONFIRMED), weight))
+    each.depth.copy_(torch.where(known, swept, each.depth))
 
 
 def _enlarged(inverse: Tensor, size: Sequence[int]) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 
 from snowsplat.surface.volume import SIDE, Volume, block_coordinates, block_keys
 
-_CHUNK = 2048  # blocks at a time
+_CHUNK = 512  # blocks at a time
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # (8, 3): z, y, x
 #: Smallest sum of weights of a voxel: that of one view from the front that no other one confirms.
 _LEAST_WEIGHT = 0.25
@@ -120,7 +120,8 @@ def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> 
     """
     order = np.argsort(cells)
     ordered = cells[order]
-    triangles = [np.zeros((0, 3), np.int32)]
+    faces = np.empty((2 * sum(len(first) for first in edges), 3), np.int32)
+    found = 0
     steps = np.array([1 << 42, 1 << 21, 1])  # of a key, along x, y and z
     for kind, first in enumerate(edges):
         axis, inward = divmod(kind, 2)
@@ -138,5 +139,7 @@ def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> 
         p = vertices[quad]
         across = ((p[:, 0] - p[:, 2]) ** 2).sum(1) <= ((p[:, 1] - p[:, 3]) ** 2).sum(1)
         quad = np.where(across[:, None], quad, np.roll(quad, -1, 1))
-        triangles += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
-    return np.concatenate(triangles)
+        for corners in ([0, 1, 2], [0, 2, 3]):
+            faces[found : found + len(quad)] = quad[:, corners]
+            found += len(quad)
+    return faces[:found]
