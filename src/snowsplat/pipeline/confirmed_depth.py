@@ -29,7 +29,7 @@ from snowsplat.util.process_memory import return_unused
 
 #: All maps of a sweep together have at most this number of pixels, of nine bytes.
 _MOST_PIXELS = 24_000_000
-#: Each sweep has half the size of the one before, so larger windows, in which faint texture suffices.
+#: Each sweep has half the size of the one before, so larger windows: faint texture suffices.
 _SWEEPS = 2
 #: For photos that are decoded ahead; each is used once.
 PHOTO_BYTES = 32 << 20
