@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -144,8 +145,8 @@ def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
     for camera in CAMERAS:
         depth = (0.96 / true_inverse_depth(camera)).to(torch.float32)
         depth[:10], depth[-10:] = 0.0, math.inf
-        maps.append(surface_depth.DepthMap(camera, depth, weight))
-    found, far = list(maps), list(maps)
+        maps.append(surface_depth.DepthMap(camera, depth, weight.clone()))
+    found, far = copy.deepcopy(maps), copy.deepcopy(maps)
     confirm_by_photos(dataset.train, found, 100.0, lambda *_: None)
     for each, camera in zip(found, CAMERAS, strict=True):
         error = (each.depth * true_inverse_depth(camera) - 1.0).abs()

@@ -33,7 +33,7 @@ from snowsplat.util.process_memory import return_unused
 
 #: All maps of a sweep together have at most this number of pixels, of nine bytes.
 _MOST_PIXELS = 24_000_000
-#: Each sweep has half the size of the one before, so larger windows, in which faint texture suffices.
+#: Each sweep has half the size of the one before, so larger windows: faint texture suffices.
 _SWEEPS = 2
 #: For photos that are decoded ahead; each is used once.
 PHOTO_BYTES = 32 << 20
@@ -57,9 +57,9 @@ _SMOOTH = 0.01
 
 
 def confirm_by_photos(
-    views: Sequence[View], maps: list[DepthMap], far: float, report: Report
+    views: Sequence[View], maps: Sequence[DepthMap], far: float, report: Report
 ) -> None:
-    """Replaces maps by maps with the depths that two photos confirm.
+    """Corrects maps, in place, by the depths that two photos confirm.
 
     Pixels that show no surface, and views that share no surface with others, remain as they are.
 
@@ -91,7 +91,7 @@ def confirm_by_photos(
         pictures = [picture.half for picture in pictures]
     for i, inverse_depth in enumerate(found):
         if inverse_depth is not None:
-            maps[i] = _corrected(maps[i], inverse_depth, far)
+            _correct(maps[i], inverse_depth, far)
 
 
 def _pictures(views: Sequence[View], report: Report) -> list[Picture]:
@@ -126,8 +126,8 @@ def _points_of(maps: Sequence[DepthMap]) -> Tensor:
     return torch.cat(found)
 
 
-def _corrected(each: DepthMap, inverse: Tensor, far: float) -> DepthMap:
-    """The map with the confirmed inverse depths (h, w); 0: not confirmed."""
+def _correct(each: DepthMap, inverse: Tensor, far: float) -> None:
+    """Corrects a map by the confirmed inverse depths (h, w); 0: not confirmed."""
     inverse = _enlarged(inverse, each.depth.shape).to(each.depth.device)
     surface = each.depth.isfinite()
     known = surface & (inverse * far > 1.0)
@@ -135,18 +135,17 @@ def _corrected(each: DepthMap, inverse: Tensor, far: float) -> DepthMap:
     agree = (each.depth / swept - 1.0).abs() < _AGREE
     own = each.depth * torch.exp(-_difference(each.depth, swept, known & agree))
     swept = torch.where(agree, 0.5 * (swept + own), swept)
-    depth = torch.where(known, swept, own)
     doubtful = (_UNCONFIRMED * each.weight).ceil().to(torch.uint8)
     weight = torch.where(surface, doubtful, each.weight)
-    weight = torch.where(known, each.weight.clamp(min=_CONFIRMED), weight)
-    return DepthMap(each.camera, depth, weight)
+    each.weight.copy_(torch.where(known, each.weight.clamp(min=_CONFIRMED), weight))
+    each.depth.copy_(torch.where(known, swept, own))
 
 
 def _difference(depth: Tensor, swept: Tensor, agree: Tensor) -> Tensor:
     """(H, W): the logarithm of depth / swept, mean of the pixels around that agree; 0: too few."""
     ratio = torch.where(agree, (depth / swept).log(), 0.0)
     cell = max(1, round(_CELL * max(depth.shape)))
-    grid = [math.ceil(side / cell) for side in depth.shape]
+    grid = math.ceil(depth.shape[0] / cell), math.ceil(depth.shape[1] / cell)
     shares = adaptive_avg_pool2d(torch.stack([agree.to(ratio), ratio])[None], grid)
     share, total = avg_pool2d(shares, 3, stride=1, padding=1)[0]
     mean = torch.where(share >= _FEWEST, total / share, 0.0)

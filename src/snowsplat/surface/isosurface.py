@@ -15,7 +15,7 @@ import torch
 
 from snowsplat.surface.volume import SIDE, Volume, block_coordinates, block_keys
 
-_CHUNK = 2048  # blocks at a time
+_CHUNK, _PARTS = 512, 8  # blocks at a time; parts of the edges of a kind
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # (8, 3): z, y, x
 #: Smallest sum of weights of a voxel: that of one view from the front that no other one confirms.
 _LEAST_WEIGHT = 0.25
@@ -61,8 +61,10 @@ def zero_level(
                 edges[2 * axis + inward].append(block_keys(first))
     if not cells:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
-    vertices = np.concatenate(places)
-    faces = _quads(np.concatenate(cells), [np.concatenate(each) for each in edges], vertices)
+    vertices, keys = np.concatenate(places), np.concatenate(cells)
+    firsts = [np.concatenate(each) for each in edges]
+    del places, cells, edges  # 0.1 GB of a large scene
+    faces = _quads(keys, firsts, vertices)
     return (volume.voxel * vertices).astype(np.float32), faces
 
 
@@ -76,7 +78,8 @@ def _with_borders(volume: Volume, own: np.ndarray, least_weight: float) -> np.nd
         to = tuple(slice(SIDE, None) if d else slice(0, SIDE) for d in (dz, dy, dx))
         of = tuple(slice(0, 1) if d else slice(None) for d in (dz, dy, dx))
         target = (there.nonzero()[0], *to)
-        sums = volume.sums[(torch.from_numpy(row[there]), *of)].cpu().numpy()
+        source = (torch.from_numpy(row[there]), *of)
+        sums = volume.sums[source].cpu().numpy()
         weight = sums[..., 0]
         enough = weight >= least_weight
         values = np.where(enough, sums[..., 1] / np.where(enough, weight, 1), np.nan)
@@ -91,16 +94,16 @@ def _shifted(values: np.ndarray, dz: int, dy: int, dx: int) -> np.ndarray:
 
 def _crossings(field: np.ndarray, index: np.ndarray) -> np.ndarray:
     """(K, 3) float32: the mean crossing of the edges of cells (K, 4), x, y, z from the corner."""
-    block, *first = index.T
+    block, z, y, x = index.T
     values = {
-        corner: field[(block, *(own + step for own, step in zip(first, corner, strict=True)))]
-        for corner in itertools.product((0, 1), repeat=3)
+        (dz, dy, dx): field[block, z + dz, y + dy, x + dx] for dz, dy, dx in _CORNERS.tolist()
     }
     total, count = np.zeros((3, len(index)), np.float32), np.zeros(len(index), np.float32)
     for corner, axis in itertools.product(values, range(3)):
         if corner[axis]:
             continue  # the edge begins at the other corner
-        a, b = values[corner], values[(*corner[:axis], 1, *corner[axis + 1 :])]
+        dz, dy, dx = (step + (other == axis) for other, step in enumerate(corner))
+        a, b = values[corner], values[dz, dy, dx]
         crosses = (a < 0) != (b < 0)
         count += crosses
         total[axis] += np.where(crosses, a / np.where(crosses, a - b, 1), 0)
@@ -120,9 +123,11 @@ def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> 
     """
     order = np.argsort(cells)
     ordered = cells[order]
-    triangles = [np.zeros((0, 3), np.int32)]
+    faces = np.empty((2 * sum(len(first) for first in edges), 3), np.int32)
+    found = 0
     steps = np.array([1 << 42, 1 << 21, 1])  # of a key, along x, y and z
-    for kind, first in enumerate(edges):
+    for kind, part in itertools.product(range(6), range(_PARTS)):
+        first = np.array_split(edges[kind], _PARTS)[part]
         axis, inward = divmod(kind, 2)
         b, c = steps[(axis + 1) % 3], steps[(axis + 2) % 3]
         quad = np.zeros((len(first), 4), np.int32)
@@ -138,5 +143,7 @@ def _quads(cells: np.ndarray, edges: list[np.ndarray], vertices: np.ndarray) -> 
         p = vertices[quad]
         across = ((p[:, 0] - p[:, 2]) ** 2).sum(1) <= ((p[:, 1] - p[:, 3]) ** 2).sum(1)
         quad = np.where(across[:, None], quad, np.roll(quad, -1, 1))
-        triangles += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
-    return np.concatenate(triangles)
+        for corners in ([0, 1, 2], [0, 2, 3]):
+            faces[found : found + len(quad)] = quad[:, corners]
+            found += len(quad)
+    return faces[:found]
