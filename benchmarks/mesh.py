@@ -6,9 +6,10 @@
 The photos are ray traced; poses are exact, points have errors of some millimetres. A point of the
 mesh is accurate if a true surface that a photo shows is within 0.5% of the extent, the longest side
 of the box of the true points; a true point that two photos show is complete if the mesh is within
-the same distance. Rays decide what a photo shows. Only the photos of the training count.
+the same distance. Rays decide what a photo shows.
 Methods: `median`, that of `snowsplat mesh`; `mean`, with the mean depth of each pixel; `reference`,
-the median with the field of the PyTorch reference; `poisson`, Open3D's surface of the points.
+the plain method: depths that no photo confirms, in the field of the PyTorch reference; `poisson`,
+Open3D's surface of the points.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import itertools
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -27,6 +29,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.ops import reference
+from snowsplat.pipeline import mesh as pipeline_mesh
 from snowsplat.pipeline.mesh import MeshOptions, surface_of
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import TrainOptions, train
@@ -34,6 +37,7 @@ from snowsplat.scene.mesh import Mesh
 
 _SAMPLES = 60_000
 _THRESHOLD = 0.005  # of the extent
+_BLOCKS = 2048  # of voxels
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,12 @@ def with_mean(*arguments: object) -> tuple[Tensor, Tensor, Tensor]:
 _MEDIAN = ops.rasterize_median
 
 
+def with_reference(sums: Tensor, origins: Tensor, *arguments: Any) -> None:
+    """`reference.fuse_depth` of some blocks at a time, which needs less memory."""
+    for own, at in zip(sums.split(_BLOCKS), origins.split(_BLOCKS), strict=True):
+        reference.fuse_depth(own, at, *arguments)
+
+
 def made(method: str, scene: TrainedScene) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a method."""
 
@@ -149,7 +159,8 @@ def made(method: str, scene: TrainedScene) -> tuple[np.ndarray, np.ndarray]:
         with patch.object(ops, "rasterize_median", with_mean):
             return ours()
     if method == "reference":
-        with patch.object(ops, "fuse_depth", reference.fuse_depth):
+        plain = patch.object(pipeline_mesh, "confirmed_by_photos", lambda _, maps, *__: maps)
+        with plain, patch.object(ops, "fuse_depth", with_reference):
             return ours()
     return ours()
 

@@ -28,7 +28,6 @@ from snowsplat.synthetic.still_life import still_life
 _POINT_ERROR = 0.004  # metres: of the points of the dataset, as in structure from motion
 _POINTS = 120  # of the dataset, per photo
 _SAME_DEPTH = 0.01  # a photo shows a point if its depth there differs by less than this share
-TEST_EVERY = 8  # every photo with such a number is not for the training
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
@@ -98,39 +97,34 @@ def write_dataset(folder: Path, scene: Procedural, width: int) -> Scene:
 def true_points(
     built: Scene, scene: Procedural, width: int, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Random points (P, 3) on the surfaces that the photos of the training show.
+    """Random points (P, 3) on the surfaces that the photos show.
 
     The first ones are where a camera could show them from within the reach. A photo may show them
     from farther away: a mesh there is right. The second ones are a part of them: a photo shows them
     from within the reach, and another one shows them, too.
     """
     lens = scene.lens(width)
-    poses = [pose for i, pose in enumerate(scene.poses) if i % TEST_EVERY]
-    depths = [depth_map(built, lens, pose) for pose in poses]
+    depths = [depth_map(built, lens, pose) for pose in scene.poses]
     random = np.random.default_rng(1)
     found = []
-    for pose, depth in zip(poses, depths, strict=True):
+    for pose, depth in zip(scene.poses, depths, strict=True):
         rows, columns = np.nonzero(np.isfinite(depth))
         chosen = random.choice(len(rows), min(len(rows), count // len(depths)), replace=False)
         found.append(_points(lens, pose, depth, rows[chosen], columns[chosen]))
     points = np.concatenate(found)
-    inside, near, shown = _views(points, poses, scene.reach, lens, depths)
+    inside, near, shown = _views(points, scene, lens, depths)
     return points[inside > 0], points[(near > 0) & (shown > 1)]
 
 
 def _views(
-    points: np.ndarray,
-    poses: Sequence[Tensor],
-    reach: float,
-    lens: Lens,
-    depths: Sequence[np.ndarray],
+    points: np.ndarray, scene: Procedural, lens: Lens, depths: Sequence[np.ndarray]
 ) -> np.ndarray:
     """(3, P): the photos in whose picture each point is within the reach, hidden or not; those
     that show it from within the reach; and those that show it. Points are in the dataset's frame.
     """
     own = points @ DATASET_FROM_SCENE[:, :3].numpy()  # the inverse rotation
     count = np.zeros((3, len(points)), int)
-    for pose, depth in zip(poses, depths, strict=True):
+    for pose, depth in zip(scene.poses, depths, strict=True):
         camera = own @ pose[:, :3].numpy().T + pose[:, 3].numpy()
         z = np.maximum(camera[:, 2], 1e-6)
         x = (camera[:, 0] / z * lens.focal + lens.width / 2).astype(int)
@@ -138,7 +132,7 @@ def _views(
         inside = (camera[:, 2] > 0.05) & (x >= 0) & (y >= 0) & (x < lens.width) & (y < lens.height)
         seen = depth[y.clip(0, lens.height - 1), x.clip(0, lens.width - 1)]
         shown = inside & (np.abs(seen / z - 1) < _SAME_DEPTH)
-        near = z < reach
+        near = z < scene.reach
         count += np.stack([inside & near, shown & near, shown])
     return count
 

@@ -164,12 +164,12 @@ def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
 def test_depths_next_to_confirmed_ones_lose_the_same_error(dataset: Dataset) -> None:
     weight = torch.full((HEIGHT, WIDTH), 255, dtype=torch.uint8)
     maps = [
-        surface_depth.DepthMap(camera, (1.02 / true_inverse_depth(camera)).float(), weight)
+        surface_depth.DepthMap(camera, (1.02 / true_inverse_depth(camera)).float(), weight.clone())
         for camera in CAMERAS
     ]
-    found = confirmed_by_photos(dataset.train, maps, 100.0, lambda *_: None)
+    confirm_by_photos(dataset.train, maps, 100.0, lambda *_: None)
     errors = []
-    for each, camera in zip(found, CAMERAS, strict=True):
+    for each, camera in zip(maps, CAMERAS, strict=True):
         confirmed = each.weight == 255
         near = max_pool2d(confirmed.float()[None], 3, 1, 1)[0] > 0
         error = (each.depth * true_inverse_depth(camera) - 1.0).abs()

@@ -144,8 +144,9 @@ def _correct(each: DepthMap, inverse: Tensor, far: float) -> None:
 def _difference(depth: Tensor, swept: Tensor, agree: Tensor) -> Tensor:
     """(H, W): the logarithm of depth / swept, mean of the pixels around that agree; 0: too few."""
     ratio = torch.where(agree, (depth / swept).log(), 0.0)
-    cell = max(1, round(_CELL * max(depth.shape)))
-    grid = math.ceil(depth.shape[0] / cell), math.ceil(depth.shape[1] / cell)
+    height, width = depth.shape
+    cell = max(1, round(_CELL * max(height, width)))
+    grid = math.ceil(height / cell), math.ceil(width / cell)
     shares = adaptive_avg_pool2d(torch.stack([agree.to(ratio), ratio])[None], grid)
     share, total = avg_pool2d(shares, 3, stride=1, padding=1)[0]
     mean = torch.where(share >= _FEWEST, total / share, 0.0)

@@ -20,8 +20,8 @@ _SAMPLE = 1000
 #: The maximum number of pixels of all depth maps. If there are more, one view in two, in three … is
 #: used: the photos of a large dataset overlap more, and this limits time and memory.
 _MAX_PIXELS = 16_000_000
-#: Depth maps may have one pixel per this number of bytes of the memory for photos: 4 for the depth, 5
-#: for the brightness, and masks.
+#: Depth maps may have one pixel per this number of bytes of the memory for photos: 4 for the depth,
+#: 5 for the brightness, and masks.
 _BYTES_PER_PIXEL = 12
 
 
