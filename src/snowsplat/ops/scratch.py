@@ -94,13 +94,6 @@ def empty(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device | Non
     return torch.from_numpy(array).view(dtype).view(shape)
 
 
-def release() -> None:
-    """Return the memory of the pool to the system, as soon as no tensor uses it."""
-    global _pool
-    with _lock:
-        _pool = None
-
-
 def empty_like(tensor: Tensor) -> Tensor:
     """`empty` with the shape, dtype and device of a tensor, which need not be contiguous."""
     return empty(tuple(tensor.shape), tensor.dtype, tensor.device)

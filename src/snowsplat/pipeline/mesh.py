@@ -14,7 +14,6 @@ from torch import Tensor
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
-from snowsplat.ops import scratch
 from snowsplat.pipeline.confirmed_depth import PHOTO_BYTES, confirm_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import TrainedScene
@@ -180,8 +179,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
     with single_threaded():
         with observer.waiting("depth") as report:
             maps, far = _depth_maps(scene, views, options, report)
-        scratch.release()  # 0.1 GB, which the next stages do not use
-        return_unused()
+        return_unused()  # temporary tensors of the photos; here and after the next stages
         with observer.waiting("stereo") as report:
             confirm_by_photos(views, maps, far, report)
         return_unused()
