@@ -2,6 +2,9 @@
 
 import itertools
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import av
@@ -66,6 +69,37 @@ def test_quality_is_that_of_h264_at_crf_18(tmp_path):
     """x264 writes its settings into the stream."""
     write(tmp_path / "a.mp4")
     assert b"crf=18.0" in (tmp_path / "a.mp4").read_bytes()
+
+
+_PROGRAM = """
+import os, sys
+from pathlib import Path
+import numpy as np
+from snowsplat.trajectory.video_file import video_writer
+
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, list(os.sched_getaffinity(0))[: int(sys.argv[2])])
+blocks = np.random.default_rng(0).integers(0, 255, (26, 48, 3), np.uint8)
+wall = np.kron(blocks, np.ones((8, 8, 1), np.uint8))
+with video_writer(Path(sys.argv[1]), 304, 208, 30) as add:
+    for i in range(8):
+        add(np.ascontiguousarray(wall[:, 3 * i : 3 * i + 304]))
+"""
+
+
+@pytest.mark.slow
+def test_the_bytes_depend_neither_on_the_content_of_unused_memory_nor_on_processors(tmp_path):
+    """glibc fills memory with the complement of MALLOC_PERTURB_ before a program gets it."""
+    videos = []
+    for fill, processors in ("0", "1"), ("85", "2"):
+        file = tmp_path / f"{fill}.mp4"
+        subprocess.run(
+            [sys.executable, "-c", _PROGRAM, str(file), processors],
+            env={**os.environ, "MALLOC_PERTURB_": fill},
+            check=True,
+        )
+        videos.append(file.read_bytes())
+    assert videos[0] == videos[1]
 
 
 def test_other_encoders_get_a_bit_rate(tmp_path, monkeypatch):

@@ -12,12 +12,16 @@ import numpy as np
 from snowsplat.trajectory.spherical_metadata import mark_as_spherical
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
+from snowsplat.util.native_library import available_isas
 
 # Encoders in the order of preference. The first one that this build of FFmpeg contains is used. The
 # first two write H.264, which all players support.
 _ENCODERS = ("libx264", "libopenh264", "mpeg4")
 # Quality of libx264. The compression is hardly visible.
 _CRF = "18"
+# The number of frames that are encoded at the same time. The bytes of a file depend on it, so it is
+# not the number of processors.
+_THREADS = 4
 # Bit rate of the other encoders, which have no such quality setting.
 _BITS_PER_PIXEL = 0.25
 # FFmpeg's number for the primaries, the transfer curve and the colour matrix of HD video.
@@ -36,8 +40,9 @@ def video_writer(
             add(pixels)
 
     The file appears under its name when the block ends. If the block raises (also on Ctrl-C), an
-    existing file stays unchanged. Memory does not grow with the number of frames. The index is at
-    the start of the file, so that browsers can play it while loading it.
+    existing file stays unchanged. The same frames give the same bytes. Memory does not grow with
+    the number of frames. The index is at the start of the file, so that browsers can play it while
+    loading it.
 
     Args:
         path: the mp4 file, in an existing folder.
@@ -85,8 +90,14 @@ def video_writer(
                 codec = stream.codec_context
                 codec.color_primaries = codec.color_trc = codec.colorspace = _BT709
                 codec.color_range = _LIMITED_RANGE
+                codec.thread_count, codec.thread_type = _THREADS, "FRAME"
                 if encoder == "libx264":
-                    stream.options = {"crf": _CRF}
+                    options = {"crf": _CRF}
+                    if "avx512" in available_isas():
+                        # The AVX-512 code of x264 (mb-tree) reads memory that was never written if
+                        # the width is not a multiple of 128 pixels.
+                        options["x264-params"] = "asm=AVX2"
+                    stream.options = options
                 else:
                     stream.bit_rate = round(_BITS_PER_PIXEL * width * height * rate)
                 yield add

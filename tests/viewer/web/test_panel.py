@@ -220,6 +220,18 @@ def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
 
 
 @pytest.mark.browser
+def test_a_browser_without_webgl_is_told_so(file):
+    with Browser(600, 400, 0.25, frames=5.0) as browser:
+        page = browser.open("about:blank")
+        none = "HTMLCanvasElement.prototype.getContext = () => null"
+        page.call("Page.addScriptToEvaluateOnNewDocument", source=none)
+        page.navigate(f"{file.as_uri()}?webgl")
+        told = page.wait_for("document.querySelector('.sse-loadingText')?.textContent")
+        assert told.startswith("This browser has no WebGL 2")
+        assert any("WebGL not supported" in error for error in page.errors)
+
+
+@pytest.mark.browser
 def test_a_click_on_every_control(file):
     """Leaves no error in the console. The film is the last one; dragging ends it in orbit."""
     with opened(file, 600, 400) as page:

@@ -67,6 +67,15 @@ const linkedHiding = () => {
     return numbers?.length === 2 && numbers.every((x) => x >= 0 && x <= 100) ? numbers : undefined;
 };
 
+// The viewer itself would show its empty loading bar forever.
+const explainFailure = (error) => {
+    const canDraw = document.createElement('canvas').getContext('webgl2');
+    document.querySelector('.sse-loadingText').textContent = canDraw
+        ? error.message
+        : say('This browser has no WebGL 2, so it cannot draw the scene. Use another browser, or switch on hardware acceleration.');
+    throw error;
+};
+
 settings.cameras[0].initial = addView(linkedView() ?? start);
 createViewer({ container: document.body, settings, ...options }).then((viewer) => {
     window.sse.viewer = viewer;
@@ -218,4 +227,4 @@ createViewer({ container: document.body, settings, ...options }).then((viewer) =
     document.querySelector('.sse-viewer').append(panel);
     // The studio adds its tools.
     window.sse.tools?.({ viewer, scene, camera, canvas, hiding, panel, presentView, flyTo });
-});
+}, explainFailure);
