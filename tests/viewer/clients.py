@@ -73,7 +73,7 @@ class Visitor:
         """``options``: those of `websockets.sync.client.connect`."""
         options = {"open_timeout": 20, "close_timeout": 2, "max_size": None, **options}
         address = url.replace("http://", "ws://") + "live"
-        self.socket: ClientConnection = connect(address, compression=None, **options)
+        self.socket: ClientConnection = connect(address, compression=None, **options).__enter__()
         self.told: dict[str, dict[str, Any]] = {}
         self.keys: list[dict[str, Any]] = []
         self.thumbnails: set[int] = set()

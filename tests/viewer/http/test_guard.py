@@ -77,7 +77,7 @@ def put(server: WebServer, name: str, body: bytes) -> tuple[int, bytes]:
 
 
 def websocket(server: WebServer, name: str, **options):
-    return connect(server.url.replace("http", "ws") + name, **options)
+    return connect(server.url.replace("http", "ws") + name, **options).__enter__()
 
 
 def test_bodies(server):
