@@ -1,5 +1,6 @@
 """An edit whose process was killed: nothing of it is half done, and two never work at once."""
 
+import os
 import threading
 from dataclasses import asdict
 
@@ -10,6 +11,7 @@ from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.studio import changes
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import locked, one_run
 from snowsplat.util.safe_json import from_json, read_json
@@ -62,6 +64,31 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
         keys = from_json(PageFilm, read_json(finished.plan)).keys
         assert np.allclose(keys[1][:3], [2, 0, -18] if is_edited else [1, 0, -9])
         changes.show_scene(finished)
+    assert not finished.begun.exists()
+
+
+def test_a_failed_edit_leaves_nothing(studio, finished):
+    """Neither its title nor the film of that time appear when the scene is made again."""
+    write_json(finished.plan, asdict(PageFilm(KEYS)))
+    write_json(finished.edits, edit_of(~NOTHING, title="Nothing", scale=2.0))
+    with pytest.raises(UserError, match="nothing would be left"):
+        changes.edit_scene(finished, finished.version(), undo=False)
+    file = finished.scene_file()
+    os.utime(file, ns=(1, file.stat().st_mtime_ns + 1))
+    write_json(finished.plan, asdict(PageFilm(KEYS[::-1])))
+    changes.show_scene(finished)
+    assert finished.job.title == "Box"
+    assert from_json(PageFilm, read_json(finished.plan)).keys == KEYS[::-1]
+
+
+def test_a_new_title_is_newer_than_that_of_a_killed_edit(finished, monkeypatch):
+    write_json(finished.edits, edit_of(np.arange(N) < 20, title="Half"))
+    with monkeypatch.context() as patch:
+        patch.setattr(changes, "show_scene", lambda scene: {})  # the process is killed before it
+        changes.edit_scene(finished, finished.version(), undo=False)
+    assert finished.begun.exists()
+    changes.rename(finished, "Whole")
+    assert finished.job.title == "Whole"
     assert not finished.begun.exists()
 
 
