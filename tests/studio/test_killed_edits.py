@@ -10,7 +10,7 @@ import pytest
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.studio import changes
+from snowsplat.studio import changes, job
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import locked, one_run
@@ -134,3 +134,16 @@ def test_a_file_is_that_of_the_scene_as_it_is(studio, finished):
     file.write_bytes((finished.made / "box.ply").read_bytes())
     assert studio.ask(address, "POST", {})[0] == 200
     assert len(read_gaussians(file)) == N - 20
+
+
+def test_a_folder_to_look_at(studio, finished, monkeypatch):
+    """The site is not that of the scene, as after an update, and cannot be written anew: it is
+    shown, and files that are there are sent."""
+    address = f"scenes/{finished.name}"
+    assert studio.ask(f"{address}/exports/ply", "POST", {})[0] == 200
+    finished.change(title="Box ")
+    assert studio.ask(address)[1]["status"] == "opening"
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    assert studio.ask(address)[1]["status"] == "done"
+    monkeypatch.setattr(job, "work", None)
+    assert studio.ask(f"{address}/exports/ply", "POST", {}) == (200, {"file": "Box.ply"})

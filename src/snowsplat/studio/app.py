@@ -57,6 +57,7 @@ from snowsplat.studio.hand_on import (
     export_command,
     export_file,
     film_command,
+    is_exported,
     make_command,
 )
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
@@ -325,6 +326,8 @@ class _Studio:
     async def _export(self, request: Request, scene: Scene) -> Any:
         kind = _kind(request)
         async with self._locks["", "export"], self._locks[scene.name, "edit"]:
+            if is_exported(scene, kind):  # needs no process, and no folder that can be written
+                return {"file": export_file(scene, kind).name}
             return await asyncio.to_thread(job.work, "export", scene.folder, kind)
 
     async def _exported(self, request: Request, scene: Scene) -> Any:
@@ -474,7 +477,8 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
     """One of new, running, done, stopped, failed or, if the process was killed, interrupted.
 
     A scene of the command line is "found" until its site was written; any other one is "opening"
-    if the process that has changed it was killed before it has written the site.
+    if the process that has changed it was killed before it has written the site. In a folder that
+    cannot be written, the site remains as it is.
     """
     if scene.found:
         return "done" if scene.is_shown() else "found"
@@ -484,7 +488,7 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
         return "new"
     status = str(state.get("outcome", "interrupted"))
     behind = status == "done" and not scene.is_shown() and not is_locked(scene.edit_lock)
-    return "opening" if behind else status
+    return "opening" if behind and os.access(scene.kept, os.W_OK) else status
 
 
 def _edited(scene: Scene) -> float:

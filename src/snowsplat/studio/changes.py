@@ -23,7 +23,7 @@ from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.sfm.dataset_report import REPORT
-from snowsplat.studio.hand_on import export_file
+from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import Scene, safe_title
 from snowsplat.util.errors import UserError
@@ -54,7 +54,7 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
     file, target = finished(scene), export_file(scene, kind)
     # It gets the time of the scene that is read, which may be replaced meanwhile.
     time = file.stat().st_mtime_ns
-    if not target.is_file() or target.stat().st_mtime_ns != time:
+    if not is_exported(scene, kind):
         target.parent.mkdir(exist_ok=True)
         if kind == "zip":
             if not scene.is_shown():

@@ -68,7 +68,8 @@ def stop(scene: Scene, task: str = "make") -> None:
     elif other.host == socket.gethostname():
         os.kill(other.process, signal.SIGTERM)
     else:
-        raise UserError(f"this scene is being made on {other.host or 'another computer'}")
+        where = other.host or "another computer"
+        raise UserError(f"this scene is being made on {where}; stop it there")
 
 
 def work(*words: str | Path) -> dict[str, Any]:

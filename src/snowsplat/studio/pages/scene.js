@@ -101,9 +101,12 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     }
 
     /** A scene of the command line has no site yet; that of another one is not written. */
-    function openingPart() {
+    function openingPart(/** @type {any} */ scene) {
         const line = make("p", { role: "status" }, say("opening"));
-        const tell = (/** @type {any} */ error) => (line.textContent = error instanceof Refused ? error.message : say("offline"));
+        const tell = (/** @type {any} */ error) => {
+            line.textContent = error instanceof Refused ? error.message : say("offline");
+            body.append(keptPart(scene)); // a scene that cannot be opened can be removed
+        };
         ask(`${address}/open`, "POST", {}).then(refresh, tell);
         return [make("section.card", {}, line)];
     }
