@@ -115,6 +115,8 @@ def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
     else:
         try:
             has_levels = not (scene.site / SITE_SCENE).is_file()
+            if has_levels:
+                show_whole(scene)  # it is gone if the scene was renamed meanwhile
             edit(file, scene.whole if has_levels else scene.site, changes)
         except OtherScene as error:
             show_scene(scene)
