@@ -40,8 +40,8 @@ export class Refused extends Error {
     }
 }
 
-/** Why a request failed, for people. */
-export const reasonOf = (/** @type {unknown} */ error) => (error instanceof Refused ? error.message : say("offline"));
+/** Why a request failed, for people. `away` is the text if there was no answer. */
+export const reasonOf = (/** @type {unknown} */ error, away = "no_answer") => (error instanceof Refused ? error.message : say(away));
 
 /**
  * The JSON answer of the server.

@@ -54,7 +54,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         } catch (error) {
             if (closed.aborted) return;
             away = true;
-            notice(reasonOf(error));
+            notice(reasonOf(error, "offline"));
             wait = 3000;
         }
         timer = setTimeout(refresh, wait);
