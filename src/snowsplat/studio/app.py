@@ -195,7 +195,9 @@ class _Studio:
         return _listing(Path(os.path.expanduser(path)))
 
     async def _scenes(self, request: Request) -> Any:
-        return [_summary(scene) for scene in self._library.scenes()]
+        # A lock of another computer takes seconds to judge.
+        scenes = self._library.scenes()
+        return await asyncio.to_thread(lambda: [_summary(scene) for scene in scenes])
 
     async def _new(self, request: Request) -> Any:
         wanted = await _object(request)
@@ -208,26 +210,7 @@ class _Studio:
         return {"name": self._library.new(title, inputs).name}
 
     async def _scene(self, request: Request, scene: Scene) -> Any:
-        state, made = scene.state(), scene.job
-        has_page = state.pop("page", None) is not None  # its address is a secret of the job
-        state.pop("placed", None)  # `_photos` tells it
-        return {
-            "name": scene.name,
-            "title": made.title,
-            "folder": str(scene.folder),
-            "found": scene.found,
-            "inputs": made.inputs,
-            "quality": made.quality,
-            "minutes": made.minutes,
-            "status": _status(scene, state),
-            "state": state,
-            "has_page": has_page,
-            "edited": _edited(scene),
-            "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
-            "map": scene.map.stat().st_mtime if is_file(scene.map) else 0,
-            "command": make_command(scene, made),
-            "exports": {kind: export_command(scene, kind) for kind in FORMATS},
-        }
+        return await asyncio.to_thread(_details, scene)
 
     async def _remove(self, request: Request, scene: Scene) -> Any:
         if job.is_being_made(scene) or job.is_running(scene, "film"):
@@ -471,6 +454,30 @@ def _summary(scene: Scene) -> dict[str, Any]:
     except UserError:
         about = {"title": scene.name, "created": "", "status": "failed"}
     return {"name": scene.name, "picture": _picture_of(scene) is not None, **about}
+
+
+def _details(scene: Scene) -> dict[str, Any]:
+    """A scene for its own page."""
+    state, made = scene.state(), scene.job
+    has_page = state.pop("page", None) is not None  # its address is a secret of the job
+    state.pop("placed", None)  # `_photos` tells it
+    return {
+        "name": scene.name,
+        "title": made.title,
+        "folder": str(scene.folder),
+        "found": scene.found,
+        "inputs": made.inputs,
+        "quality": made.quality,
+        "minutes": made.minutes,
+        "status": _status(scene, state),
+        "state": state,
+        "has_page": has_page,
+        "edited": _edited(scene),
+        "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
+        "map": scene.map.stat().st_mtime if is_file(scene.map) else 0,
+        "command": make_command(scene, made),
+        "exports": {kind: export_command(scene, kind) for kind in FORMATS},
+    }
 
 
 def _status(scene: Scene, state: dict[str, Any]) -> str:
