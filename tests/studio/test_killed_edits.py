@@ -2,6 +2,7 @@
 
 import os
 import threading
+import zipfile
 from dataclasses import asdict
 
 import numpy as np
@@ -134,6 +135,15 @@ def test_a_file_is_that_of_the_scene_as_it_is(studio, finished):
     file.write_bytes((finished.made / "box.ply").read_bytes())
     assert studio.ask(address, "POST", {})[0] == 200
     assert len(read_gaussians(file)) == N - 20
+
+
+def test_a_web_site_is_that_of_the_scene_as_it_is(studio, finished):
+    """Here, the site was not written since the scene got its title."""
+    finished.change(title="New")
+    address = f"scenes/{finished.name}/exports/zip"
+    assert studio.ask(address, "POST", {}) == (200, {"file": "New.zip"})
+    with zipfile.ZipFile(finished.exports / "New.zip") as archive:
+        assert b"<title>New</title>" in archive.read("index.html")
 
 
 def test_a_folder_to_look_at(studio, finished, monkeypatch):

@@ -55,10 +55,10 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
     # It gets the time of the scene that is read, which may be replaced meanwhile.
     time = file.stat().st_mtime_ns
     if not is_exported(scene, kind):
+        if kind == "zip" and not scene.is_shown():
+            show_scene(scene)  # removes the other files
         target.parent.mkdir(exist_ok=True)
         if kind == "zip":
-            if not scene.is_shown():
-                show_scene(scene)
             with atomic_path(target) as temporary:
                 archive = shutil.make_archive(str(temporary), "zip", scene.site)
                 os.replace(archive, temporary)
