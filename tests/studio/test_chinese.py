@@ -111,7 +111,7 @@ def test_errors(tmp_path):
         f"no such film is possible: {error_of(lambda: PageFilm([]))}",
         *(
             message_of(OSError(number, os.strerror(number), "/full"))
-            for number in (errno.ENOSPC, errno.EACCES)
+            for number in (errno.ENOSPC, errno.EACCES, errno.EROFS)
         ),
     ]
     chinese = translated(errors)

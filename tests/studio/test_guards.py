@@ -67,6 +67,8 @@ def test_levels_of_detail_are_edited_in_a_page_of_their_own(studio, finished, mo
     assert studio.ask(f"{address}/whole", "POST", {}) == (200, {})
     assert (finished.whole / "index.html").stat().st_mtime_ns == written  # it was there
     left = shown.means[:, 0] > 0
+    # In another window; the open page can still be saved.
+    assert studio.ask(f"{address}/rename", "POST", {"title": "Larger"})[0] == 200
     assert studio.ask(f"{address}/edit", "POST", edit_of(left))[0] == 200
     kept = read_gaussians(finished.scene_file())
     assert (len(kept), kept.sh_rest.shape[1]) == (N - left.sum(), 3)

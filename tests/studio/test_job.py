@@ -80,7 +80,7 @@ def test_a_job_of_another_computer_is_not_stopped(library, holder):
     started = job._started.pop(scene.lock())
     # The file of the lock is what tells.
     scene.lock().write_text(json.dumps({"host": "elsewhere", "process": os.getpid()}))
-    with pytest.raises(UserError, match="is being made on elsewhere"):
+    with pytest.raises(UserError, match="is being made on elsewhere; stop it there"):
         job.stop(scene)
     os.kill(process, signal.SIGKILL)
     started.wait()

@@ -1,6 +1,8 @@
 """An edit whose process was killed: nothing of it is half done, and two never work at once."""
 
+import os
 import threading
+import zipfile
 from dataclasses import asdict
 
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.studio import changes
+from snowsplat.studio import changes, job
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import locked, one_run
 from snowsplat.util.safe_json import from_json, read_json
@@ -65,6 +68,31 @@ def test_what_is_left_of_an_edit_is_done(studio, finished, monkeypatch, before):
     assert not finished.begun.exists()
 
 
+def test_a_failed_edit_leaves_nothing(studio, finished):
+    """Neither its title nor the film of that time appear when the scene is made again."""
+    write_json(finished.plan, asdict(PageFilm(KEYS)))
+    write_json(finished.edits, edit_of(~NOTHING, title="Nothing", scale=2.0))
+    with pytest.raises(UserError, match="nothing would be left"):
+        changes.edit_scene(finished, finished.version(), undo=False)
+    file = finished.scene_file()
+    os.utime(file, ns=(1, file.stat().st_mtime_ns + 1))
+    write_json(finished.plan, asdict(PageFilm(KEYS[::-1])))
+    changes.show_scene(finished)
+    assert finished.job.title == "Box"
+    assert from_json(PageFilm, read_json(finished.plan)).keys == KEYS[::-1]
+
+
+def test_a_new_title_is_newer_than_that_of_a_killed_edit(finished, monkeypatch):
+    write_json(finished.edits, edit_of(np.arange(N) < 20, title="Half"))
+    with monkeypatch.context() as patch:
+        patch.setattr(changes, "show_scene", lambda scene: {})  # the process is killed before it
+        changes.edit_scene(finished, finished.version(), undo=False)
+    assert finished.begun.exists()
+    changes.rename(finished, "Whole")
+    assert finished.job.title == "Whole"
+    assert not finished.begun.exists()
+
+
 def test_an_edit_waits_for_one_of_a_studio_that_was_killed(studio, finished):
     address = f"scenes/{finished.name}"
     answers = []
@@ -107,3 +135,25 @@ def test_a_file_is_that_of_the_scene_as_it_is(studio, finished):
     file.write_bytes((finished.made / "box.ply").read_bytes())
     assert studio.ask(address, "POST", {})[0] == 200
     assert len(read_gaussians(file)) == N - 20
+
+
+def test_a_web_site_is_that_of_the_scene_as_it_is(studio, finished):
+    """Here, the site was not written since the scene got its title."""
+    finished.change(title="New")
+    address = f"scenes/{finished.name}/exports/zip"
+    assert studio.ask(address, "POST", {}) == (200, {"file": "New.zip"})
+    with zipfile.ZipFile(finished.exports / "New.zip") as archive:
+        assert b"<title>New</title>" in archive.read("index.html")
+
+
+def test_a_folder_to_look_at(studio, finished, monkeypatch):
+    """The site is not that of the scene, as after an update, and cannot be written anew: it is
+    shown, and files that are there are sent."""
+    address = f"scenes/{finished.name}"
+    assert studio.ask(f"{address}/exports/ply", "POST", {})[0] == 200
+    finished.change(title="Box ")
+    assert studio.ask(address)[1]["status"] == "opening"
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    assert studio.ask(address)[1]["status"] == "done"
+    monkeypatch.setattr(job, "work", None)
+    assert studio.ask(f"{address}/exports/ply", "POST", {}) == (200, {"file": "Box.ply"})

@@ -1,6 +1,8 @@
 """One studio per library."""
 
 import os
+import socket
+import threading
 
 import pytest
 
@@ -48,7 +50,32 @@ def test_requests_to_this_computer_go_past_proxies(studio, monkeypatch):
     address = Address(url, "127.0.0.1", studio.server.port, token, [])
     assert address.answers(studio.library.folder)
     assert not address.answers(studio.library.folder.parent)
-    write_address(studio.library.folder, address)
-    with pytest.raises(Running) as running, only_studio(studio.library.folder):
-        pass
+    with only_studio(studio.library.folder):
+        write_address(studio.library.folder, address)
+        with pytest.raises(Running) as running, only_studio(studio.library.folder):
+            pass
     assert running.value.address == address
+
+
+def test_another_program_at_the_port_of_one_that_was_killed(tmp_path):
+    """It does not get the token; and what is no answer is not that of a studio."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        address = Address(f"http://127.0.0.1:{port}/x/", "127.0.0.1", port, "x", [])
+        write_address(tmp_path, address)
+        with only_studio(tmp_path) as killed:
+            assert killed == address
+        other.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            other.accept()
+        other.setblocking(True)
+
+        def answer():
+            with other.accept()[0] as asked:
+                asked.recv(1000)
+                asked.sendall(b"SSH-2.0-OpenSSH\r\n")
+
+        answering = threading.Thread(target=answer)
+        answering.start()
+        assert not address.answers(tmp_path)
+        answering.join()

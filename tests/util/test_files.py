@@ -47,6 +47,16 @@ def test_files_have_the_default_permissions(tmp_path):
     assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o644
 
 
+def test_a_private_file_is_not_one_that_another_user_has_prepared(tmp_path):
+    prepared = tmp_path / ".secret.tmp"
+    prepared.touch(mode=0o666)
+    with atomic_path(tmp_path / "secret", private=True) as temporary:
+        temporary.write_text("secret")
+    assert (tmp_path / "secret").read_text() == "secret"
+    assert (tmp_path / "secret").stat().st_mode & 0o77 == 0
+    assert prepared.read_text() == ""
+
+
 def test_json_has_null_for_infinity_and_nan(tmp_path):
     write_json(tmp_path / "a.json", {"a": [math.inf, (math.nan, 1.5)]})
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, [None, 1.5]]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import socket
@@ -14,7 +15,7 @@ import pytest
 
 from snowsplat.util import run_lock
 from snowsplat.util.errors import UserError
-from snowsplat.util.run_lock import LOCK, InUse, locked, one_run
+from snowsplat.util.run_lock import LOCK, InUse, is_locked, locked, one_run
 
 _HOLD = """
 import sys, time
@@ -55,6 +56,27 @@ def test_a_killed_process_leaves_no_lock(tmp_path):
         holder.kill()
         with one_run(tmp_path):
             assert json.loads((tmp_path / LOCK).read_text("utf-8"))["process"] == os.getpid()
+
+
+def test_a_lock_in_a_folder_to_look_at(tmp_path, monkeypatch):
+    """As on a disk that is mounted to read only, or of another user."""
+    lock = tmp_path / LOCK
+    opened = os.open
+
+    def refuse(path, flags, *more):
+        if flags & os.O_RDWR:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return opened(path, flags, *more)
+
+    with one_run(tmp_path), monkeypatch.context() as patch:
+        patch.setattr(os, "open", refuse)
+        assert is_locked(lock)
+    lock.touch()  # a process was killed
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refuse)
+        assert not is_locked(lock)
+    assert lock.exists()
+    assert not is_locked(lock)
 
 
 def test_a_lock_that_its_folder_was_moved_with(tmp_path):

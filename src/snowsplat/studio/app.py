@@ -57,6 +57,7 @@ from snowsplat.studio.hand_on import (
     export_command,
     export_file,
     film_command,
+    is_exported,
     make_command,
 )
 from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
@@ -194,7 +195,9 @@ class _Studio:
         return _listing(Path(os.path.expanduser(path)))
 
     async def _scenes(self, request: Request) -> Any:
-        return [_summary(scene) for scene in self._library.scenes()]
+        # A lock of another computer takes seconds to judge.
+        scenes = self._library.scenes()
+        return await asyncio.to_thread(lambda: [_summary(scene) for scene in scenes])
 
     async def _new(self, request: Request) -> Any:
         wanted = await _object(request)
@@ -207,26 +210,7 @@ class _Studio:
         return {"name": self._library.new(title, inputs).name}
 
     async def _scene(self, request: Request, scene: Scene) -> Any:
-        state, made = scene.state(), scene.job
-        has_page = state.pop("page", None) is not None  # its address is a secret of the job
-        state.pop("placed", None)  # `_photos` tells it
-        return {
-            "name": scene.name,
-            "title": made.title,
-            "folder": str(scene.folder),
-            "found": scene.found,
-            "inputs": made.inputs,
-            "quality": made.quality,
-            "minutes": made.minutes,
-            "status": _status(scene, state),
-            "state": state,
-            "has_page": has_page,
-            "edited": _edited(scene),
-            "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
-            "map": scene.map.stat().st_mtime if is_file(scene.map) else 0,
-            "command": make_command(scene, made),
-            "exports": {kind: export_command(scene, kind) for kind in FORMATS},
-        }
+        return await asyncio.to_thread(_details, scene)
 
     async def _remove(self, request: Request, scene: Scene) -> Any:
         if job.is_being_made(scene) or job.is_running(scene, "film"):
@@ -325,6 +309,8 @@ class _Studio:
     async def _export(self, request: Request, scene: Scene) -> Any:
         kind = _kind(request)
         async with self._locks["", "export"], self._locks[scene.name, "edit"]:
+            if is_exported(scene, kind):  # needs no process, and no folder that can be written
+                return {"file": export_file(scene, kind).name}
             return await asyncio.to_thread(job.work, "export", scene.folder, kind)
 
     async def _exported(self, request: Request, scene: Scene) -> Any:
@@ -470,11 +456,36 @@ def _summary(scene: Scene) -> dict[str, Any]:
     return {"name": scene.name, "picture": _picture_of(scene) is not None, **about}
 
 
+def _details(scene: Scene) -> dict[str, Any]:
+    """A scene for its own page."""
+    state, made = scene.state(), scene.job
+    has_page = state.pop("page", None) is not None  # its address is a secret of the job
+    state.pop("placed", None)  # `_photos` tells it
+    return {
+        "name": scene.name,
+        "title": made.title,
+        "folder": str(scene.folder),
+        "found": scene.found,
+        "inputs": made.inputs,
+        "quality": made.quality,
+        "minutes": made.minutes,
+        "status": _status(scene, state),
+        "state": state,
+        "has_page": has_page,
+        "edited": _edited(scene),
+        "film": scene.film.stat().st_mtime if is_file(scene.film) else 0,
+        "map": scene.map.stat().st_mtime if is_file(scene.map) else 0,
+        "command": make_command(scene, made),
+        "exports": {kind: export_command(scene, kind) for kind in FORMATS},
+    }
+
+
 def _status(scene: Scene, state: dict[str, Any]) -> str:
     """One of new, running, done, stopped, failed or, if the process was killed, interrupted.
 
     A scene of the command line is "found" until its site was written; any other one is "opening"
-    if the process that has changed it was killed before it has written the site.
+    if the process that has changed it was killed before it has written the site. In a folder that
+    cannot be written, the site remains as it is.
     """
     if scene.found:
         return "done" if scene.is_shown() else "found"
@@ -484,7 +495,7 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
         return "new"
     status = str(state.get("outcome", "interrupted"))
     behind = status == "done" and not scene.is_shown() and not is_locked(scene.edit_lock)
-    return "opening" if behind else status
+    return "opening" if behind and os.access(scene.kept, os.W_OK) else status
 
 
 def _edited(scene: Scene) -> float:

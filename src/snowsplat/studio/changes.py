@@ -17,13 +17,13 @@ from typing import Any
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames, write_keys
-from snowsplat.pipeline.output.edit_record import PageEdit
+from snowsplat.pipeline.output.edit_record import PageEdit, edited_file
 from snowsplat.pipeline.output.output_folder import DATASET
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.sfm.dataset_report import REPORT
-from snowsplat.studio.hand_on import export_file
+from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import Scene, safe_title
 from snowsplat.util.errors import UserError
@@ -54,11 +54,11 @@ def export(scene: Scene, kind: str) -> dict[str, Any]:
     file, target = finished(scene), export_file(scene, kind)
     # It gets the time of the scene that is read, which may be replaced meanwhile.
     time = file.stat().st_mtime_ns
-    if not target.is_file() or target.stat().st_mtime_ns != time:
+    if not is_exported(scene, kind):
+        if kind == "zip" and not scene.is_shown():
+            show_scene(scene)  # removes the other files
         target.parent.mkdir(exist_ok=True)
         if kind == "zip":
-            if not scene.is_shown():
-                show_scene(scene)
             with atomic_path(target) as temporary:
                 archive = shutil.make_archive(str(temporary), "zip", scene.site)
                 os.replace(archive, temporary)
@@ -73,14 +73,21 @@ class _Begun:
     """What an edit changes beside the scene file, after it: what is done if its process is killed.
 
     Attributes:
-        version: of the scene before.
+        file: of the edited scene, in the folder of the scene.
+        time: when this file was written before the edit, nanoseconds; 0: there was none. Only an
+            edit that succeeds changes it, and no job or training does.
         title: the new one; "": as it is.
         plan: that of the film; its keys are in the world of the scene before all edits.
     """
 
-    version: str
+    file: str
+    time: int
     title: str
     plan: PageFilm | None
+
+
+def _written_at(file: Path) -> int:
+    return file.stat().st_mtime_ns if file.is_file() else 0
 
 
 def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
@@ -100,12 +107,16 @@ def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
     with suppress(OSError, ValueError):  # no film is planned
         plan = moved_film(film_plan(scene), page_frames(file), [])
     title = changes.title and safe_title(changes.title) if changes else ""
-    write_json(scene.begun, asdict(_Begun(scene.version(), title, plan)))
+    edited = edited_file(file)
+    name = edited.relative_to(scene.folder).as_posix()
+    write_json(scene.begun, asdict(_Begun(name, _written_at(edited), title, plan)))
     if changes is None:
         undo_edits(file)
     else:
         try:
             has_levels = not (scene.site / SITE_SCENE).is_file()
+            if has_levels:
+                show_whole(scene)  # it is gone if the scene was renamed meanwhile
             edit(file, scene.whole if has_levels else scene.site, changes)
         except OtherScene as error:
             show_scene(scene)
@@ -120,7 +131,7 @@ def finish_edit(scene: Scene) -> None:
         begun = from_json(_Begun, read_json(scene.begun))
     except (OSError, ValueError):  # nothing is left
         return
-    if begun.version != scene.version():
+    if begun.time != _written_at(scene.folder / begun.file):
         if begun.title:
             scene.change(title=begun.title)
         if begun.plan is not None:
@@ -155,8 +166,12 @@ def show_scene(scene: Scene) -> dict[str, Any]:
 
 def rename(scene: Scene, title: str) -> dict[str, Any]:
     """Change the title, also in the site if there is one."""
+    if scene.scene_file() is None:
+        scene.change(title=safe_title(title))
+        return {}
+    finish_edit(scene)  # which may have another title
     scene.change(title=safe_title(title))
-    return show_scene(scene) if scene.scene_file() else {}
+    return show_scene(scene)
 
 
 def show_whole(scene: Scene) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.studio.library import Job, Scene, safe_name
+from snowsplat.util.safe_json import is_file
 
 #: By kind: the end of the file's name.
 FORMATS = {
@@ -22,6 +23,16 @@ FORMATS = {
 def export_file(scene: Scene, kind: str) -> Path:
     """The file of a scene in one of `FORMATS`; it need not exist."""
     return scene.exports / (safe_name(scene.job.title) + FORMATS[kind])
+
+
+def is_exported(scene: Scene, kind: str) -> bool:
+    """Whether this file has the scene as it is now: `export` gives it the time of the scene."""
+    file, target = scene.scene_file(), export_file(scene, kind)
+    return (
+        file is not None
+        and is_file(target)
+        and target.stat().st_mtime_ns == file.stat().st_mtime_ns
+    )
 
 
 def export_command(scene: Scene, kind: str) -> str:

@@ -42,12 +42,12 @@ def start(scene: Scene, task: str = "make") -> None:
 
 def is_running(scene: Scene, task: str = "make") -> bool:
     """Whether a process, started here or elsewhere, does this."""
-    lock = scene.lock(task)
-    process = _started.get(lock)
-    if process is not None and process.poll() is None:
-        return True
-    _started.pop(lock, None)
-    return is_locked(lock)
+    return _own_process(scene, task) is not None or is_locked(scene.lock(task))
+
+
+def _own_process(scene: Scene, task: str) -> subprocess.Popen[bytes] | None:
+    process = _started.get(scene.lock(task))
+    return process if process is not None and process.poll() is None else None
 
 
 def is_being_made(scene: Scene) -> bool:
@@ -60,15 +60,18 @@ def stop(scene: Scene, task: str = "make") -> None:
 
     Raises: UserError: it runs on another computer.
     """
-    if not is_running(scene, task):
-        return
-    process, other = _started.get(scene.lock(task)), holder(scene.lock(task))
+    process, lock = _own_process(scene, task), scene.lock(task)
     if process is not None:
         process.terminate()
-    elif other.host == socket.gethostname():
+        return
+    if not is_locked(lock):
+        return
+    other = holder(lock)
+    if other.host == socket.gethostname():
         os.kill(other.process, signal.SIGTERM)
     else:
-        raise UserError(f"this scene is being made on {other.host or 'another computer'}")
+        where = other.host or "another computer"
+        raise UserError(f"this scene is being made on {where}; stop it there")
 
 
 def work(*words: str | Path) -> dict[str, Any]:

@@ -15,10 +15,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from snowsplat.studio.local_page import open_local
+from snowsplat.studio.local_page import read_local
 from snowsplat.util.files import atomic_path
 from snowsplat.util.run_lock import InUse, locked
-from snowsplat.util.safe_json import from_json, read_json
+from snowsplat.util.safe_json import from_json, parse_json, read_json
 
 _LOCK = ".studio.lock"
 _ADDRESS = ".studio.json"
@@ -44,8 +44,8 @@ class Address:
     def answers(self, folder: Path) -> bool:
         """Whether it is there, and has this library."""
         try:
-            with open_local(f"{self.url}about", _SECONDS) as answer:
-                return os.path.samefile(json.load(answer)["folder"], folder)
+            about = parse_json(read_local(f"{self.url}about", _SECONDS)[1])
+            return os.path.samefile(about["folder"], folder)
         except (OSError, ValueError, KeyError, TypeError):
             return False
 
@@ -97,12 +97,16 @@ def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None
         yield None
         return
     with ExitStack() as stack:
-        _check_running(folder)
-        try:
-            stack.enter_context(locked(folder / _LOCK, f"{folder}: in use by", wait))
-        except InUse:
-            _check_running(folder)  # it has just started
-            raise
+        for seconds in (0.0, wait):
+            try:
+                stack.enter_context(locked(folder / _LOCK, f"{folder}: in use by", seconds))
+                break
+            except InUse:
+                # Only now: another program may have the port of a studio that was killed, and it
+                # must not get the secret in the address.
+                _check_running(folder)
+                if seconds == wait:
+                    raise
         try:
             yield _address_in(folder)
         finally:

@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
-from snowsplat.studio.local_page import open_local
+from snowsplat.studio.local_page import read_local
 
 _SECONDS = 20.0  # to answer; a training step may block the process
 
@@ -23,9 +23,9 @@ async def relay_file(url: str, name: str) -> Response:
     """The file ``name`` of the page at ``url``; 404 if there is none, or no page."""
 
     def load() -> Response:
-        with open_local(url + name, _SECONDS) as answer:
-            kept = {key: answer.headers[key] for key in ("Content-Type", "Content-Security-Policy")}
-            return Response(answer.read(), headers=kept)
+        headers, content = read_local(url + name, _SECONDS)
+        kept = {key: headers[key] for key in ("Content-Type", "Content-Security-Policy")}
+        return Response(content, headers=kept)
 
     try:
         return await asyncio.to_thread(load)

@@ -194,7 +194,9 @@ def _line(error: UserError | OSError) -> str:
 
 def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
     with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
-        pass  # an edit that has begun ends first; none begins while this job runs
+        # An edit that has begun ends first; none begins while this job runs. What an edit that was
+        # killed has left to do is not for the scene that is made now.
+        scene.begun.unlink(missing_ok=True)
     job = scene.job
     scene.map.unlink(missing_ok=True)  # the photos may be others now
     options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]

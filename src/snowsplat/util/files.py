@@ -34,14 +34,14 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
     rename. After a crash or a power cut, ``path`` has either the old or the new content, never a
     part of it. If the block raises, the temporary file is removed and ``path`` does not change. If
     the process is killed, the temporary file stays; the next write of ``path`` reuses it.
-    ``private``: other users cannot read the file.
+    ``private``: other users cannot read the file, also if they can write to the folder.
 
     Raises: OSError: the folder is missing or not writable, or the disk is full. The error names
     ``path``.
     """
     path = Path(path)
     try:
-        handle, temporary = _temporary(path)
+        handle, temporary = _temporary(path, private)
         try:
             yield temporary
             with open(temporary, "rb+") as file:
@@ -66,14 +66,15 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
     _sync_folder(path.parent)
 
 
-def _temporary(path: Path) -> tuple[int | None, Path]:
+def _temporary(path: Path, private: bool) -> tuple[int | None, Path]:
     """An empty file beside ``path``, and the handle of its lock (None without a lock).
 
     The name of the file is always the same, and the writer holds a lock on it. A killed process has
     no lock any more, so the file that it left is reused. If another process or thread holds the
-    lock, or if the system has no locks, the file gets a random name.
+    lock, or if the system has no locks, the file gets a random name. So does a ``private`` one,
+    because another user may have created that of the usual name.
     """
-    if fcntl is not None:
+    if fcntl is not None and not private:
         temporary = path.with_name(f".{path.name}.tmp")
         with contextlib.suppress(OSError):
             return _lock(temporary), temporary

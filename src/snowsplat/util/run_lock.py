@@ -118,7 +118,8 @@ def locked(file: Path, what: str, wait: float = _WAIT_SECONDS) -> Iterator[None]
 
 
 def is_locked(file: Path) -> bool:
-    """Whether another process holds a lock."""
+    """Whether another process holds a lock. Of a file that cannot be written, such as that of
+    another user, only the lock of the operating system counts."""
     if not file.exists():
         return False
     try:
@@ -126,6 +127,19 @@ def is_locked(file: Path) -> bool:
             return False
     except InUse:
         return True
+    except OSError:
+        return _is_held(file)
+
+
+def _is_held(file: Path) -> bool:
+    try:
+        handle = os.open(file, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+        try:
+            return not _lock(handle)
+        finally:
+            os.close(handle)
+    except OSError:  # it has just been removed, cannot be read, or there are no locks
+        return False
 
 
 def _acquired(file: Path, what: str, wait: float) -> int:

@@ -18,8 +18,6 @@ from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.safe_json import from_json, read_json
 
 _ENDING = "_edited"
-
-
 #: The limits of the viewer that shows them.
 MOST_NOTES, _LONGEST_TITLE, _LONGEST_TEXT = 25, 60, 280
 
@@ -29,7 +27,7 @@ class Note:
     """What a person has written at a place of the scene.
 
     Attributes:
-        title, text: at most 60 and 280 characters.
+        title, text: 1 to 60, and at most 280 characters.
         view: the view that shows it, whose target is the place; see `EditRecord.start`.
 
     Raises: ValueError: the title is empty, a text is too long, or the view is none.
@@ -42,7 +40,7 @@ class Note:
     def __post_init__(self) -> None:
         if not 0 < len(self.title) <= _LONGEST_TITLE or len(self.text) > _LONGEST_TEXT:
             raise ValueError(
-                f"an annotation has a title of at most {_LONGEST_TITLE} characters, and a text of "
+                f"an annotation has a title of 1 to {_LONGEST_TITLE} characters, and a text of "
                 f"at most {_LONGEST_TEXT}"
             )
         if not is_view(self.view):

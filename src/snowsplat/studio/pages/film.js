@@ -1,7 +1,7 @@
 // A film of a finished scene: key views on a time line, a preview, and the video that the studio
 // renders. The path through the keys is that of the studio, so the preview is what is rendered.
 
-import { action, ask, button, bytes, command, make, Refused } from "./page.js";
+import { action, ask, button, bytes, command, make, reasonOf } from "./page.js";
 import { say, told } from "./text.js";
 
 const SIZES = ["1920x1080", "1080x1920", "1080x1080"];
@@ -155,7 +155,7 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         frame.hidden = !previewing;
     }
 
-    const fail = (/** @type {any} */ error) => tell(error instanceof Refused ? error.message : say("offline"));
+    const fail = (/** @type {any} */ error) => tell(reasonOf(error));
     function scrub() {
         playing = false;
         share = Number(position.value);

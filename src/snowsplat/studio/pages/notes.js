@@ -1,7 +1,7 @@
 // The tool that writes annotations.
 
 import { button, make } from "./page.js";
-import { say } from "./text.js";
+import { say, told } from "./text.js";
 
 const MOST = 25; // the limit of the viewer
 
@@ -19,7 +19,7 @@ export function notesOf({ viewer, scene }) {
 }
 
 /** @param {import("./edit.js").Editing} editing */
-export function addNotes({ edits, scene, overlay, world, placement, presentView, change, show }) {
+export function addNotes({ edits, scene, overlay, world, placement, presentView, change, show, tell }) {
     /** @type {import("./edits.js").Note[]} */
     let listed = [];
     const list = make("div");
@@ -46,7 +46,7 @@ export function addNotes({ edits, scene, overlay, world, placement, presentView,
         },
         point(/** @type {number[]} */ point) {
             const { notes } = edits.present;
-            if (notes.length >= MOST) return;
+            if (notes.length >= MOST) return tell(told(`a scene has at most ${MOST} annotations`));
             const view = presentView();
             const note = { title: say("edit_note_new", notes.length + 1), text: "", view: [...placement.unplaced(view.slice(0, 3)), ...point, view[6], scene.aspect] };
             edits.change({ notes: [...notes, note] });

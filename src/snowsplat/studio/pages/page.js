@@ -40,6 +40,9 @@ export class Refused extends Error {
     }
 }
 
+/** Why a request failed, for people. `away` is the text if there was no answer. */
+export const reasonOf = (/** @type {unknown} */ error, away = "no_answer") => (error instanceof Refused ? error.message : say(away));
+
 /**
  * The JSON answer of the server.
  * @param {string} path relative to the page
@@ -75,7 +78,7 @@ export function action(/** @type {() => Promise<any>} */ run) {
         try {
             await run();
         } catch (error) {
-            notice(error instanceof Refused ? error.message : say("offline"));
+            notice(reasonOf(error));
         } finally {
             button.disabled = false;
         }

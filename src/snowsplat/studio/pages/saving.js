@@ -1,6 +1,6 @@
 // What of an edit is saved: title, first view, what the sliders hide. "Save" sends it to the studio.
 
-import { ask, button, make, Refused } from "./page.js";
+import { ask, button, make, reasonOf } from "./page.js";
 import { say } from "./text.js";
 
 /**
@@ -38,7 +38,7 @@ export function addSaving({ edits, scene, placement, presentView, change, show, 
             if (parent === window) location.replace(`../site/index.html${location.search}`);
             else parent.document.dispatchEvent(new Event("edited"));
         } catch (error) {
-            tell(error instanceof Refused ? error.message : say("offline"));
+            tell(reasonOf(error));
             saving = false;
             show();
         }

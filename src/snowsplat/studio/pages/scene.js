@@ -1,6 +1,6 @@
 // The page of one scene: uploads, what the photos are, the progress of the job, and the result.
 
-import { action, ask, bytes, command, duration, make, notice, Refused } from "./page.js";
+import { action, ask, bytes, command, duration, make, notice, reasonOf } from "./page.js";
 import { dressed, say, told } from "./text.js";
 import { chosen, dropped, Upload } from "./upload.js";
 
@@ -54,7 +54,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         } catch (error) {
             if (closed.aborted) return;
             away = true;
-            notice(error instanceof Refused ? error.message : say("offline"));
+            notice(reasonOf(error, "offline"));
             wait = 3000;
         }
         timer = setTimeout(refresh, wait);
@@ -101,9 +101,12 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     }
 
     /** A scene of the command line has no site yet; that of another one is not written. */
-    function openingPart() {
+    function openingPart(/** @type {any} */ scene) {
         const line = make("p", { role: "status" }, say("opening"));
-        const tell = (/** @type {any} */ error) => (line.textContent = error instanceof Refused ? error.message : say("offline"));
+        const tell = (/** @type {any} */ error) => {
+            line.textContent = reasonOf(error);
+            body.append(keptPart(scene)); // a scene that cannot be opened can be removed
+        };
         ask(`${address}/open`, "POST", {}).then(refresh, tell);
         return [make("section.card", {}, line)];
     }
@@ -157,8 +160,7 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                     if (time) time.textContent = say("about_time", duration(Number(seconds)));
                 }
             } catch (error) {
-                const text = error instanceof Refused ? error.message : say("offline");
-                facts.replaceChildren(make("p.bad", { role: "alert" }, text));
+                facts.replaceChildren(make("p.bad", { role: "alert" }, reasonOf(error)));
                 if (uploaded) facts.append(moreFiles());
             }
         }

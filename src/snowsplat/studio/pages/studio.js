@@ -1,6 +1,6 @@
 // The start page, and which page is shown.
 
-import { action, ask, make, notice } from "./page.js";
+import { action, ask, make, notice, reasonOf } from "./page.js";
 import { showScene, upload } from "./scene.js";
 import { chosenLanguage, chosenTheme, say, speak } from "./text.js";
 import { chosen, dropped, titleOf } from "./upload.js";
@@ -56,7 +56,7 @@ function showStart(/** @type {AbortSignal} */ closed) {
             grid.replaceChildren(...(scenes.length ? scenes.map(tile) : [make("p.soft", {}, say("none"))]));
             kept.textContent = say("kept", about.folder);
         },
-        () => notice(say("offline")),
+        error => notice(reasonOf(error)),
     );
 }
 
@@ -82,8 +82,8 @@ async function begin(/** @type {import("./upload.js").Item[]} */ items) {
         const { name } = await ask("scenes", "POST", { title: titleOf(items) });
         upload(name, items);
         location.hash = encodeURIComponent(name);
-    } catch {
-        notice(say("offline"));
+    } catch (error) {
+        notice(reasonOf(error));
     }
 }
 

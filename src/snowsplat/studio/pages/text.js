@@ -44,7 +44,7 @@ const TEXTS = {
     left: ["about {0} left", "大约还需 {0}"],
     not_arrived: ["Files that have not arrived completely: {0}. They are not used; drop them again.", "有 {0} 个文件没有传完，不会被使用：请再次拖入这些文件。"],
     no_files: ["Drop the photos here, or the same ones again: what has arrived is kept.", "请把照片拖到这里；如果上传中断，请再次拖入同样的照片，已上传的部分会保留。"],
-    arrived: ["{0} files have arrived.", "已上传 {0} 个文件。"],
+    no_answer: ["The studio does not answer; try again, or start it anew with: snowsplat studio", "工作室没有响应，请重试，或用此命令重新启动：snowsplat studio"],
     offline: ["The studio does not answer; trying again …", "工作室没有响应，正在重试……"],
     looking: ["Looking at the photos …", "正在检查照片……"],
     photos: ["Photos", "照片"],

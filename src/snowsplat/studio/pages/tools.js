@@ -3,7 +3,7 @@
 
 import { addEditor, centersOf } from "./edit.js";
 import { addFilm } from "./film.js";
-import { ask, make, Refused } from "./page.js";
+import { ask, make, reasonOf } from "./page.js";
 import { chosenLanguage, say, speak } from "./text.js";
 
 const { page: kind, edited, version } = /** @type {HTMLElement} */ (document.querySelector("script[data-page]")).dataset;
@@ -44,7 +44,7 @@ function addWholePage(/** @type {HTMLElement} */ panel) {
             await ask("../whole", "POST");
             location.href = `../whole/index.html${location.search}`;
         } catch (error) {
-            told.textContent = error instanceof Refused ? error.message : say("offline");
+            told.textContent = reasonOf(error);
             open.disabled = false;
         }
     });
