@@ -20,8 +20,7 @@ Result = TypeVar("Result")
 
 def reduced_photo(view: View, images: Photos, width: int, height: int) -> LoadedImage:
     """The photo of a view at this size, which is not larger than the photo, on the CPU."""
-    factor = next((f for f in (4, 2) if view.camera.width >= f * width), 1)
-    photo = images.get(view, factor).to(torch.device("cpu"))
+    photo = images.get(view, reduction(view, width)).to(torch.device("cpu"))
     size = (height, width)
     if photo.planes.shape[1:] == size:
         return photo
@@ -30,6 +29,11 @@ def reduced_photo(view: View, images: Photos, width: int, height: int) -> Loaded
     if mask is not None:
         mask = interpolate(mask[None, None].to(torch.float32), size, mode="area")[0, 0] > 0.5
     return LoadedImage(planes.round().to(torch.uint8), mask)
+
+
+def reduction(view: View, width: int) -> int:
+    """The factor 1, 2 or 4 of `reduced_photo`; `Photos.prefetch` needs it, too."""
+    return next((f for f in (4, 2) if view.camera.width >= f * width), 1)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
