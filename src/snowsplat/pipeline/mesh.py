@@ -24,7 +24,7 @@ from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
 from snowsplat.surface.isosurface import zero_level
 from snowsplat.surface.volume import Report, fused, occupied_blocks
-from snowsplat.training.starts.photos import reduced_photo, reduction, usable_pixels
+from snowsplat.training.starts.photos import decoded_ahead, reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
 from snowsplat.util.process import single_threaded
@@ -305,9 +305,10 @@ def _photos(
     views: Sequence[View], maps: Sequence[DepthMap], device: torch.device, report: Report
 ) -> Iterator[tuple[DepthMap, Tensor, Tensor | None]]:
     """The depth maps with their photos at the same size."""
+    widths = [each.camera.width for each in maps]
     with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
-        for i, (view, each) in enumerate(zip(views, maps, strict=True)):
+        ahead = decoded_ahead(views, widths, loader)
+        for i, (view, each) in enumerate(zip(ahead, maps, strict=True)):
             report(i, len(views), "photos")
-            loader.prefetch(views[i : i + 4], reduction(view, each.camera.width))
             photo = reduced_photo(view, loader, each.camera.width, each.camera.height)
             yield each, photo.planes[:3], usable_pixels(photo)
