@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -224,13 +225,18 @@ def _depth_maps(
     if far is None:
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
         far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
+    partial = [
+        view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE for view in views
+    ]
+    widths = [camera.width for camera in compress(cameras, partial)]
     maps = []
     with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
-        for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+        ahead = decoded_ahead(list(compress(views, partial)), widths, loader)
+        for i, (camera, is_partial) in enumerate(zip(cameras, partial, strict=True)):
             report(i, len(cameras), "photos")
             found = renderer.render(camera, far)
-            if view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE:
-                photo = reduced_photo(view, loader, camera.width, camera.height)
+            if is_partial:
+                photo = reduced_photo(next(ahead), loader, camera.width, camera.height)
                 empty = None if photo.alpha is None else photo.alpha < _TRANSPARENT
                 found = found.corrected(empty, photo.mask)
             maps.append(found)
