@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +16,10 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.decode import ImageSource, load_views
 from snowsplat.data.image_loader import ImageLoader
 from snowsplat.pipeline.confirmed_depth import confirm_by_photos
+from snowsplat.pipeline.mesh import _photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
@@ -161,6 +163,28 @@ def test_photos_correct_the_depths_of_a_mesh(dataset: Dataset) -> None:
     assert all(torch.equal(a.depth, b.depth) for a, b in zip(far, maps, strict=True))
 
 
+def test_photos_that_are_larger_than_their_maps_are_decoded_once(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[Path] = []
+
+    def load(sources: Sequence[tuple[ImageSource, object]], background: object) -> object:
+        decoded.append(sources[0][0].path)
+        return load_views(sources, background)
+
+    monkeypatch.setattr("snowsplat.data.image_loader.load_views", load)
+    monkeypatch.setattr("snowsplat.pipeline.confirmed_depth.LONGER_SIDE", 24)
+    weight = torch.full((18, 24), 255, dtype=torch.uint8)
+    small = [camera.scaled(24, 18) for camera in CAMERAS]
+    maps = [
+        surface_depth.DepthMap(camera, (1.0 / true_inverse_depth(camera)).float(), weight.clone())
+        for camera in small
+    ]
+    confirm_by_photos(dataset.train, maps, 100.0, lambda *_: None)
+    assert len(list(_photos(dataset.train, maps, torch.device("cpu"), lambda *_: None))) == 5
+    assert sorted(decoded) == sorted(2 * [view.image.path for view in dataset.train])
+
+
 def test_depths_next_to_confirmed_ones_lose_the_same_error(dataset: Dataset) -> None:
     weight = torch.full((HEIGHT, WIDTH), 255, dtype=torch.uint8)
     maps = [
@@ -274,12 +298,15 @@ def test_a_dataset_without_points(dataset: Dataset) -> None:
     assert float(distance.abs().median()) < 0.03
 
 
-def test_the_result_does_not_depend_on_the_number_of_threads(dataset: Dataset) -> None:
+def test_the_result_does_not_depend_on_the_number_of_threads(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     threads = torch.get_num_threads()
     clouds = []
     try:
         for n in (1, 3):
             torch.set_num_threads(n)
+            monkeypatch.setattr("snowsplat.training.starts.photos.DECODERS", n)
             random = torch.Generator().manual_seed(1)
             clouds.append(swept_points(dataset, photos(dataset), 300, random))
     finally:

@@ -167,15 +167,16 @@ class ImageLoader:
 
     def _decode(self, key: _Key) -> LoadedImage:
         source, _, factor = key
-        if source.path not in self._photos or not self._fits(factor):
+        if source.path not in self._photos:
             return self._load([key])[0]
         lock, views = self._photos[source.path]
         with lock:
             with self._lock:
                 if key in self._cache:  # another thread has decoded the photo
                     return self._cache[key]
-                found = dict.fromkeys([key, *((*view, factor) for view in views)])
-                keys = [one for one in found if one not in self._cache]
+                all_of_it = [(*view, factor) for view in views]
+                more = all_of_it if self._fits(factor) else self._next_of(key)
+                keys = [one for one in dict.fromkeys([key, *more]) if one not in self._cache]
             images = self._load(keys)
             with self._lock:
                 for one, image in zip(keys, images, strict=True):
@@ -197,6 +198,23 @@ class ImageLoader:
         sizes = (_estimated_bytes((view.image, view.mask, factor)) for view in self.views)
         return sum(sizes) <= self.budget_bytes
 
+    def _next_of(self, key: _Key) -> list[_Key]:
+        """The views of the same photo that directly follow in the order, as many as may be decoded
+        ahead. Needs the lock."""
+        order = [*self._ahead, *self._queue]
+        found = []
+        for one in order[order.index(key) + 1 :] if key in order else order:
+            same = (one[0].path, one[2]) == (key[0].path, key[2])
+            if not same or not (one in self._ahead or self._may_decode_ahead(one)):
+                break
+            self._ahead[one] = _estimated_bytes(one)
+            found.append(one)
+        return found
+
+    def _may_decode_ahead(self, key: _Key) -> bool:
+        size = _estimated_bytes(key)
+        return not self._ahead or sum(self._ahead.values()) + size <= self.budget_bytes // 2
+
     def _store(self, key: _Key, image: LoadedImage) -> None:
         """Add an image to the cache and remove others until the budget holds. Needs the lock.
         Images that were decoded ahead and not yet requested are removed last."""
@@ -216,15 +234,14 @@ class ImageLoader:
         while self._queue and len(self._running) < 2 * self._threads:
             key = self._queue[0]
             if key not in self._cache and key not in self._running:
-                size = _estimated_bytes(key)
-                if self._ahead and sum(self._ahead.values()) + size > self.budget_bytes // 2:
+                if not self._may_decode_ahead(key):
                     break
                 try:
                     future = self._pool.submit(self._decode, key)
                 except RuntimeError:  # the loader is closed, or the program is ending
                     self._queue.clear()
                     break
-                self._ahead[key] = size
+                self._ahead[key] = _estimated_bytes(key)
                 self._running[key] = future
                 future.add_done_callback(partial(self._finished, key))
             self._queue.popleft()

@@ -25,8 +25,9 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate
 from snowsplat.data import ImageLoader, View
 from snowsplat.surface.depth import DepthMap
 from snowsplat.surface.volume import Report
-from snowsplat.training.starts.depth_map import LONGER_SIDE
+from snowsplat.training.starts.depth_map import LONGER_SIDE, map_size
 from snowsplat.training.starts.fusion import consistent
+from snowsplat.training.starts.photos import decoded_ahead
 from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_maps
 from snowsplat.training.starts.source_views import source_views
 from snowsplat.util.process_memory import return_unused
@@ -98,13 +99,13 @@ def _pictures(views: Sequence[View], report: Report) -> list[Picture]:
     """The photos at the size of the first sweep."""
     pixels = sum(view.camera.width * view.camera.height for view in views)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
-    side = min(LONGER_SIDE, int(longest * min(1.0, math.sqrt(_MOST_PIXELS / pixels))))
+    side = min(LONGER_SIDE, max(1, int(longest * min(1.0, math.sqrt(_MOST_PIXELS / pixels)))))
+    widths = [map_size(view.camera.width, view.camera.height, side)[0] for view in views]
     found = []
     with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
-        for i, view in enumerate(views):
+        for i, view in enumerate(decoded_ahead(views, widths, loader)):
             report(i, len(views), "photos")
-            loader.prefetch(views[i : i + 4])
-            found.append(Picture.from_view(view, loader, max(1, side)))
+            found.append(Picture.from_view(view, loader, side))
     return found
 
 

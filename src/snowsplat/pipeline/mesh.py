@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
 from snowsplat.surface.isosurface import zero_level
 from snowsplat.surface.volume import Report, fused, occupied_blocks
-from snowsplat.training.starts.photos import reduced_photo, usable_pixels
+from snowsplat.training.starts.photos import decoded_ahead, reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
 from snowsplat.util.process import single_threaded
@@ -224,13 +225,18 @@ def _depth_maps(
     if far is None:
         sample = cameras[:: math.ceil(len(cameras) / _SAMPLE_VIEWS)]
         far = _REACH * _usual_depth([renderer.render(_small(camera)) for camera in sample])
+    partial = [
+        view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE for view in views
+    ]
+    widths = [camera.width for camera in compress(cameras, partial)]
     maps = []
     with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
-        for i, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+        ahead = decoded_ahead(list(compress(views, partial)), widths, loader)
+        for i, (camera, is_partial) in enumerate(zip(cameras, partial, strict=True)):
             report(i, len(cameras), "photos")
             found = renderer.render(camera, far)
-            if view.mask is not None or view.image.path.suffix.lower() not in _OPAQUE:
-                photo = reduced_photo(view, loader, camera.width, camera.height)
+            if is_partial:
+                photo = reduced_photo(next(ahead), loader, camera.width, camera.height)
                 empty = None if photo.alpha is None else photo.alpha < _TRANSPARENT
                 found = found.corrected(empty, photo.mask)
             maps.append(found)
@@ -305,9 +311,10 @@ def _photos(
     views: Sequence[View], maps: Sequence[DepthMap], device: torch.device, report: Report
 ) -> Iterator[tuple[DepthMap, Tensor, Tensor | None]]:
     """The depth maps with their photos at the same size."""
+    widths = [each.camera.width for each in maps]
     with ImageLoader(views, budget_bytes=PHOTO_BYTES) as loader:
-        for i, (view, each) in enumerate(zip(views, maps, strict=True)):
+        ahead = decoded_ahead(views, widths, loader)
+        for i, (view, each) in enumerate(zip(ahead, maps, strict=True)):
             report(i, len(views), "photos")
-            loader.prefetch(views[i : i + 4])
             photo = reduced_photo(view, loader, each.camera.width, each.camera.height)
             yield each, photo.planes[:3], usable_pixels(photo)

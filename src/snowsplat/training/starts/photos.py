@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
 from typing import TypeVar
 
 import torch
@@ -20,8 +21,7 @@ Result = TypeVar("Result")
 
 def reduced_photo(view: View, images: Photos, width: int, height: int) -> LoadedImage:
     """The photo of a view at this size, which is not larger than the photo, on the CPU."""
-    factor = next((f for f in (4, 2) if view.camera.width >= f * width), 1)
-    photo = images.get(view, factor).to(torch.device("cpu"))
+    photo = images.get(view, _reduction(view, width)).to(torch.device("cpu"))
     size = (height, width)
     if photo.planes.shape[1:] == size:
         return photo
@@ -30,6 +30,22 @@ def reduced_photo(view: View, images: Photos, width: int, height: int) -> Loaded
     if mask is not None:
         mask = interpolate(mask[None, None].to(torch.float32), size, mode="area")[0, 0] > 0.5
     return LoadedImage(planes.round().to(torch.uint8), mask)
+
+
+def decoded_ahead(views: Sequence[View], widths: Sequence[int], images: Photos) -> Iterator[View]:
+    """The views in their order, while the next photos are decoded for `reduced_photo`.
+
+    ``widths``: of the reduced photos, pixels.
+    """
+    pairs = zip(views, widths, strict=True)
+    for factor, group in groupby(pairs, lambda pair: _reduction(*pair)):
+        own = [view for view, _ in group]
+        images.prefetch(own, factor)
+        yield from own
+
+
+def _reduction(view: View, width: int) -> int:
+    return next((f for f in (4, 2) if view.camera.width >= f * width), 1)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
