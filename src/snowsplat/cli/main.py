@@ -29,7 +29,7 @@ from snowsplat.cli.reference_flags import translated
 from snowsplat.cli.reports import run
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
-from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.errors import SettingError, UserError, message_of
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.safe_json import printable
 
@@ -83,9 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _fail(_OUT_OF_MEMORY, 2)
     except OSError as error:
-        where = f"{_locked_folder(error) or error.filename}: " if error.filename else ""
         remedy = _REMEDIES.get(error.errno or 0)
-        return _fail(f"{where}{error.strerror or error}{f'; {remedy}' if remedy else ''}", 2)
+        message = message_of(error, _locked_folder(error))
+        return _fail(f"{message}; {remedy}" if remedy else message, 2)
 
 
 def parse(arguments: Sequence[str]) -> Any:

@@ -179,7 +179,7 @@ class Scene:
     def version(self) -> str:
         """Names the content of the scene file; "" if there is none."""
         file = self.scene_file()
-        return str(file.stat().st_mtime_ns) if file else ""
+        return version_of(file) if file else ""
 
     def check_version(self, version: str) -> None:
         """Raises UserError: a page shows another version, whose world is another one. "" is any."""
@@ -289,6 +289,11 @@ def default_folder() -> Path:
         return Path.home() / _DEFAULT
     except RuntimeError:  # in containers, a user may have a number only
         return Path.cwd() / _DEFAULT
+
+
+def version_of(file: Path) -> str:
+    """Names the content of a scene file; each training and each edit changes it."""
+    return str(file.stat().st_mtime_ns)
 
 
 def safe_title(title: str) -> str:

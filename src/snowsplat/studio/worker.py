@@ -49,7 +49,7 @@ from snowsplat.sfm.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.studio import changes
 from snowsplat.studio.changes import existing_reports, film_plan, finished
-from snowsplat.studio.library import TASKS, Scene
+from snowsplat.studio.library import TASKS, Scene, version_of
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import write_text
@@ -206,7 +206,7 @@ def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
         )
     recorder.begin("page")
     file = shown_file(made.scene)
-    shown = [str(file.stat().st_mtime_ns), job.title]
+    shown = [version_of(file), job.title]
     site = publish(file, scene.site, PublishOptions(job.title), overwrite=True)
     recorder.leave()
     return _result(scene, made) | {"gaussians": site.gaussians, "shown": shown}

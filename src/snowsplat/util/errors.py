@@ -9,9 +9,12 @@ class UserError(Exception):
     """
 
 
-def message_of(error: OSError) -> str:
-    """An error of the system in one line: the file, and what is wrong."""
-    where = f"{error.filename}: " if error.filename else ""
+def message_of(error: OSError, cause: str | None = None) -> str:
+    """An error of the system in one line: the file, and what is wrong.
+
+    ``cause``: what is named in place of the file.
+    """
+    where = f"{cause or error.filename}: " if error.filename else ""
     return f"{where}{error.strerror or error}"
 
 
