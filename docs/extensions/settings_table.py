@@ -20,8 +20,8 @@ from snowsplat.training.settings import (
     TrainConfig,
     recipe,
 )
-from snowsplat.training.settings.declare import allowed, declarations
 from snowsplat.training.settings.names import PARTS, setting_names
+from snowsplat.util.settings import allowed, declarations
 
 _TITLES = {
     TrainConfig: "The training",

@@ -33,8 +33,8 @@ from snowsplat.training.settings import (
     register_recipe,
     register_start,
 )
-from snowsplat.training.settings.declare import declarations
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.settings import declarations
 
 from ..fork_server import ENVIRONMENT
 

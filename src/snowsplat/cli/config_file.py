@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_h
 import tyro
 
 from snowsplat.cli.flag_errors import spellings
-from snowsplat.training.settings.declare import kinds_of, suggestion
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import from_json, printable, read_json
+from snowsplat.util.settings import kinds_of, suggestion
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.output.output_folder import DatasetSettings

@@ -1,7 +1,7 @@
 """The flags of `snowsplat train` that are settings of its configuration.
 
 They are made from the declarations of the settings, under the same names; see
-`snowsplat.training.settings.declare`.
+`snowsplat.util.settings`.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from snowsplat.cli.flags import flag, switch, with_flags
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.training.settings.declare import Setting, flags_of
 from snowsplat.training.settings.density import DENSITY_CONTROLS
 from snowsplat.training.settings.rates import DecayRates, LearningRates
 from snowsplat.training.settings.recipes import RECIPES
+from snowsplat.util.settings import Setting, flags_of
 
 RECIPE = "set by the recipe"
 #: The values of the flag --recipe.

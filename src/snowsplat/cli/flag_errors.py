@@ -17,10 +17,10 @@ import tyro
 
 from snowsplat.cli import other_trainers
 from snowsplat.cli.subcommands import SUBCOMMANDS
-from snowsplat.training.settings.declare import Setting, allowed, kinds_of, shown
-from snowsplat.training.settings.declare import suggestion as similar
 from snowsplat.training.settings.recipes import RECIPES
 from snowsplat.util.safe_json import printable
+from snowsplat.util.settings import Setting, allowed, kinds_of, shown
+from snowsplat.util.settings import suggestion as similar
 
 _FLAG = re.compile(r"-[^\d.]")
 _FRAME = "│|╭╮╰╯─┌┐└┘+-= "

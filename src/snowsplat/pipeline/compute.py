@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.run import processes
-from snowsplat.training.settings.declare import Settings, setting
+from snowsplat.util.settings import Settings, setting
 
 if TYPE_CHECKING:
     import torch

@@ -49,13 +49,13 @@ from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
 from snowsplat.training.settings.config import AutoOnOff, TrainConfig
-from snowsplat.training.settings.declare import Settings, same, setting
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import read_json
+from snowsplat.util.settings import Settings, same, setting
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures", "all")  # `make_dataset` records its own stages

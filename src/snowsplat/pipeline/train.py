@@ -37,7 +37,6 @@ from snowsplat.training.parts.exposure import exposure_hint
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.config import TrainConfig, parts_of
-from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.stored import config_from_json
@@ -45,6 +44,7 @@ from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 from snowsplat.util.run_lock import one_run
+from snowsplat.util.settings import Settings, setting
 
 logger = logging.getLogger(__name__)
 

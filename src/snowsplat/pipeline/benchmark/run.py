@@ -17,10 +17,10 @@ from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_r
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
 from snowsplat.pipeline.run import option
-from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.run_lock import InUse
+from snowsplat.util.settings import Settings, setting
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,12 @@ from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.train import TrainOptions
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.parts.found_sky import sky_distance
-from snowsplat.training.settings.declare import Settings, setting
 from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, read_json
+from snowsplat.util.settings import Settings, setting
 
 PLAN = "plan.json"
 #: More blocks than this are a mistake.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from snowsplat.training.settings.declare import setting
 from snowsplat.training.settings.recipes import check_recipe
 from snowsplat.util.byte_size import parse_bytes
+from snowsplat.util.settings import setting
 
 
 def minutes() -> float | None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from snowsplat.training.settings.declare import When
+from snowsplat.util.settings import When
 
 
 @dataclass

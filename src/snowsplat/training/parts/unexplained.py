@@ -24,8 +24,8 @@ from snowsplat.evaluation.color_alignment import color_fit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 from snowsplat.training.parts.part import Part
-from snowsplat.training.settings.declare import When
 from snowsplat.util.names import first_names
+from snowsplat.util.settings import When
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run

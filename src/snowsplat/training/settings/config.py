@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
-from snowsplat.training.settings.declare import Settings, When, part, setting
 from snowsplat.training.settings.density import AdaptiveDensity, DensityConfig, check_density
 from snowsplat.training.settings.rates import DecayRates, LearningRates
 from snowsplat.training.settings.starts import check_starts
 from snowsplat.util.errors import SettingError
+from snowsplat.util.settings import Settings, When, part, setting
 
 if TYPE_CHECKING:
     from snowsplat.training.core.step_schedule import Schedule

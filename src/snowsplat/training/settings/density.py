@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-from snowsplat.training.settings.declare import Settings, When, checked, declarations, same, setting
+from snowsplat.util.settings import Settings, When, checked, declarations, same, setting
 
 if TYPE_CHECKING:
     import torch

@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 from typing import Any
 
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.training.settings.declare import suggestion
 from snowsplat.training.settings.density import owner
 from snowsplat.util.errors import SettingError
+from snowsplat.util.settings import suggestion
 
 #: The fields of `TrainConfig` whose value has settings itself.
 PARTS = ("density", "learning_rates", "decay")

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
-from snowsplat.training.settings.declare import Settings, When, setting
+from snowsplat.util.settings import Settings, When, setting
 
 if TYPE_CHECKING:
     from snowsplat.training.core.step_schedule import Schedule

@@ -12,10 +12,10 @@ from dataclasses import replace
 from typing import Any
 
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.training.settings.declare import Setting, checked, suggestion
 from snowsplat.training.settings.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.util.settings import Setting, checked, suggestion
 
 
 def default() -> TrainConfig:

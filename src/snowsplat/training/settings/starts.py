@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from snowsplat.training.settings.declare import suggestion
+from snowsplat.util.settings import suggestion
 
 if TYPE_CHECKING:
     import torch

@@ -7,11 +7,11 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.training.settings.declare import Settings
 from snowsplat.training.settings.density import DENSITY_CONTROLS
 from snowsplat.training.settings.rates import DecayRates, LearningRates
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import from_json, quoted
+from snowsplat.util.settings import Settings
 
 logger = logging.getLogger(__name__)
 
