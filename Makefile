@@ -161,8 +161,8 @@ nightly: native $(ENVIRONMENT) pytest-isas
 # The kernels for Arm (NEON), in an emulator, which takes five times as long as the processor: with the
 # precision that trainings use. float64, for references, has the same source. The loader of the library,
 # which test_native.py tests, is not used for them.
-NEON_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_patches.py \
-    tests/sfm/colmap/test_sift.py \
+NEON_TESTS := tests/ops tests/sfm/colmap/pairs/test_matching.py tests/sfm/colmap/features/test_patches.py \
+    tests/sfm/colmap/features/test_sift.py \
     --ignore tests/ops/test_native.py -k 'not (float64 or $(SAME))'
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
@@ -177,7 +177,7 @@ pytest-repeated:
 	    then echo; grep -E '^(SNOWSPLAT_ISA|sanitized|neon|[0-9]+ passed)' $(REPEATED); \
 	    else cat $(REPEATED); exit 1; fi
 
-ISA_TESTS := tests/ops tests/sfm/colmap/test_matching.py tests/sfm/colmap/test_sift.py \
+ISA_TESTS := tests/ops tests/sfm/colmap/pairs/test_matching.py tests/sfm/colmap/features/test_sift.py \
     tests/training/test_pose_refinement.py tests/training/test_step_runner.py -k 'not ($(SAME))'
 # All lower instruction sets. Each change is tested with the next lower one, and with NEON, whose kernels
 # have the source of the baseline.

@@ -44,7 +44,7 @@ from torch import Tensor
 from snowsplat.data.colmap import read_model
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.sfm.gps import east_north_up, middle_of
-from snowsplat.sfm.ingest.exif import read_exif
+from snowsplat.sfm.ingest.photos.exif import read_exif
 from snowsplat.util.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,8 +16,8 @@ def import_all() -> None:
     import snowsplat.scene.edit
     import snowsplat.sfm.colmap.reconstruct
     import snowsplat.sfm.dataset_folder
-    import snowsplat.sfm.dataset_report
     import snowsplat.sfm.orient
+    import snowsplat.sfm.report.dataset_report
     import snowsplat.sfm.undistort
     import snowsplat.training.budgets.time_plan
     import snowsplat.training.core.checkpoint

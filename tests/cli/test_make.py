@@ -22,7 +22,7 @@ from snowsplat.pipeline.output.scene_paths import scene_file, scene_name
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm import cost
-from snowsplat.sfm.ingest import sources
+from snowsplat.sfm.ingest.search import sources
 from snowsplat.util.stages import Stages
 
 from ..fork_server import popen

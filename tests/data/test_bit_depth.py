@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from snowsplat.data.decode import ImageSource, load_image
-from snowsplat.sfm.ingest.photo_files import decode, read_header
+from snowsplat.sfm.ingest.photos.photo_files import decode, read_header
 
 HEIGHT, WIDTH = 120, 160
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageCms
 
 from snowsplat.data import colour_profile
 from snowsplat.data.decode import ImageSource, load_image, load_thumbnail
-from snowsplat.sfm.ingest.photo_files import decode, read_header, save
+from snowsplat.sfm.ingest.photos.photo_files import decode, read_header, save
 
 from .colour_profiles import (
     DISPLAY_P3,

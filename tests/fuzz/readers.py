@@ -46,9 +46,11 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.sfm import dataset_folder
-from snowsplat.sfm.ingest import archive, clip, mask_files, photo_files, video_frames
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photos import mask_files, photo_files
+from snowsplat.sfm.ingest.search import archive
+from snowsplat.sfm.ingest.video import clip, video_frames
 from snowsplat.sfm.progress import silent
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint

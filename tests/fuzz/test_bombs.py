@@ -29,10 +29,10 @@ from snowsplat.formats.spz_container import Header, pack
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.sfm import dataset_folder
-from snowsplat.sfm.colmap import check_model
+from snowsplat.sfm.colmap.process import check_model
 from snowsplat.sfm.colmap.result import describe_model
-from snowsplat.sfm.ingest import photo_files
-from snowsplat.sfm.ingest.clip import read_clip, why_no_video
+from snowsplat.sfm.ingest.photos import photo_files
+from snowsplat.sfm.ingest.video.clip import read_clip, why_no_video
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint, checkpoint_file
 from snowsplat.training.core.history import History

@@ -85,7 +85,7 @@ def _isas(package: Path) -> list[str]:
 def _tests(package: Path, isa: str) -> bool:
     started = time.monotonic()
     command = [sys.executable, "-m", "pytest", "-m", "not emulated and not gpu"]
-    command += ["tests/ops", "tests/sfm/colmap/test_matching.py", "tests/data/lens"]
+    command += ["tests/ops", "tests/sfm/colmap/pairs/test_matching.py", "tests/data/lens"]
     # Without tests that measure times, load their own libraries, or compile with NVRTC, which does
     # not find its own libraries under a sanitizer.
     for other in ("native", "emulation", "driver", "cuda_build"):

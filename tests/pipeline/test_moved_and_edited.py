@@ -14,7 +14,7 @@ from snowsplat.pipeline.observer import SILENT
 from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
-from snowsplat.sfm.ingest.sources import Sources
+from snowsplat.sfm.ingest.search.sources import Sources
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Outcome, Stages

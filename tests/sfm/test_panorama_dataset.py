@@ -9,9 +9,9 @@ from PIL import Image
 from snowsplat.data import load_dataset
 from snowsplat.data.decode import load_image
 from snowsplat.scene.geometry import Similarity
-from snowsplat.sfm.coverage import measure_coverage
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent
+from snowsplat.sfm.report.coverage import measure_coverage
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
 

@@ -15,11 +15,11 @@ import pytest
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.stage_lines import described
-from snowsplat.sfm.colmap.diagnosis import Evidence, failure
+from snowsplat.sfm.colmap.checks.diagnosis import Evidence, failure
+from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED
 from snowsplat.sfm.ingest.inputs import _too_few
-from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED
-from snowsplat.sfm.ingest.sources import find_sources
-from snowsplat.sfm.ingest.video_frames import SAME_VIEW
+from snowsplat.sfm.ingest.search.sources import find_sources
+from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW
 from snowsplat.studio.app import _listing
 from snowsplat.studio.library import Library
 from snowsplat.studio.uploads import Upload, safe_path, write_part

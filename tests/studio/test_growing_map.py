@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from snowsplat.sfm.scene_map import PlacedPhoto
+from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.studio import worker
 from snowsplat.util.stages import Outcome
 

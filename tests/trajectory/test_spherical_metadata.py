@@ -4,7 +4,7 @@ import av
 import numpy as np
 import pytest
 
-from snowsplat.sfm.ingest.panorama import spherical_video
+from snowsplat.sfm.ingest.content.panorama import spherical_video
 from snowsplat.trajectory.spherical_metadata import mark_as_spherical
 from snowsplat.trajectory.video_file import video_writer
 

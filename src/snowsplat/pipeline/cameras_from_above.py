@@ -14,7 +14,7 @@ from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.geometry import shortest_rotation
 from snowsplat.scene.orientation import scene_up
-from snowsplat.sfm.scene_map import PlacedPhoto, draw_scene
+from snowsplat.sfm.report.scene_map import PlacedPhoto, draw_scene
 
 
 def cameras_from_above(output: Path | str) -> str:

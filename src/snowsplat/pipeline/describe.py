@@ -15,7 +15,7 @@ from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
 from snowsplat.pipeline.output.scene_paths import file_of_make, index_in, training_folder
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
-from snowsplat.sfm.ingest.archive import files_in, is_zip
+from snowsplat.sfm.ingest.search.archive import files_in, is_zip
 from snowsplat.training.core import checkpoint_file
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
@@ -175,7 +175,7 @@ def _output(folder: OutputFolder, made: Path | None) -> dict[str, Any]:
 def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
     """What `describe_photos` says. Raises ``otherwise`` if there are no photos and no videos."""
     from snowsplat.pipeline.describe_photos import describe_photos  # pycolmap and torch
-    from snowsplat.sfm.ingest.sources import find_sources
+    from snowsplat.sfm.ingest.search.sources import find_sources
 
     try:
         sources = find_sources([path])
@@ -186,7 +186,7 @@ def _photos(path: Path, otherwise: UserError) -> dict[str, Any]:
 
 def _has_photos(path: Path) -> bool:
     """Whether a zip file has photos or videos, and is not a SOG scene."""
-    from snowsplat.sfm.ingest.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES  # torch
+    from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES  # torch
 
     names = files_in(path)
     if any(name.endswith(_ROOT_OF_SOG) for name in names):

@@ -11,10 +11,10 @@ from snowsplat.data.files.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, steps_of
-from snowsplat.sfm.ingest.archive import files_in
-from snowsplat.sfm.ingest.clip import max_frame_count, read_clip
-from snowsplat.sfm.ingest.photo_files import Header, Unusable, read_header
-from snowsplat.sfm.ingest.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sources
+from snowsplat.sfm.ingest.photos.photo_files import Header, Unusable, read_header
+from snowsplat.sfm.ingest.search.archive import files_in
+from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sources
+from snowsplat.sfm.ingest.video.clip import max_frame_count, read_clip
 from snowsplat.sfm.survey import survey
 from snowsplat.util.duration import duration
 from snowsplat.util.files import shown
@@ -56,7 +56,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
 def describe_zip(path: Path) -> dict[str, Any]:
     """What a zip file contains; it is not unpacked.
 
-    Raises: UserError: see `snowsplat.sfm.ingest.archive.unpack`.
+    Raises: UserError: see `snowsplat.sfm.ingest.search.archive.unpack`.
     """
     suffixes = [PurePosixPath(name).suffix.lower() for name in files_in(path)]
     return {

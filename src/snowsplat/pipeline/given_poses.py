@@ -11,7 +11,7 @@ from snowsplat.data.files.matching import match_names
 from snowsplat.data.judge.verdict import judge
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.output.output_folder import DatasetSettings
-from snowsplat.sfm.ingest.sources import Source, Sources
+from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 

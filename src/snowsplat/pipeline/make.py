@@ -42,9 +42,9 @@ from snowsplat.pipeline.train import TrainOptions, resume, train
 from snowsplat.sfm.colmap import SfmOptions
 from snowsplat.sfm.cost import measure_speed
 from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
-from snowsplat.sfm.dataset_report import REPORT
 from snowsplat.sfm.ingest.inputs import GatherOptions
-from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.ingest.search.sources import find_sources
+from snowsplat.sfm.report.dataset_report import REPORT
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint

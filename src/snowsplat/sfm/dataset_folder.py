@@ -29,19 +29,19 @@ from typing import Any, Protocol
 import numpy as np
 
 from snowsplat.data.placement import PLACEMENT
-from snowsplat.sfm.capture_verdict import capture_verdict
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
-from snowsplat.sfm.coverage import measure_coverage
-from snowsplat.sfm.dataset_report import REPORT, write_report
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.sources import RECORDS, Sources, find_sources
+from snowsplat.sfm.ingest.search.sources import RECORDS, Sources, find_sources
 from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
-from snowsplat.sfm.photo_problems import problems
 from snowsplat.sfm.progress import Report
-from snowsplat.sfm.scene_map import PlacedPhoto
+from snowsplat.sfm.report.capture_verdict import capture_verdict
+from snowsplat.sfm.report.coverage import measure_coverage
+from snowsplat.sfm.report.dataset_report import REPORT, write_report
+from snowsplat.sfm.report.photo_problems import problems
+from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort

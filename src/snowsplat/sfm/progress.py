@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     import numpy as np
 
-    from snowsplat.sfm.scene_map import PlacedPhoto
+    from snowsplat.sfm.report.scene_map import PlacedPhoto
 
 
 class Report(Protocol):

@@ -22,7 +22,7 @@ from snowsplat.pipeline.output.output_folder import DATASET
 from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
-from snowsplat.sfm.dataset_report import REPORT
+from snowsplat.sfm.report.dataset_report import REPORT
 from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import Scene, safe_title

@@ -42,10 +42,10 @@ from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of
-from snowsplat.sfm.dataset_report import draw_from_above
-from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.progress import Report
-from snowsplat.sfm.scene_map import PlacedPhoto
+from snowsplat.sfm.report.dataset_report import draw_from_above
+from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
 from snowsplat.studio import changes
 from snowsplat.studio.changes import existing_reports, film_plan, finished

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from snowsplat.sfm.colmap import child
+from snowsplat.sfm.colmap.process import child
 
 from ... import fork_server
 

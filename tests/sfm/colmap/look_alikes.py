@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from snowsplat.sfm.colmap.database import open_database
-from snowsplat.sfm.colmap.lens import Lens
+from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
 
 from .walks import write_features

@@ -20,7 +20,7 @@ from snowsplat.sfm.colmap.database import (
     set_names,
     verified_pairs,
 )
-from snowsplat.sfm.colmap.lens import Lens
+from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
 
 

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from snowsplat.sfm.colmap import reconstruct
-from snowsplat.sfm.colmap.features import Folders, WorkerProgress
-from snowsplat.sfm.colmap.lens import Lens
+from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
+from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.colmap.options import SfmOptions
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.progress import silent

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from snowsplat.sfm.colmap.database import closing_database, open_database
-from snowsplat.sfm.colmap.lens import Lens
+from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.synthetic.lens import Lens as PhoneLens
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from snowsplat.sfm.ingest.inputs import GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.sources import find_sources
+from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
@@ -356,10 +356,10 @@ def test_the_disk_becomes_full(writes, tmp_path, monkeypatch):
 
     if writes == "photos":
         source = write_photos(tmp_path / "p", 3, "webp")
-        monkeypatch.setattr("snowsplat.sfm.ingest.gather_photos.save", full)
+        monkeypatch.setattr("snowsplat.sfm.ingest.photos.gather_photos.save", full)
     else:
         source = write_video(tmp_path / "a.mp4", pan(9))
-        monkeypatch.setattr("snowsplat.sfm.ingest.video_frames.save", full)
+        monkeypatch.setattr("snowsplat.sfm.ingest.video.video_frames.save", full)
     with pytest.raises(UserError, match="disk: full; free some space"):
         gathered(source, tmp_path / "out")
 

@@ -24,7 +24,7 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.sfm.ingest.photo_files import Unusable, decode, read_header
+from snowsplat.sfm.ingest.photos.photo_files import Unusable, decode, read_header
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.trajectory.orbit import swing_path
 from snowsplat.trajectory.video_file import video_writer

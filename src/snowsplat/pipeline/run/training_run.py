@@ -26,7 +26,7 @@ from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
 from snowsplat.pipeline.run.watchers import Watchers
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.sfm.capture_verdict import recorded_verdict
+from snowsplat.sfm.report.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.pace import Pace
 from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.budgets.steps_left import StepsLeft

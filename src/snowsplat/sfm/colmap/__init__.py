@@ -1,15 +1,20 @@
 """Structure from motion: estimates camera poses, lens parameters and scene points from photos.
 
-`child` starts the process `worker`, in which COLMAP runs and which does not import torch.
-`reconstruct` makes the attempts there, from `features` to `repair`.
+process/     starts the process in which COLMAP runs, and which does not import torch
+reconstruct  makes the attempts there, from features to checks
+features/    detects features
+pairs/       chooses pairs of photos and matches them
+lenses/      chooses camera models
+mapping/     makes models of poses and points
+checks/      finds wrong poses, and explains what is missing
 """
 
 from snowsplat.util.errors import UserError
 from snowsplat.util.interrupts import handle_again
 
 try:
-    from snowsplat.sfm.colmap.child import estimate_poses
     from snowsplat.sfm.colmap.options import SfmOptions, SfmResult
+    from snowsplat.sfm.colmap.process.child import estimate_poses
     from snowsplat.sfm.colmap.result import describe_model
 except ModuleNotFoundError as error:
     if error.name != "pycolmap":

@@ -21,8 +21,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.lens import Lens, camera_ids, cameras_of
-from snowsplat.sfm.colmap.tracks import of_long_tracks
+from snowsplat.sfm.colmap.lenses.lens import Lens, camera_ids, cameras_of
+from snowsplat.sfm.colmap.mapping.tracks import of_long_tracks
 from snowsplat.sfm.ingest.photo import Photo
 
 _PLANE_OR_ROTATION = {"PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC", "WATERMARK"}

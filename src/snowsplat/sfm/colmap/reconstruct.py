@@ -43,8 +43,9 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap import camera_groups
-from snowsplat.sfm.colmap.consistency import CONSISTENT, agreement_of_model
+from snowsplat.sfm.colmap.checks.consistency import CONSISTENT, agreement_of_model
+from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure, gather_evidence
+from snowsplat.sfm.colmap.checks.repair import repair
 from snowsplat.sfm.colmap.database import (
     fingerprint_of,
     forget_verification,
@@ -55,10 +56,10 @@ from snowsplat.sfm.colmap.database import (
     set_cameras,
     verified_pairs,
 )
-from snowsplat.sfm.colmap.diagnosis import Evidence, explain, failure, gather_evidence
-from snowsplat.sfm.colmap.features import Folders, WorkerProgress, extract_features
-from snowsplat.sfm.colmap.fisheye import LensEvidence, lens_evidence
-from snowsplat.sfm.colmap.lens import (
+from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress, extract_features
+from snowsplat.sfm.colmap.lenses import camera_groups
+from snowsplat.sfm.colmap.lenses.fisheye import LensEvidence, lens_evidence
+from snowsplat.sfm.colmap.lenses.lens import (
     EQUAL_ERROR,
     Lens,
     Refine,
@@ -70,13 +71,12 @@ from snowsplat.sfm.colmap.lens import (
     settled,
     with_all_parameters,
 )
-from snowsplat.sfm.colmap.mapping import Mapping, usable_models, write_models
+from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models, write_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult, detection_size
-from snowsplat.sfm.colmap.pair_matching import match_pairs, verify_pairs
-from snowsplat.sfm.colmap.pairs import PairChoice, choose_pairs
-from snowsplat.sfm.colmap.repair import repair
+from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
+from snowsplat.sfm.colmap.pairs.pair_matching import match_pairs, verify_pairs
+from snowsplat.sfm.colmap.pairs.retrieval import FEATURES, similarity
 from snowsplat.sfm.colmap.result import names_in, result_of
-from snowsplat.sfm.colmap.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered

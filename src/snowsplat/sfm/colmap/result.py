@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.check_model import can_be_read
 from snowsplat.sfm.colmap.options import SfmResult
+from snowsplat.sfm.colmap.process.check_model import can_be_read
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import inside, quoted

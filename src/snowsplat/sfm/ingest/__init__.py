@@ -1,10 +1,10 @@
 """The inputs of structure from motion: finds photos and videos, and checks and copies them.
 
-    sources      finds the files
-    inputs       fills ``input/`` of a dataset: gather_photos copies photos, video_frames frames
-    clip, motion, key_frames   read a video and choose its frames
-    photo_files, exif, mask_files   read and write image files
-    sharpness    rejects images without content
+    search/      finds the files
+    inputs       fills ``input/`` of a dataset
+    photos/      reads photos, their metadata and masks, and copies them
+    video/       reads a video, and chooses and writes its frames
+    content/     what photos show: bars, discs, panoramas, nothing
 
 `inputs.gather` fills ``input/``, and returns the photos that the next stages use.
 """

@@ -16,14 +16,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.files.mask_look import doubt_about_masks
-from snowsplat.sfm.ingest.clip import Clip, max_frame_count, read_clip
-from snowsplat.sfm.ingest.gather_photos import Planned, evenly_spread, plan_photos, write_photos
-from snowsplat.sfm.ingest.panorama import STITCHED, is_twice_as_wide, spherical_video
+from snowsplat.sfm.ingest.content.panorama import STITCHED, is_twice_as_wide, spherical_video
+from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.set_aside import set_fixed_parts_aside
-from snowsplat.sfm.ingest.sharpness import BLACK, BLURRED, FLAT, WHITE
-from snowsplat.sfm.ingest.sources import Source, Sources, find_sources
-from snowsplat.sfm.ingest.video_frames import SAME_VIEW, extract_frames
+from snowsplat.sfm.ingest.photos.gather_photos import (
+    Planned,
+    evenly_spread,
+    plan_photos,
+    write_photos,
+)
+from snowsplat.sfm.ingest.photos.set_aside import set_fixed_parts_aside
+from snowsplat.sfm.ingest.search.sources import Source, Sources, find_sources
+from snowsplat.sfm.ingest.video.clip import Clip, max_frame_count, read_clip
+from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import shown

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from snowsplat.sfm.colmap.sift import read_grey
+from snowsplat.sfm.colmap.features.sift import read_grey
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient.up import tangent
 

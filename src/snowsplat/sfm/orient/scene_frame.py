@@ -14,8 +14,8 @@ from snowsplat.data.placement import Placement
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.orientation import VIEWING_DISTANCE
 from snowsplat.sfm.gps import east_north_up, location_of, middle_of, position_errors
-from snowsplat.sfm.ingest.attitude import UPRIGHT
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photos.attitude import UPRIGHT
 from snowsplat.sfm.orient.cameras import Cameras, read_cameras
 from snowsplat.sfm.orient.ground import of_ground
 from snowsplat.sfm.orient.marker import MarkerScale

@@ -1,0 +1,1 @@
+"""Detects features, and moves them to their exact positions in the final model."""

@@ -1,0 +1,164 @@
+"""Moves the features of each point so that they show exactly the same place in all photos.
+
+The position of a SIFT feature has an error of a few tenths of a pixel, more if its surface is seen
+at different angles. The photos themselves are more accurate. So for each point, the patch of one
+feature is the template, and the patches of its other features are aligned with it. The idea to
+adjust the features before bundle adjustment is that of Lindenberger, Sarlin, Larsson and Pollefeys,
+"Pixel-Perfect Structure-from-Motion with Featuremetric Refinement", ICCV 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snowsplat.sfm.colmap.database import closing_database
+from snowsplat.sfm.colmap.features.patches import (
+    SIDE,
+    Floats,
+    align_patches,
+    cut_patches,
+    patch_axes,
+)
+from snowsplat.sfm.colmap.features.sift import read_grey
+from snowsplat.sfm.colmap.options import detection_size
+from snowsplat.util import native_library
+
+# A feature is moved to its aligned position if all of these conditions hold. Otherwise it is not
+# moved: if its match is false, the robust loss of the bundle adjustment reduces its effect.
+_MIN_CORRELATION = 0.8
+_MAX_SHIFT = 3.0  # pixels of the patch
+_MAX_STRETCH = 10.0  # of the area of the window, and of its inverse
+# Number of features whose patches are in memory; each has 729 bytes. A photo is read again in each
+# block that has features of it.
+_BLOCK = 200_000
+
+
+class _Features(NamedTuple):
+    """The features that observe a point; the features of a point follow one another."""
+
+    image: NDArray[np.int64]  # (N,) image ids
+    row: NDArray[np.int64]  # (N,) indices of the features in their photos
+    point: NDArray[np.int64]  # (N,) ascending, indices of the points
+
+
+def align_features(
+    model: pycolmap.Reconstruction, database: Path, images: Path, image_size: int, threads: int
+) -> None:
+    """Move the observations in ``model`` to their aligned positions. Poses and points are kept.
+
+    Args:
+        database: has the features.
+        images: the folder of the photos.
+        image_size: that of the detection of the features; see `detection_size`.
+
+    Raises:
+        OSError: a photo is missing.
+        UserError: the native library is missing or outdated.
+    """
+    native_library.set_num_threads(threads)
+    features = _features_of(model)
+    with closing_database(database) as source:
+        keypoints = {int(i): source.read_keypoints(int(i)) for i in np.unique(features.image)}
+    for block in _blocks(features):
+        names = {int(i): model.image(int(i)).name for i in np.unique(block.image)}
+        lenses = {i: model.cameras[model.image(i).camera_id] for i in names}
+        sizes = {i: detection_size(image_size, lens.is_spherical()) for i, lens in lenses.items()}
+        patches = _Patches.cut(block, names, keypoints, images, sizes, threads)
+        positions, good = patches.aligned(block)
+        points = {i: model.image(i).points2D for i in names}
+        (moved,) = np.nonzero(good)
+        for i, row, position in zip(
+            block.image[moved].tolist(), block.row[moved].tolist(), positions[moved], strict=True
+        ):
+            points[i][row].xy = position
+
+
+def _features_of(model: pycolmap.Reconstruction) -> _Features:
+    points = [model.point3D(i).track.elements for i in sorted(model.points3D)]
+    rows = [(e.image_id, e.point2D_idx, k) for k, track in enumerate(points) for e in track]
+    return _Features(*np.array(rows, np.int64).reshape(-1, 3).T)
+
+
+def _blocks(features: _Features) -> Iterator[_Features]:
+    """Parts of ``features`` with about `_BLOCK` features each, without dividing points."""
+    starts = np.searchsorted(features.point, np.unique(features.point))
+    block = starts[features.point] // _BLOCK
+    for rows in np.split(np.arange(len(block)), np.flatnonzero(np.diff(block)) + 1):
+        if len(rows):
+            image, row, point = (column[rows] for column in features)
+            yield _Features(image, row, point - point[0])
+
+
+class _Patches(NamedTuple):
+    """The patches of features."""
+
+    patches: NDArray[np.uint8]  # (N, SIDE, SIDE)
+    positions: Floats  # (N, 2) of the features, in pixels of the photos in ``images``
+    axes: Floats  # (N, 2, 2) of the patches, in the same unit
+
+    @staticmethod
+    def cut(
+        features: _Features,
+        names: dict[int, str],
+        keypoints: dict[int, Floats],
+        images: Path,
+        sizes: dict[int, int],
+        threads: int,
+    ) -> _Patches:
+        count = len(features.image)
+        result = _Patches(
+            np.empty((count, SIDE, SIDE), np.uint8), np.empty((count, 2)), np.empty((count, 2, 2))
+        )
+
+        def cut_from(image: int) -> None:
+            (chosen,) = np.nonzero(features.image == image)
+            found = np.asarray(keypoints[image], np.float64)[features.row[chosen]]
+            grey, size = read_grey(images / names[image], sizes[image])
+            ratio = np.array(size) / grey.shape[::-1]
+            found[:, :2] /= ratio
+            found[:, 2:] /= ratio.mean()
+            axes = patch_axes(found)
+            result.patches[chosen] = cut_patches(grey, found[:, :2], axes)
+            result.positions[chosen] = found[:, :2] * ratio
+            result.axes[chosen] = axes * ratio[:, None]
+
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(cut_from, names))
+        return result
+
+    def aligned(self, features: _Features) -> tuple[Floats, NDArray[np.bool_]]:
+        """The aligned positions (N, 2) in pixels of the photos, and (N,) which of them are good."""
+        template = self._templates(features)
+        (others,) = np.nonzero(template != np.arange(len(template)))
+        pairs = np.stack([template[others], others], 1).astype(np.int32)
+        transform, correlation = align_patches(self.patches, pairs)
+        shift = transform[:, :, 2]
+        area = np.linalg.det(transform[:, :, :2])
+        positions, good = self.positions.copy(), np.ones(len(template), bool)
+        positions[others] += (self.axes[others] @ shift[:, :, None])[:, :, 0]
+        good[others] = (
+            (correlation >= _MIN_CORRELATION)
+            & (np.linalg.norm(shift, axis=1) <= _MAX_SHIFT)
+            & (area >= 1 / _MAX_STRETCH)
+            & (area <= _MAX_STRETCH)
+        )
+        return positions, good
+
+    def _templates(self, features: _Features) -> NDArray[np.int64]:
+        """(N,) for each feature, the index of the feature that is the template of its point.
+
+        Its size is closest to the (geometric) mean size of the features of the point: the surface
+        is neither very near nor far away, and not foreshortened very much.
+        """
+        size = np.log(np.abs(np.linalg.det(self.axes)))
+        mean = np.bincount(features.point, size) / np.bincount(features.point)
+        order = np.lexsort((np.abs(size - mean[features.point]), features.point))
+        first = order[np.searchsorted(features.point, np.arange(len(mean)))]
+        return np.asarray(first[features.point])

@@ -1,0 +1,79 @@
+"""Detects features in the photos and writes them into the COLMAP database."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from snowsplat.sfm.colmap.database import closing_database
+from snowsplat.sfm.colmap.features.panorama import detect_in_panorama
+from snowsplat.sfm.colmap.features.sift import Features, detect_sift, photos_at_once
+from snowsplat.sfm.colmap.options import Effort, detection_size, feature_count
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.progress import Report
+
+#: The seed of all random numbers in COLMAP.
+SEED = 1
+
+
+class Folders:
+    """Paths inside a dataset."""
+
+    def __init__(self, dataset: Path) -> None:
+        self.images, self.distorted = dataset / "input", dataset / "distorted"
+        self.masks = self.distorted / "masks"
+        self.database = self.distorted / "database.db"
+        self.sparse = self.distorted / "sparse"
+
+
+@dataclass(frozen=True)
+class WorkerProgress:
+    """The functions with which the worker sends its progress to the parent process.
+
+    ``report`` sends a number of finished items. ``features`` is called with the mean number of
+    features of the photos, ``placed`` as `Placements`.
+    """
+
+    report: Report
+    features: Callable[[float], None] = lambda mean: None
+    placed: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
+
+
+def extract_features(
+    folders: Folders,
+    database: Path,
+    photos: list[Photo],
+    effort: Effort,
+    threads: int,
+    progress: WorkerProgress,
+) -> None:
+    """Detect features in all photos that have none in ``database`` yet, and write them there."""
+
+    def detect(photo: Photo) -> Features:
+        mask = folders.masks / f"{photo.name}.png" if photo.mask else None
+        size = detection_size(effort.image_size, photo.panorama)
+        count = feature_count(effort.features, photo.panorama)
+        detect_in = detect_in_panorama if photo.panorama else detect_sift
+        return detect_in(folders.images / photo.name, mask, size, count)
+
+    at_once = photos_at_once(effort.image_size, threads)
+    with closing_database(database) as opened, ThreadPoolExecutor(at_once) as pool:
+        counts = []
+        left = [i for i in range(len(photos)) if not opened.exists_descriptors(i + 1)]
+        found = pool.map(detect, [photos[i] for i in left])
+        for done, (i, features) in enumerate(zip(left, found, strict=True)):
+            progress.report(len(photos) - len(left) + done, len(photos), "photos with features")
+            counts.append(len(features.descriptors))
+            transaction = pycolmap.DatabaseTransaction(opened)
+            opened.write_keypoints(i + 1, features.keypoints)
+            sift = pycolmap.FeatureExtractorType.SIFT
+            descriptors = pycolmap.FeatureDescriptors(sift, features.descriptors)
+            opened.write_descriptors(i + 1, descriptors)
+            del transaction  # ends it
+        if counts:
+            progress.features(sum(counts) / len(counts))
+        progress.report(len(photos), len(photos), "photos with features")

@@ -1,0 +1,1 @@
+"""Camera models: which lens the photos have, and how many focal lengths."""

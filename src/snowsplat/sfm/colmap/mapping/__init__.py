@@ -1,0 +1,1 @@
+"""Makes models (camera poses and points) from matches."""

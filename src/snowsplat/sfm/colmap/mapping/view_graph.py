@@ -1,0 +1,123 @@
+"""The view graph: its nodes are the photos, its edges the pairs with verified matches."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.pairs.choice import following, numbered_series
+
+# Poses are not compared with pairs that have fewer verified matches: unrelated photos can have
+# about this number of matches by chance.
+_MIN_MATCHES = 50
+_MIN_FOLLOWING_MATCHES = 15  # for photos that follow each other: their matches are rarely false
+# Two photos follow each other if their positions in a series of names (`numbered_series`) differ by
+# at most `_MAX_STEP`. Such photos were usually taken side by side, so their matches are rarely
+# false, and each match counts as `_FOLLOWING_WEIGHT` matches. In five datasets with correct poses,
+# the model confirms all 692 pairs of this kind.
+_MAX_STEP = 2
+_FOLLOWING_WEIGHT = 20.0
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """Two photos with verified matches: image ids of the database, ``first`` < ``second``."""
+
+    first: int
+    second: int
+    matches: int  # number of verified matches
+    follows: bool = field(default=False, kw_only=True)  # the photos follow each other (`_MAX_STEP`)
+
+    @property
+    def weight(self) -> float:
+        """The number of matches; those of photos that follow each other count several times."""
+        return self.matches * (_FOLLOWING_WEIGHT if self.follows else 1.0)
+
+    @property
+    def counts(self) -> bool:
+        """Whether the pair has enough matches to be compared with poses."""
+        return self.matches >= (_MIN_FOLLOWING_MATCHES if self.follows else _MIN_MATCHES)
+
+    def other(self, photo: int) -> int:
+        """The photo of this pair that is not ``photo``."""
+        return self.first + self.second - photo
+
+
+@dataclass(frozen=True)
+class ViewGraph:
+    """The verified pairs of some photos."""
+
+    names: Mapping[int, str]  # image id -> file name, of all photos of the graph
+    pairs_of: Mapping[int, list[VerifiedPair]]  # image id -> its pairs
+
+    @staticmethod
+    def from_pairs(names: Mapping[int, str], pairs: Iterable[tuple[int, int, int]]) -> ViewGraph:
+        """``pairs``: image ids (first < second) and number of verified matches.
+
+        Pairs with a photo that is not in ``names`` are left out.
+        """
+        follow = following_pairs(names)
+        pairs_of: dict[int, list[VerifiedPair]] = {i: [] for i in names}
+        for first, second, matches in pairs:
+            if first in names and second in names:
+                pair = VerifiedPair(first, second, matches, follows=(first, second) in follow)
+                pairs_of[first].append(pair)
+                pairs_of[second].append(pair)
+        return ViewGraph(names, pairs_of)
+
+    @staticmethod
+    def read(database: Path) -> ViewGraph:
+        """The graph of all photos and verified pairs in the database."""
+        with closing_database(database) as source:
+            names = database_names(source)
+        found = verified_pairs(database)
+        return ViewGraph.from_pairs(names, ((p.first + 1, p.second + 1, p.inliers) for p in found))
+
+    @property
+    def pairs(self) -> list[VerifiedPair]:
+        """All pairs, sorted by their image ids."""
+        found = (pair for i, pairs in self.pairs_of.items() for pair in pairs if pair.first == i)
+        return sorted(found, key=lambda pair: (pair.first, pair.second))
+
+    def of_photos(self, photos: Collection[int]) -> ViewGraph:
+        """The graph of these photos only.
+
+        Two photos follow each other in it if at most one of these photos is between them.
+        """
+        chosen = set(photos)
+        names = {i: name for i, name in self.names.items() if i in chosen}
+        return ViewGraph.from_pairs(names, ((p.first, p.second, p.matches) for p in self.pairs))
+
+    def matrix(self) -> tuple[list[int], NDArray[np.floating[Any]]]:
+        """The image ids in ascending order, and the number of verified matches of each pair.
+
+        The numbers are a symmetric (N, N) matrix; 0: the two photos are no pair.
+        """
+        ids = sorted(self.names)
+        row = {photo: index for index, photo in enumerate(ids)}
+        matches = np.zeros((len(ids), len(ids)))
+        for pair in self.pairs:
+            i, j = row[pair.first], row[pair.second]
+            matches[i, j] = matches[j, i] = pair.matches
+        return ids, matches
+
+
+def following_pairs(names: Mapping[int, str], max_step: int = _MAX_STEP) -> set[tuple[int, int]]:
+    """The pairs (first < second) of photos that follow each other by name. ``names``: id -> name
+
+    ``max_step``: the largest difference of their positions in the series of names.
+    """
+    steps = range(1, max_step + 1)
+    return set().union(*(following(series, steps) for series in numbered_series(names)))
+
+
+def database_names(database: pycolmap.Database) -> dict[int, str]:
+    """Image id -> file name, of all photos."""
+    return {image.image_id: image.name for image in database.read_all_images()}

@@ -1,0 +1,1 @@
+"""Chooses pairs of photos, and finds their matches."""

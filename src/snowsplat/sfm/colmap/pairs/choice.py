@@ -1,0 +1,226 @@
+"""Chooses the pairs of photos to match. Matching all pairs takes quadratic time.
+
+    few photos           all pairs
+    frames of a video    each frame with the next frames, with later frames at growing distances,
+                         and with frames that look similar. Similar frames close loops: the camera
+                         comes back to a place where it was before
+    photos with GPS      each photo with the nearest photos, and with some that look similar, if
+                         the positions differ by more than their error
+    many photos          each photo with those that look similar. A photo with a number in its name
+                         is also paired with the photos that have the next numbers, which were
+                         usually taken directly after it
+
+If several rules apply, all of them are used, so that all photos are connected by pairs.
+
+If a photo has many similar ones, most of their pairs connect the same points again. So a photo is
+first matched with about half of them: with the most similar ones, and with others at growing
+distances in the order of similarity, which connect it to other parts of the scene. The other half
+is the reserve, for photos of which few pairs have enough matches (`completed`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snowsplat.sfm.colmap.database import Pair
+from snowsplat.sfm.colmap.options import Effort
+from snowsplat.sfm.colmap.pairs.retrieval import nearest
+from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.components import components
+
+# Share of `Effort.neighbours` that is used for similar photos if all photos already have pairs from
+# one video or from GPS.
+_LOOP_SHARE = 0.4
+# Share of `Effort.overlap` that is used for photos with numbered names. Such photos are farther
+# apart than the frames of a video, and the next photos are usually among the similar ones anyway.
+_NUMBERED_SHARE = 0.5
+_NUMBERED_NAME = re.compile(r"(.*?)([0-9]+)\.[^./]*")
+
+# Of the similar photos of a photo, this number of the most similar ones is matched first, and then
+# those whose place in the order grows by this factor.
+_MOST_SIMILAR, _STEP = 6, 1.25
+# A pair with at least this number of verified matches connects two photos well. A photo with at
+# least this number of such pairs needs no reserve.
+_CLEAR_MATCHES, _CLEAR_PAIRS = 50, 8
+
+Pairs = set[tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class PairChoice:
+    """Pairs (i < j) of indices in the list of photos, and the rules that chose them, as text.
+
+    Attributes:
+        pairs: sorted, those to match.
+        reserve: sorted, further pairs, which are only needed by photos with few matches.
+    """
+
+    pairs: list[tuple[int, int]]
+    rules: str
+    reserve: list[tuple[int, int]] = field(default_factory=list)
+
+    @property
+    def description(self) -> str:
+        """The rules and the number of pairs, as text for users."""
+        return f"{self.rules} ({len(self.pairs)} pairs)"
+
+    def completed(self, verified: Sequence[Pair], count: int) -> PairChoice:
+        """This choice, with those pairs of the reserve that are needed.
+
+        These are all pairs of photos that are not well connected; and all pairs, if there are
+        several groups of photos without a connection: any pair may be the one between them.
+
+        Args:
+            verified: the pairs with verified matches.
+            count: number of photos.
+        """
+        clear = [(p.first, p.second) for p in verified if p.inliers >= _CLEAR_MATCHES]
+        first, second = np.array(clear, np.int64).reshape(-1, 2).T
+        partners = np.bincount(np.concatenate([first, second]), minlength=count)
+        groups = np.unique(components((first, second), count)[partners > 0])
+        weak = (partners < _CLEAR_PAIRS) | (len(groups) > 1)
+        return self._with({(i, j) for i, j in self.reserve if weak[i] or weak[j]})
+
+    def whole(self) -> PairChoice:
+        """This choice, with all pairs of the reserve."""
+        return self._with(set(self.reserve))
+
+    def _with(self, needed: Pairs) -> PairChoice:
+        rest = [pair for pair in self.reserve if pair not in needed]
+        return PairChoice(sorted({*self.pairs, *needed}), self.rules, rest)
+
+
+def choose_pairs(
+    photos: Sequence[Photo], effort: Effort, similarity: Callable[[], NDArray[np.floating[Any]]]
+) -> PairChoice:
+    """Choose the pairs to match.
+
+    ``similarity`` returns the visual similarity of the photos (`retrieval.similarity`), (N, N). It
+    is called only if needed.
+    """
+    count = len(photos)
+    if count <= effort.exhaustive:
+        every = list(itertools.combinations(range(count), 2))
+        return PairChoice(every, "all pairs of photos")
+    pairs: Pairs = set()
+    rules = []
+    sequences = _sequences(photos)
+    if sequences:
+        for sequence in sequences:
+            pairs |= _pairs_along(sequence, effort.overlap)
+        rules.append("frames of a video with the following frames")
+    overlap = round(_NUMBERED_SHARE * effort.overlap)
+    names = {i: photo.name for i, photo in enumerate(photos) if photo.sequence is None}
+    numbered = [following(series, range(1, overlap + 1)) for series in numbered_series(names)]
+    if numbered:
+        pairs |= set().union(*numbered)
+        rules.append("photos with the next photos by name")
+    near, located = _near_pairs(photos, effort.neighbours)
+    if near:
+        pairs |= near
+        rules.append("photos with the nearest photos by GPS")
+    covered = located == count or sum(map(len, sequences)) == count
+    alike = _unlike_next_frames(photos, similarity(), effort.overlap)
+    rules.append("photos with similar photos")
+    if covered:
+        pairs |= nearest(alike, range(round(_LOOP_SHARE * effort.neighbours)))
+        return PairChoice(sorted(pairs), ", ".join(rules))
+    places = range(effort.neighbours)
+    pairs |= nearest(alike, _growing(places))
+    reserve = nearest(alike, places) - pairs
+    return PairChoice(sorted(pairs), ", ".join(rules), sorted(reserve))
+
+
+def _growing(places: range) -> list[int]:
+    """Some places in an order: the first ones, then at growing distances."""
+    chosen = list(places[:_MOST_SIMILAR])
+    while chosen and (place := math.ceil(_STEP * (chosen[-1] + 1)) - 1) in places:
+        chosen.append(place)
+    return chosen
+
+
+def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
+    """Series of photos whose names differ only in the last number, in the order of this number.
+
+    ``names``: any number that identifies a photo -> its file name (IMG_0017.jpg). The series
+    contain these identifiers. Series of a single photo are left out.
+    """
+    by_prefix: dict[str, list[tuple[int, int]]] = {}
+    for i, name in names.items():
+        parts = _NUMBERED_NAME.fullmatch(name)
+        if parts is not None:
+            by_prefix.setdefault(parts[1], []).append((int(parts[2]), i))
+    return [[i for _, i in sorted(series)] for series in by_prefix.values() if len(series) > 1]
+
+
+def following(series: Sequence[int], steps: Sequence[int]) -> Pairs:
+    """Pairs (i < j) of entries of ``series`` whose positions differ by one of ``steps``."""
+    pairs = set()
+    for position, i in enumerate(series):
+        for step in steps:
+            if position + step < len(series):
+                j = series[position + step]
+                pairs.add((min(i, j), max(i, j)))
+    return pairs
+
+
+def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
+    by_name: dict[str, list[int]] = {}
+    for i, photo in enumerate(photos):
+        if photo.sequence is not None:
+            by_name.setdefault(photo.sequence, []).append(i)
+    return [sorted(frames, key=lambda i: photos[i].name) for frames in by_name.values()]
+
+
+def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
+    # Pair every frame with the next `overlap` frames, and with frames at distances of 2, 4, 8 …
+    # times `overlap`.
+    steps = list(range(1, overlap + 1))
+    while steps[-1] * 2 < len(sequence):
+        steps.append(steps[-1] * 2)
+    return following(sequence, steps)
+
+
+def _unlike_next_frames(
+    photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], overlap: int
+) -> NDArray[np.floating[Any]]:
+    # A frame is most similar to the frames directly before and after it, which are already paired
+    # with it. They are excluded here; otherwise no pair would close a loop.
+    similarity = similarity.copy()
+    for sequence in _sequences(photos):
+        for position, i in enumerate(sequence):
+            near = sequence[max(0, position - overlap) : position + overlap + 1]
+            similarity[i, near] = -np.inf
+    return similarity
+
+
+def _near_pairs(photos: Sequence[Photo], neighbours: int) -> tuple[Pairs, int]:
+    """Pairs of photos that are near by GPS, and the number of photos whose neighbours are known.
+
+    If more than ``neighbours`` photos are within the error of a position, GPS cannot tell which of
+    them are nearest. This happens indoors, where phones also store the last position outdoors.
+    """
+    located = [i for i, photo in enumerate(photos) if photo.location is not None]
+    if len(located) <= neighbours:
+        return set(), 0
+    locations = np.array([photos[i].location for i in located])
+    places = east_north_up(locations, middle_of(locations))[:, :2]
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)
+    errors = position_errors([photos[i] for i in located])
+    within = (distances <= errors[:, None]).sum(axis=1) - 1  # the photo itself is not counted
+    clear = np.flatnonzero(within <= neighbours)
+    pairs: Pairs = set()
+    for i in clear:
+        order = np.argsort(distances[i], kind="stable")
+        for j in order[order != i][:neighbours]:
+            pairs.add((located[min(i, j)], located[max(i, j)]))
+    return pairs, len(clear)

@@ -1,0 +1,218 @@
+"""Runs the COLMAP worker as a child process, reports its progress and handles its failures."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
+from snowsplat.sfm.colmap.process.growing_map import read_placed
+from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.progress import Figures, Placed, Report
+from snowsplat.util.errors import SettingError, UserError
+
+# Bytes by which the database may grow in one transaction.
+_DATABASE_GROWTH = 8_000_000
+_MODULE = "snowsplat.sfm.colmap.process.worker"
+_POLL_SECONDS = 0.5
+_Watchers = tuple[Report, Figures, Placed]
+
+
+class Crashed(Exception):
+    """The child ended without a result; ``code`` is its exit status, negative for a signal."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+    @property
+    def reason(self) -> str:
+        """How the child ended, as text."""
+        if self.code == -getattr(signal, "SIGKILL", 9):
+            return "it was killed, probably because the memory was full"
+        if self.code < 0:
+            return f"it crashed ({signal.Signals(-self.code).name})"
+        return f"it ended with status {self.code}"
+
+
+def estimate_poses(
+    dataset: Path,
+    photos: list[Photo],
+    options: SfmOptions,
+    report: Report,
+    figures: Figures = lambda cpu_seconds, features: None,
+    placed: Placed = lambda photos, points: None,
+) -> SfmResult:
+    """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
+
+    Writes three things. ``distorted/sparse/N`` are the models (0 has the most photos); the cameras
+    include the lens distortion, and scale and orientation are arbitrary.
+    ``distorted/database.db`` contains the features and matches. ``distorted/colmap.log`` is the
+    output of COLMAP. Features and matches of an interrupted run are reused. The same photos and
+    settings lead to the same pairs and matches, and to the same poses except for rounding. With
+    more than 150 photos, the coordinate frame may differ, too.
+
+    ``report`` is called at least twice per second, also if nothing has changed. ``figures``
+    is called as often as there is progress, ``placed`` every two seconds while photos are placed.
+
+    Raises:
+        UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
+            explains why), or COLMAP crashed twice.
+        OSError: the disk is full.
+    """
+    if len(photos) < 3:
+        raise UserError(
+            f"photos: {len(photos)} are not enough; take at least 3, preferably 30 or more"
+        )
+    if options.camera_model not in ("auto", *CAMERA_MODELS):
+        raise SettingError(
+            "camera_model",
+            f"unknown value {options.camera_model!r}; use one of auto, " + ", ".join(CAMERA_MODELS),
+        )
+    distorted = dataset.absolute() / "distorted"
+    distorted.mkdir(parents=True, exist_ok=True)
+    log = distorted / "colmap.log"
+    log.unlink(missing_ok=True)
+    job = {
+        "dataset": str(dataset.absolute()),
+        "photos": [dataclasses.asdict(photo) for photo in photos],
+        "options": dataclasses.asdict(options),
+    }
+    threads, watchers = thread_count(options.threads), (report, figures, placed)
+    try:
+        return _run({**job, "reduced": False}, log, threads, watchers)
+    except Crashed as crash:
+        first = crash
+        _check_disk(distorted)
+    try:
+        result = _run({**job, "reduced": True}, log, 1, watchers)
+    except Crashed as crash:
+        _check_disk(distorted)
+        advice = "report it"
+        if crash.code < 0:
+            advice = "use fewer or smaller photos, or a lower effort"
+        raise UserError(
+            f"pose estimation: failed twice: {crash.reason}; {advice} "
+            f"(last line of the log: {_last_line(log)})"
+        ) from None
+    note = f"first attempt: {first.reason}; repeated with smaller photos and one thread"
+    return dataclasses.replace(result, attempts=[note, *result.attempts])
+
+
+def _check_disk(folder: Path) -> None:
+    """Raises OSError if there is no space for a larger file in ``folder``. In this case, the full
+    disk is the likely cause of the crash."""
+    try:
+        largest = max(path.stat().st_size for path in folder.iterdir())
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.seek(largest)
+            file.write(bytes(_DATABASE_GROWTH))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none")
+
+
+def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> SfmResult:
+    with (
+        open(log, "ab") as log_file,
+        subprocess.Popen(
+            [sys.executable, "-m", _MODULE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log_file,
+            env=child_environment(threads),
+            text=True,
+            encoding="utf-8",
+        ) as child,
+    ):
+        try:
+            answer = _communicate(child, job, watchers)
+            code = child.wait()
+        finally:
+            child.kill()
+    if "user_error" in answer:
+        raise UserError(answer["user_error"])
+    if "result" not in answer:
+        raise Crashed(code)
+    return SfmResult(**answer["result"])
+
+
+def _communicate(
+    child: subprocess.Popen[str], job: dict[str, Any], watchers: _Watchers
+) -> dict[str, Any]:
+    """Send the job, report progress until the child ends, and return its last line.
+
+    ``report`` is called in this thread, so it needs no lock and Ctrl-C interrupts it. A second
+    thread reads the lines.
+    """
+    report, figures, placed = watchers
+    lines: queue.Queue[str | None] = queue.Queue()
+
+    def listen() -> None:
+        assert child.stdout is not None
+        # After an interrupt, the stream may be closed while it is read.
+        with contextlib.suppress(ValueError), child.stdout:
+            for line in child.stdout:
+                lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=listen, daemon=True).start()
+    assert child.stdin is not None
+    with contextlib.suppress(BrokenPipeError):  # the child has ended: detected below
+        child.stdin.write(json.dumps(job) + "\n")
+        child.stdin.flush()
+    answer: dict[str, Any] = {}
+    while True:
+        try:
+            line = lines.get(timeout=_POLL_SECONDS)
+        except queue.Empty:
+            if "progress" in answer:
+                report(*answer["progress"])
+            continue
+        # If the child has ended, the last line may be incomplete.
+        if line is None or not line.endswith("\n"):
+            break
+        message = json.loads(line)
+        if "placed" in message:
+            placed(*read_placed(message["placed"]))
+            continue
+        answer = message
+        if "progress" in answer:
+            figures(answer["cpu"], answer["features"])
+            report(*answer["progress"])
+    # stdin is closed only after the last answer, because the child ends when its stdin is closed.
+    with contextlib.suppress(BrokenPipeError):
+        child.stdin.close()
+    return answer
+
+
+def child_environment(threads: int) -> dict[str, str]:
+    """The environment of a child process that runs modules of this package.
+
+    COLMAP uses ``threads`` threads there.
+    """
+    # The child imports modules from the same places as this process (a checkout or an installed
+    # wheel), but not from the current folder.
+    paths: Sequence[str] = [os.path.abspath(path) for path in sys.path if path]
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONSAFEPATH": "1",
+        "OMP_NUM_THREADS": str(threads),
+        "OPENBLAS_NUM_THREADS": str(threads),
+    }

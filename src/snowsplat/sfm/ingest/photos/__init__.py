@@ -1,0 +1,1 @@
+"""Reads photos with their metadata and masks, and copies them to input/."""

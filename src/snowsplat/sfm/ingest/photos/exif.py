@@ -1,0 +1,142 @@
+"""Metadata of a photo: orientation, camera, focal length, location and attitude."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from snowsplat.sfm.ingest.photo import Attitude
+from snowsplat.sfm.ingest.photos.attitude import read_attitude
+
+_SRGB = 1
+_PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
+_JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
+
+
+@dataclass(frozen=True)
+class ExifInfo:
+    """The metadata that snowsplat uses."""
+
+    orientation: int = 1  # EXIF value, 1 to 8
+    camera: str = ""  # make, model and focal lengths, which identify a lens and its zoom
+    focal: float | None = None  # pixels of the stored photo, before any resizing
+    location: tuple[float, float, float] | None = None  # latitude, longitude (°), altitude (m)
+    location_error: float | None = None  # m, horizontal, as the receiver states it
+    attitude: Attitude | None = None  # in the frame of the upright photo
+
+
+def read_exif(
+    exif: Image.Exif, width: int, height: int, xmp: bytes = b"", taken: int | None = None
+) -> ExifInfo:
+    """Read the metadata of a photo with ``width`` × ``height`` stored pixels.
+
+    ``xmp`` is the XMP packet of the file, in which drones store the angles of their gimbal.
+    ``taken`` is the orientation with which the photo was taken, if the pixels have been turned
+    since, as in a HEIC file that is open.
+
+    Missing and implausible values have the default of `ExifInfo`.
+    """
+    details, gps = _ifd(exif, IFD.Exif), _ifd(exif, IFD.GPSInfo)
+    stored = exif.get(Base.Orientation, 1)
+    orientation = stored if stored in range(1, 9) else 1
+    named = [str(exif.get(tag) or "").strip("\0 ") for tag in (Base.Make, Base.Model)]
+    zoom = [_number(details.get(tag)) for tag in (Base.FocalLength, Base.FocalLengthIn35mmFilm)]
+    return ExifInfo(
+        orientation=orientation,
+        camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
+        focal=_focal(details, width, height),
+        location=_location(gps),
+        location_error=_number(gps.get(GPS.GPSHPositioningError)),
+        attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
+    )
+
+
+def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
+    """Focal length in pixels, or None if it is unknown or implausible.
+
+    Cameras store the focal length in one of two ways. A 35 mm equivalent is converted by the ratio
+    of the diagonals, as in COLMAP. A focal length in mm is divided by the pixel size. This size is
+    that of the original pixels: if a program has resized the photo, the metadata may still describe
+    the original. Therefore the result is multiplied by the ratio of the longest sides.
+    """
+    focal = None
+    equivalent = _number(details.get(Base.FocalLengthIn35mmFilm))
+    length = _number(details.get(Base.FocalLength))
+    density = _number(details.get(Base.FocalPlaneXResolution))
+    unit = _PLANE_UNITS_IN_MM.get(details.get(Base.FocalPlaneResolutionUnit, 2))
+    if equivalent:
+        focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(width, height)
+    elif length and density and unit:
+        sizes = [_number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
+        original = max((size for size in sizes if size), default=max(width, height))
+        focal = length * density / unit * max(width, height) / original
+    # These limits are fields of view of 150° and 1.5°. Values beyond them were not set correctly.
+    plausible = focal is not None and 0.13 < focal / max(width, height) < 40
+    return focal if plausible else None
+
+
+def _location(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S")
+    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W")
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
+        return None
+    if latitude == 0 and longitude == 0:  # GPS receivers store this if they have no position
+        return None
+    altitude = _number(gps.get(GPS.GPSAltitude)) or 0.0
+    below_sea = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    return latitude, longitude, -altitude if below_sea else altitude
+
+
+def _degrees(value: Any, side: Any, negative: str) -> float | None:
+    if not isinstance(value, tuple | list) or len(value) != 3:
+        return None
+    parts = [_number(part, zero=True) for part in value]
+    if any(part is None for part in parts):
+        return None
+    degrees = sum(part / 60**i for i, part in enumerate(parts) if part)
+    return -degrees if str(side).strip("\0 ").upper() == negative else degrees
+
+
+def _number(value: Any, zero: bool = False) -> float | None:
+    """A positive finite number (or 0 if ``zero``); None for all other values of a tag."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and (number > 0 or (zero and number == 0)) else None
+
+
+def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
+    try:
+        return exif.get_ifd(tag)
+    except Exception:  # damaged metadata may raise any exception, but the pixels may be valid
+        return {}
+
+
+def exif_for_copy(exif: Image.Exif, width: int, height: int) -> bytes:
+    """EXIF data for a copy of a photo that is upright, in sRGB, and has this size.
+
+    Empty if the data are damaged or do not fit into a JPEG file.
+    """
+    try:
+        copy = Image.Exif()
+        copy.load(exif.tobytes())
+        copy[Base.Orientation] = 1
+        details = copy.get_ifd(IFD.Exif)
+        # A maker note contains offsets into the old file. The pixels per unit may have changed.
+        plane = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
+        for tag in (Base.MakerNote, Base.UserComment, *plane, Base.FocalPlaneResolutionUnit):
+            details.pop(tag, None)
+        details[Base.ExifImageWidth], details[Base.ExifImageHeight] = width, height
+        details[Base.ColorSpace] = _SRGB
+        details.pop(IFD.Interop, None)  # it may say that the colours are those of Adobe RGB
+        content = copy.tobytes()
+    except Exception:  # as in `_ifd`
+        return b""
+    return content if len(content) < _JPEG_LIMIT else b""

@@ -1,0 +1,64 @@
+"""Reads and writes masks of photos. SfM and training ignore black and transparent mask pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+from PIL.ExifTags import Base
+
+from snowsplat.data.files.mask_pixels import has_shape, mask_levels
+from snowsplat.data.image_file import reason_of
+from snowsplat.sfm.ingest.photos.photo_files import Header, made_upright, open_image
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import shown
+
+
+def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
+    """The mask (H, W) bool, True for used pixels: upright, with the size of the copied photo.
+
+    The mask file may be upright (by its pixels or by its own EXIF orientation), or have the
+    orientation of the stored pixels of the photo. If both cases have the same size (photos rotated
+    by 180°, square photos), the mask is rotated as the photo, unless it has an EXIF orientation
+    itself.
+
+    Args:
+        photo: the header of the original photo.
+        size: width and height of the copied photo. A mask of another size is scaled. If it is
+            larger, a pixel of the result is used if all pixels that it covers are used.
+
+    Raises: UserError: the mask cannot be decoded, or its aspect ratio is not that of the photo.
+    """
+    try:
+        with open_image(path) as opened:
+            has_orientation = opened.getexif().get(Base.Orientation, 1) != 1
+            image = ImageOps.exif_transpose(opened)
+            image.load()
+    except Exception as error:  # Pillow may raise any exception for a damaged file
+        raise UserError(
+            f"{shown(path)}: the mask cannot be decoded ({reason_of(error)}); replace or remove it"
+        ) from None
+    stored, upright = (photo.width, photo.height), photo.size(None)
+    if not has_orientation and has_shape(image.size, stored):
+        image = made_upright(image, photo.exif.orientation)
+    elif not has_shape(image.size, upright):
+        raise UserError(
+            f"{shown(path)}: the mask is {image.width}x{image.height}, but its photo is "
+            f"{upright[0]}x{upright[1]}; make a mask of this shape"
+        )
+    return shrunk(mask_levels(image) >= 128, size)
+
+
+def shrunk(used: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool resized to ``size`` (width, height): True if all covered pixels are True."""
+    if used.shape == size[::-1]:
+        return used
+    image = Image.fromarray(used.astype(np.uint8) * 255)
+    return np.asarray(image.resize(size, Image.Resampling.BOX)) == 255
+
+
+def write_mask(path: Path, used: np.ndarray) -> None:
+    """Write an 8-bit grey PNG, 0 or 255. Raises OSError if the disk is full."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(used.astype(np.uint8) * 255).save(path, "PNG", compress_level=3)

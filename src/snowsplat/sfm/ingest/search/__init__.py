@@ -1,0 +1,1 @@
+"""Finds photos and videos in folders and archives, each picture once."""

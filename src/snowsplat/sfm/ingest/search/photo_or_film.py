@@ -1,0 +1,72 @@
+"""Whether the photos or the videos of a folder show the scene, if there are both.
+
+Phones save a video of three seconds with every photo; cameras save a small photo with every video.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
+from snowsplat.sfm.ingest.video.clip import film_size, why_no_video
+
+#: With fewer photos, there is no scene.
+MIN_PHOTOS = 3
+
+
+@dataclass
+class Chosen:
+    """Files relative to their folder; and path and reason of each of the others."""
+
+    photos: list[str]
+    videos: list[str]
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+
+def photos_or_films(root: Path, photos: Sequence[str], videos: Sequence[str]) -> Chosen:
+    """The photos of a folder, or its videos if there are fewer than three photos.
+
+    A photo with the name of a video, and not larger than its frames, is the thumbnail of the video.
+    Videos that cannot be read are left out if others can.
+    """
+    if not videos:
+        return Chosen(list(photos), [])
+    films = {_stem(video): video for video in videos}
+    thumbnails: dict[str, str] = {}
+    others = 0
+    for photo in photos:
+        film = films.get(_stem(photo))
+        if film is not None and _is_thumbnail(root / photo, root / film):
+            thumbnails[photo] = f"is the thumbnail of {film}"
+            continue
+        others += 1
+        if others == MIN_PHOTOS:
+            reason = "is a video in a folder of photos; add it as an input to use its frames"
+            return Chosen(list(photos), [], [(video, reason) for video in videos])
+    unreadable = {video: why for video in videos if (why := why_no_video(root / video))}
+    readable = [video for video in videos if video not in unreadable]
+    if not readable:
+        # Without photos, reading the videos raises the error that says what is wrong.
+        return (
+            Chosen(list(photos), [], list(unreadable.items())) if photos else Chosen([], [*videos])
+        )
+    few = "is beside a video, and too few for a scene; the video is used"
+    unused = [(photo, thumbnails.get(photo, few)) for photo in photos]
+    return Chosen([], readable, [*unused, *unreadable.items()])
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix("")).casefold()
+
+
+def _is_thumbnail(photo: Path, video: Path) -> bool:
+    frame = film_size(video)
+    if frame is None:
+        return False
+    try:
+        header = read_header(photo)
+    except Unusable:  # for example an icon
+        return True
+    return header.width * header.height <= frame[0] * frame[1]

@@ -1,0 +1,409 @@
+"""Finds the input files: photos and videos, their names in ``input/``, and their masks."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
+from snowsplat.data.files.masks import FoundMasks, find_masks
+from snowsplat.data.image_file import OPTIONAL_FORMATS
+from snowsplat.data.imports import find_export
+from snowsplat.data.load import poses_in
+from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
+from snowsplat.sfm.ingest.search.copies import find_copies
+from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
+from snowsplat.sfm.ingest.video.clip import ONLY_SOUND, why_no_video
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import shown
+
+
+def _suffixes(names: str) -> frozenset[str]:
+    return frozenset(f".{name}" for name in names.split())
+
+
+PHOTO_SUFFIXES = _suffixes(
+    "jpg jpeg jpe jfif mpo png webp tif tiff heic heif hif bmp ppm "
+    + " ".join(OPTIONAL_FORMATS).lower()
+)
+VIDEO_SUFFIXES = _suffixes(
+    "mp4 mov m4v mkv avi webm mpg mpeg mts m2ts ts 3gp 3g2 wmv ogv mjpeg flv insv gif"
+)
+# Formats that are not read, first raw photos: the user should learn that such photos are not used.
+_UNREAD = (
+    "dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw iiq 3fr fff gpr rwl "
+    "avif jxl jp2 j2k jpx jpf jxr psd psb exr hdr tga"
+)
+_UNREAD_SUFFIXES = frozenset(
+    f".{name}" for name in _UNREAD.split() if name.upper() not in OPTIONAL_FORMATS
+)
+#: The record of the stages of a dataset, and its name in version 0.1.0.
+RECORDS = ("sfm.json", "capture.json")
+# Folders in a dataset in which programs keep models of all its images.
+_MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
+_LONGEST_NAME = 200  # bytes of a name in input/
+_KEPT_END = 12  # characters at the end of a longer name
+# The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
+_MAP = re.compile(
+    r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """An input file."""
+
+    path: Path
+    kind: Literal["photo", "video"]
+    #: Relative to ``input/``, with "/": the file of a photo, or the folder for the frames of a
+    #: video ("" for ``input/`` itself).
+    name: str
+    mask: Path | None = None  # the mask of a photo
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The photos and videos in the inputs, as `find_sources` has found them.
+
+    Attributes:
+        inputs: the files and folders that were searched.
+        files: in the order of the inputs; files of a folder are in natural order.
+        left_out: path and reason of each photo, video or folder that is not used.
+        unused_masks: masks without a photo.
+        notes: lines for the user.
+        posed: the folder with camera poses, if it is the only input.
+    """
+
+    inputs: tuple[Path, ...]
+    files: list[Source]
+    left_out: list[tuple[str, str]]
+    unused_masks: list[Path]
+    notes: list[str] = field(default_factory=list)
+    posed: Path | None = None
+
+    @property
+    def photos(self) -> list[Source]:
+        return [source for source in self.files if source.kind == "photo"]
+
+    @property
+    def videos(self) -> list[Source]:
+        return [source for source in self.files if source.kind == "video"]
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files that structure from motion reads, including masks."""
+        paths = (path for source in self.files for path in (source.path, source.mask))
+        return [path for path in paths if path is not None]
+
+    def contain(self, folder: Path) -> bool:
+        """Whether ``folder`` itself is one of the inputs."""
+        return any(path.resolve() == folder.resolve() for path in self.inputs)
+
+
+def find_sources(inputs: Sequence[Path]) -> Sources:
+    """Find photos and videos in files and folders; folders are searched recursively.
+
+    Hidden files, datasets and output folders are skipped; so are folders of masks, depth maps and
+    thumbnails. Of photos of the same picture, one is used. Of a dataset, the photos in ``input`` or
+    ``images`` are used. Videos in a folder with photos are also skipped, because some phones save a
+    video of three seconds with every photo. A zip file is unpacked into a folder beside it. If
+    there is a single input, the files keep their names. If there are several, each input folder and
+    each video gets its own folder in ``input/``, so that equal names do not collide.
+
+    Raises:
+        UserError: an input does not exist, or is neither a photo nor a video; or no file was found.
+    """
+    if not inputs:
+        raise UserError("inputs: none given; add a folder of photos, photos or a video")
+    files: list[Source] = []
+    left_out: list[tuple[str, str]] = []
+    unused: list[Path] = []
+    notes: list[str] = []
+    posed: Path | None = None
+    seen: dict[Path, Path] = {}
+    folders = {"masks"}  # names in use
+
+    def add(source: Source) -> None:
+        real = source.path.resolve()
+        if real in seen:
+            left_out.append((shown(source.path), f"is the same file as {shown(seen[real])}"))
+        else:
+            seen[real] = source.path
+            files.append(source)
+
+    for path in inputs:
+        if not path.exists():
+            raise UserError(f"{shown(path)}: no such file or folder")
+        if is_zip(path):
+            path = _unpacked(path)
+        if not path.is_dir():
+            kind = kind_of_file(path)
+            if kind == "photo":
+                mask = find_masks(path.parent, [path.name]).of.get(path.name)
+                add(Source(path, kind, shown(path.name), mask))
+            else:
+                add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
+            continue
+        if (poses := poses_in(path)) is not None:
+            posed = path if len(inputs) == 1 else None
+            notes.append(
+                f"{shown(path)}: has camera poses already ({shown(poses)}), which are estimated "
+                f"again; to use them: snowsplat make {shown(path)}"
+            )
+        elif (export := find_export(path)) is not None and export.photos is not None:
+            notes.append(
+                f"{shown(path)}: a capture of {export.kind.name} without camera poses; the photos "
+                f"in {shown(export.photos.relative_to(path).as_posix())} are used"
+            )
+        photo_folder = _photos_of_dataset(path)
+        found = _search(photo_folder)
+        chosen = photos_or_films(photo_folder, found.photos, found.videos)
+        prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
+        left_out += found.left_out
+        left_out += [(shown(photo_folder / file), reason) for file, reason in chosen.left_out]
+        for relative in chosen.photos:
+            name = str(PurePosixPath(prefix) / shown(relative))
+            add(Source(photo_folder / relative, "photo", name, found.masks.of.get(relative)))
+        unused += found.masks.unused
+        for relative in chosen.videos:
+            stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
+            video = prefix if len(chosen.videos) == 1 else _free(stem, folders)
+            add(Source(photo_folder / relative, "video", video))
+    if not files:
+        raise _nothing_in(inputs)
+    return Sources(tuple(inputs), files, left_out, unused, notes, posed)
+
+
+@dataclass
+class _Folder:
+    """The photos and videos below a folder, relative to it."""
+
+    photos: list[str] = field(default_factory=list)
+    videos: list[str] = field(default_factory=list)
+    masks: FoundMasks = field(default_factory=FoundMasks)
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # file or folder; reason
+
+
+def _search(root: Path) -> _Folder:
+    """What is in a folder: each photo once, without masks, maps, thumbnails and outputs."""
+    found = _Folder()
+
+    def enter(folder: Path, names: list[str]) -> Iterator[str]:
+        for name in names:
+            reason = _why_left_out(name, names)
+            if is_output(folder / name) or folder_kind(name) == "masks":
+                continue
+            if reason is None:
+                yield name
+            else:
+                found.left_out.append((shown(folder / name), reason))
+
+    broken: list[str] = []
+    files = files_below(root, enter, broken)
+    if not any(_is_photo_name(file) or _is_video_name(file) for file in files):
+        found.left_out = []  # only photos called depth/1.png: they are the photos
+        files = files_below(root, _masks_and_outputs)
+    photos = [file for file in files if _is_photo_name(file)]
+    if unread := _unread_photos(files, photos):
+        found.left_out.append((shown(root), unread))
+    if links := _broken_links(broken):
+        found.left_out.append((shown(root), links))
+    found.videos = [file for file in files if _is_video_name(file)]
+    no_views = {
+        copy.name: f"is the same picture as {copy.used}" for copy in find_copies(root, photos)
+    }
+    no_views |= {
+        map_: f"is a {kind} of another photo" for map_, kind in _maps_beside(photos).items()
+    }
+    found.left_out += [(shown(root / name), reason) for name, reason in no_views.items()]
+    photos = [photo for photo in photos if photo not in no_views]
+    found.masks = find_masks(root, photos)
+    found.photos = [photo for photo in photos if photo not in found.masks.beside]
+    return found
+
+
+def _format_name(name: str) -> str:
+    """The name of a format, e.g. DNG, from the name of a file."""
+    return PurePosixPath(name).suffix[1:].upper()
+
+
+def _unread_photos(files: Iterable[str], read: Sequence[str]) -> str | None:
+    """What to say about the photos among ``files`` that are in such a format; None: there are none.
+
+    Cameras save a raw photo and a JPEG of it. Therefore a photo that is also among those that are
+    ``read`` does not count.
+    """
+    also = {_stem(name) for name in read}
+    counts = Counter(
+        _format_name(name)
+        for name in files
+        if PurePosixPath(name).suffix.lower() in _UNREAD_SUFFIXES and _stem(name) not in also
+    )
+    if not counts:
+        return None
+    listed = " and ".join(f"{count:,} {name}" for name, count in counts.most_common())
+    noun = "photo" if counts.total() == 1 else "photos"
+    return f"has {listed} {noun}, which cannot be read; save them as JPEG or PNG first"
+
+
+def _stem(name: str) -> str:
+    return str(PurePosixPath(name).with_suffix("")).casefold()
+
+
+def _broken_links(broken: Sequence[str]) -> str | None:
+    """The reason why photos and videos are not used that are broken links; None if none is."""
+    links = [name for name in broken if _is_photo_name(name) or _is_video_name(name)]
+    if not links:
+        return None
+    others = f" and {len(links) - 1} more" if len(links) > 1 else ""
+    return f"has links to files that are missing: {shown(links[0])}{others}; copy the files here"
+
+
+def _why_left_out(name: str, siblings: Sequence[str]) -> str | None:
+    """Why a folder is not searched; None if it is."""
+    kind, original = folder_kind(name), original_of(name, siblings, divided=False)
+    if kind == "maps":
+        return "is a folder of maps, not of photos"
+    if kind == "thumbnails":
+        return "is a folder of small copies"
+    return None if original is None else f"is a folder of changed copies of those in {original}"
+
+
+def _masks_and_outputs(folder: Path, names: list[str]) -> list[str]:
+    """The subfolders that are neither masks nor outputs."""
+    return [n for n in names if folder_kind(n) != "masks" and not is_output(folder / n)]
+
+
+def _is_photo_name(file: str) -> bool:
+    return PurePosixPath(file).suffix.lower() in PHOTO_SUFFIXES
+
+
+def _is_video_name(file: str) -> bool:
+    return PurePosixPath(file).suffix.lower() in VIDEO_SUFFIXES
+
+
+def _maps_beside(photos: Sequence[str]) -> dict[str, str]:
+    """Photos that are maps by their names, as IMG_depth.png beside IMG.jpg, and what they are."""
+    stems = {str(PurePosixPath(photo).with_suffix("")) for photo in photos}
+    matches = {photo: _MAP.fullmatch(photo) for photo in photos}
+    return {
+        photo: f"{match['kind']} map"
+        for photo, match in matches.items()
+        if match is not None and match["stem"] in stems
+    }
+
+
+def _photos_of_dataset(root: Path) -> Path:
+    """The folder of the photos of a dataset; ``root`` itself if it is no dataset or has none."""
+    export = find_export(root)
+    if export is not None and export.photos is not None:
+        return export.photos
+    poses = poses_in(root)
+    # A model deeper in the folder may be that of a few of the photos.
+    near = poses is not None and (len(poses.parts) == 1 or poses.parts[0] in _MODEL_FOLDERS)
+    if not (near or is_output(root)):
+        return root
+    for name in ("input", "images"):
+        if (root / name).is_dir():
+            return root / name
+    return root
+
+
+def _unpacked(path: Path) -> Path:
+    """The folder of a zip file of photos or videos. Raises UserError if it has none."""
+    names = [PurePosixPath(name) for name in files_in(path)]
+    if any(name.name in ("means_l.webp", "lod-meta.json") for name in names):
+        raise UserError(f"{shown(path)}: is a scene, and no photos; see it with: snowsplat view")
+    if not any(name.suffix.lower() in PHOTO_SUFFIXES | VIDEO_SUFFIXES for name in names):
+        raise UserError(f"{shown(path)}: is a zip file without photos and videos")
+    return unpack(path)
+
+
+def kind_of_file(path: Path) -> Literal["photo", "video"]:
+    """The kind of a file that was given as an input; it is determined by the content.
+
+    Raises: UserError: neither photo nor video, or the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(32)
+    except OSError as error:
+        raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
+    suffix = path.suffix.lower()
+    if suffix in _UNREAD_SUFFIXES:  # many are TIFF files with a small preview
+        form = _format_name(path.name)
+        raise UserError(
+            f"{shown(path)}: is a {form} photo, which cannot be read; save it as JPEG or PNG first"
+        )
+    if _is_photo(head):
+        return "photo"
+    if archive := other_archive(path):
+        raise UserError(f"{shown(path)}: is a {archive} archive; unpack it first")
+    no_video = why_no_video(path)
+    if no_video is None:
+        return "video"
+    if suffix in PHOTO_SUFFIXES:
+        raise UserError(f"{shown(path)}: not a photo, despite its extension; use another file")
+    if suffix in VIDEO_SUFFIXES or no_video == ONLY_SOUND:
+        raise UserError(f"{shown(path)}: {no_video}; copy it again, or use another file")
+    raise UserError(f"{shown(path)}: neither a photo nor a video; use another file")
+
+
+def _is_photo(head: bytes) -> bool:
+    """Whether the first bytes are the signature of a photo format."""
+    if head[4:8] == b"ftyp":  # HEIF shares its container with mp4
+        return head[8:12] in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
+    if head[:4] == b"RIFF":
+        return head[8:12] == b"WEBP"
+    signatures = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"BM", b"P5", b"P6")
+    return head.startswith(signatures)
+
+
+def _nothing_in(inputs: Sequence[Path]) -> UserError:
+    names = ", ".join(map(shown, inputs))
+    for path in inputs:
+        broken: list[str] = []
+        files = files_below(path, _masks_and_outputs, broken)
+        if reason := _unread_photos(files, []) or _broken_links(broken):
+            return UserError(f"{names}: {reason}")
+    return UserError(
+        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
+        "that contains them"
+    )
+
+
+def free_names(names: Sequence[str]) -> Iterator[str]:
+    """The names, made unique and not too long: a name that equals an earlier one except for case
+    gets a suffix.
+
+    "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on.
+    """
+    taken: set[str] = set()
+    for name in names:
+        yield _free(name, taken)
+
+
+def _shortened(part: str) -> str:
+    """A name of at most 200 bytes, so that ".NAME.png.tmp" fits into the 255 of a file system."""
+    if len(part.encode()) <= _LONGEST_NAME:
+        return part
+    path = PurePosixPath(part)
+    end = path.stem[-_KEPT_END:] + path.suffix  # with the number of the photo
+    room = max(0, _LONGEST_NAME - len(end.encode()))
+    return path.stem.encode()[:room].decode(errors="ignore") + end
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """``name``, or a variant of it that is not in ``taken``; the result is added to ``taken``."""
+    name = "/".join(_shortened(part) for part in shown(name).split("/"))
+    path = PurePosixPath(name)
+    candidate, n = name, 1
+    while candidate.casefold() in taken:
+        n += 1
+        candidate = str(path.with_name(f"{path.stem}_{n}{path.suffix}"))
+    taken.add(candidate.casefold())
+    return candidate

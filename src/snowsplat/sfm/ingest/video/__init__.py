@@ -1,0 +1,1 @@
+"""Reads videos, and writes their sharpest frames to input/."""

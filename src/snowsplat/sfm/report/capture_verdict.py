@@ -1,0 +1,197 @@
+"""The verdict on photos and their camera poses, before any training.
+
+Each rule has a reason that does not depend on the scene. Lengths are relative to the distance
+of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snowsplat.evaluation.verdict import Grade, Reason, Verdict
+from snowsplat.sfm.ingest.search.sources import RECORDS
+from snowsplat.sfm.report.coverage import Coverage
+from snowsplat.util.safe_json import read_json
+
+#: With fewer photos, no photo is left to check the poses and to hold out.
+_TOO_FEW = 8
+#: With fewer photos, at most every 12 degrees of a round is photographed.
+_FEW = 30
+#: Median step between photos, as a share of the distance of the scene. At a tenth, the views differ
+#: by 6 degrees. At a fifth, 11 degrees, surfaces are hidden in one of two photos and seen in the
+#: other. At a half, 27 degrees, features are rarely recognised.
+_SMALL_STEP, _LARGE_STEP, _HUGE_STEP = 0.1, 0.2, 0.5
+#: If less than this share of the points of a typical photo is confirmed by two other photos, most
+#: of the scene is known from two photos only.
+_CONFIRMED = 0.5
+#: A photo at an end of the path is weak if its confirmed share is below this share of the median.
+_WEAK_END = 0.6
+#: Share of the photos without a pose from which it is told, and from which the rest is poor.
+_SOME_LOST, _MANY_LOST = 0.05, 0.34
+#: Share of the photos that are blurred, too dark or too bright, from which it is told.
+_BAD_PHOTOS = 0.2
+#: Optical axes within this angle, in degrees, show one side of a scene.
+_ONE_SIDE = 15.0
+#: The mean reprojection error of good poses is below 1 pixel.
+_MAX_ERROR = 1.5
+#: The agreement of poses with their matches (`SfmResult`) is 0.61 to 0.80 in bent models, and 0.92
+#: or more in right ones.
+_BENT = 0.86
+
+_CLOSER = (
+    "move by at most a tenth of the distance to what you photograph from one photo to the next, so "
+    "that every place is in at least five photos"
+)
+
+
+def capture_verdict(
+    coverage: Coverage, sfm: Mapping[str, Any], problems: Mapping[str, str]
+) -> Verdict:
+    """The verdict.
+
+    Args:
+        coverage: of the photos with a pose.
+        sfm: an `SfmResult` as JSON values. The entries "doubts" and "agreement" are optional.
+        problems: photos that are blurred, too dark or too bright, and what is wrong.
+    """
+    # A photo of a wide lens becomes several images.
+    photos = min(len(sfm["registered"]), len(coverage.names))
+    reasons = [
+        *_lost(sfm),
+        *_distances(coverage),
+        *_doubts(sfm),
+        *_count(coverage, photos),
+        *_ends(coverage),
+        *_errors(sfm),
+        *_bad_photos(problems, len(coverage.names)),
+        *_one_side(coverage),
+    ]
+    verdict = Verdict.of(reasons)
+    return Verdict.of([_praise(coverage, photos), *reasons]) if verdict.grade == "good" else verdict
+
+
+def recorded_verdict(dataset: Path) -> Verdict | None:
+    """The verdict that the record of a dataset contains; None: there is none."""
+    for name in RECORDS:
+        try:
+            values = read_json(dataset / name)["stages"]["report"]["result"]["verdict"]
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        return Verdict.from_json(values)
+    return None
+
+
+def _lost(sfm: Mapping[str, Any]) -> list[Reason]:
+    lost, placed = len(sfm["unregistered"]), len(sfm["registered"])
+    share = lost / max(lost + placed, 1)
+    if share < _SOME_LOST:
+        return []
+    groups = len(sfm["sub_models"])
+    apart = f"; the photos form {groups} groups without common points" if groups > 1 else ""
+    text = f"{lost} of {lost + placed} photos could not be placed{apart}"
+    advice = "take more photos between those that are placed and those that are not"
+    return [Reason("poor" if share >= _MANY_LOST else "usable", text, advice)]
+
+
+def _doubts(sfm: Mapping[str, Any]) -> list[Reason]:
+    """What is doubtful about the cameras. In a bent model, parts of the scene are doubled."""
+    grade: Grade = "poor" if sfm.get("agreement", 1.0) < _BENT else "usable"
+    return [Reason(grade, doubt) for doubt in sfm.get("doubts", ())]
+
+
+def _distances(coverage: Coverage) -> list[Reason]:
+    """The steps from photo to photo, and the points that only two photos show."""
+    if np.isnan(coverage.confirmed).all():  # the model has no observations
+        return []
+    reasons = []
+    confirmed, step = _median(coverage.confirmed), _median(coverage.step)
+    far = (
+        f"the photos are far apart: the next one is typically {100 * step:.0f}% of the distance "
+        "to the scene away"
+        if np.isfinite(step)
+        else "most photos have no other photo that shows the same"
+    )
+    if confirmed < _CONFIRMED:
+        why = (
+            f"too few photos show the same: in a typical photo, {100 * (1 - confirmed):.0f}% of "
+            "the points are in only one other photo"
+        )
+        reasons.append(Reason("poor", why, _CLOSER))
+    if step > _LARGE_STEP:
+        reasons.append(Reason("poor" if step > _HUGE_STEP else "usable", far, _CLOSER))
+    return reasons
+
+
+def _count(coverage: Coverage, count: int) -> list[Reason]:
+    advice = "take 30 to 100 photos of an object or a room, and more of a larger place"
+    if count < _TOO_FEW:
+        return [Reason("poor", f"{count} photos are too few", advice)]
+    # A few photos are enough for one side of a scene.
+    if count < _FEW and not (_looks_one_way(coverage) and _median(coverage.step) <= _SMALL_STEP):
+        return [Reason("usable", f"{count} photos are few", advice)]
+    return []
+
+
+def _ends(coverage: Coverage) -> list[Reason]:
+    """The first and the last photo, by name, of a path."""
+    if len(coverage.names) < _TOO_FEW:
+        return []
+    least = _WEAK_END * _median(coverage.confirmed)
+    weak = [coverage.names[i] for i in (0, -1) if coverage.confirmed[i] < least]
+    if not weak:
+        return []
+    text = (
+        f"most of what {' and '.join(weak)} show{'s' if len(weak) == 1 else ''}, at the end of "
+        "your path, is in only one other photo"
+    )
+    advice = "begin earlier and end later than the place that you want to show"
+    return [Reason("good", text, advice)]
+
+
+def _errors(sfm: Mapping[str, Any]) -> list[Reason]:
+    error = sfm["reprojection_error"]
+    if error is None or error <= _MAX_ERROR:
+        return []
+    text = f"the reprojection error is high: {error:.1f} pixels"
+    advice = "leave out photos that are blurred or show moving objects, or try another --camera"
+    return [Reason("usable", text, advice)]
+
+
+def _bad_photos(problems: Mapping[str, str], count: int) -> list[Reason]:
+    if len(problems) < _BAD_PHOTOS * count:
+        return []
+    # All of one kind have the same text: "is blurred; hold the camera still …".
+    kinds = list(problems.values())
+    most = max(dict.fromkeys(kinds), key=kinds.count)
+    what, _, advice = most.partition("; ")
+    number = kinds.count(most)
+    return [Reason("usable", f"{number} of {count} photos: each {what}", advice)]
+
+
+def _one_side(coverage: Coverage) -> list[Reason]:
+    if not _looks_one_way(coverage):
+        return []
+    text = "all photos look in about the same direction: the scene can be seen from there only"
+    return [Reason("good", text)]
+
+
+def _looks_one_way(coverage: Coverage) -> bool:
+    return float(np.quantile(coverage.directions, 0.9)) < _ONE_SIDE
+
+
+def _praise(coverage: Coverage, photos: int) -> Reason:
+    text = f"{photos} photos"
+    if (confirmed := _median(coverage.confirmed)) > 0.0:
+        share = f"{100 * confirmed:.0f}%"
+        text += f"; in a typical one, {share} of the points are in at least two others"
+    return Reason("good", text)
+
+
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """The median of the values that are not NaN; 0 if there are none."""
+    known = np.asarray(values)[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else 0.0

@@ -1,0 +1,72 @@
+"""The explanation of a failure, from the numbers of features and matches."""
+
+import itertools
+
+import pytest
+
+from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
+from snowsplat.sfm.colmap.database import Pair
+from snowsplat.sfm.ingest.photo import Photo
+
+
+def photos(count):
+    return [
+        Photo(f"{i}.jpg", f"{i}.jpg", 640, 480, "", None, None, None, False, False)
+        for i in range(count)
+    ]
+
+
+def all_pairs(count, inliers=200, flat=False):
+    return [Pair(i, j, inliers, flat) for i, j in itertools.combinations(range(count), 2)]
+
+
+def test_each_photo_without_a_pose_has_its_own_reason():
+    features = [2000, 2000, 2000, 12, 2000, 2000, 2000, 2000, 2000, 2000]
+    pairs = [Pair(0, 1, 300, False), Pair(0, 5, 22, False), Pair(2, 5, 18, False)]
+    pairs += [Pair(1, 6, 400, False), Pair(7, 8, 90, False)]
+    evidence = Evidence(features, pairs, 0.2, 36)
+    models = [{"0.jpg", "1.jpg", "2.jpg"}, {"7.jpg", "8.jpg"}]
+    reasons = explain(photos(10), evidence, models, {"9.jpg": "its place is wrong"})
+    assert list(reasons) == [f"{i}.jpg" for i in (3, 4, 5, 6, 7, 8, 9)]
+    assert "hardly any detail (12 features)" in reasons["3.jpg"]
+    assert reasons["4.jpg"] == "it matches no other photo"
+    assert reasons["5.jpg"] == "it has too few matches with 2 other photos (at most 22)"
+    assert reasons["6.jpg"] == "its matches with 1 other photo are not consistent with the model"
+    assert "a separate group of 2 photos" in reasons["7.jpg"]
+    assert reasons["9.jpg"] == "its place is wrong"
+
+
+@pytest.mark.parametrize(
+    ("evidence", "message"),
+    [
+        (Evidence([0] * 5, [], None, 10), "only 0 of 5 show enough detail"),
+        (Evidence([0, 2000, 2000, 3], [Pair(1, 2, 99, False)], 0.1, 6), "only 2 of 4 show enough"),
+        (Evidence([2000] * 5, [], None, 10), "no two of them match"),
+        (Evidence([2000] * 5, [Pair(0, 4, 80, False)], 0.1, 10), "only 2 of them match"),
+        (Evidence([2000] * 5, all_pairs(5, flat=True), 0.001, 10), "camera hardly moved"),
+        (Evidence([2000] * 5, all_pairs(5, flat=True), 0.1, 10), "only rotated"),
+        (Evidence([2000] * 5, all_pairs(5), 0.1, 10), "too few or inconsistent"),
+    ],
+)
+def test_failure_has_a_reason_and_advice(evidence, message):
+    text = str(failure(evidence))
+    assert "\n" not in text
+    assert text.count(";") == 1
+    with pytest.raises(type(failure(evidence)), match=message):
+        raise failure(evidence)
+
+
+def test_more_effort_is_useless_without_overlap_or_motion():
+    assert Evidence([0] * 5, [], None, 10).more_effort_is_useless
+    assert Evidence([2000] * 5, [], None, 10).more_effort_is_useless
+    assert not Evidence([2000] * 5, [], None, 4).more_effort_is_useless  # not all pairs matched
+    # With so few features, more effort may find more of them.
+    assert not Evidence([300] * 5, [], None, 10).more_effort_is_useless
+    assert not Evidence([2000] * 5, all_pairs(5), 0.1, 10).more_effort_is_useless
+    assert Evidence([2000] * 5, all_pairs(5), 0.001, 10).more_effort_is_useless
+    assert Evidence([2000] * 5, all_pairs(5, flat=True), 0.1, 10).more_effort_is_useless
+
+
+def test_unusable_photos_are_not_counted():
+    evidence = Evidence([2000, 2000, 2000, 10, 2000], all_pairs(3), 0.1, 10)
+    assert evidence.usable == 3

@@ -1,0 +1,166 @@
+"""A lens in doubt is compared with what is known about lenses, and with that in EXIF."""
+
+import re
+
+import numpy as np
+import pycolmap
+import pytest
+
+from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, settled
+from snowsplat.sfm.colmap.mapping.mapping import Mapping
+from snowsplat.sfm.progress import silent
+
+from . import walks
+
+pytestmark = pytest.mark.sfm
+
+
+def lens(model, params, size=(1024, 768)):
+    return pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", [820.0, 512.0, 384.0]),
+        ("OPENCV", [820.0, 822.0, 512.0, 384.0, 0.05, -0.08, 0.001, -0.002]),  # of a phone
+        ("SIMPLE_RADIAL", [820.0, 512.0, 384.0, 0.1]),
+        ("OPENCV", [600.0, 600.0, 512.0, 384.0, -0.25, 0.06, 0.0, 0.0]),  # a wide lens
+        ("OPENCV_FISHEYE", [400.0, 400.0, 512.0, 384.0, 0.0, 0.0, 0.0, 0.0]),
+        ("FOV", [500.0, 500.0, 512.0, 384.0, 0.9]),
+    ],
+)
+def test_lenses_of_real_cameras_are_possible(model, params):
+    assert findings_of(lens(model, params), None) == []
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "exif", "message"),
+    [
+        ("SIMPLE_RADIAL", [820.0, 512.0, 384.0, -0.6], None, "not one-to-one"),
+        (
+            "SIMPLE_RADIAL",
+            [820.0, 512.0, 384.0, 0.3],
+            None,
+            "at the border by 1[0-9]%",
+        ),
+        (
+            "OPENCV",
+            [820.0, 820.0, 512.0, 384.0, 1.0, -1.5, 0.0, 0.0],
+            None,
+            "at the border by 17%",
+        ),
+        ("OPENCV", [956.0, 950.0, 512.0, 384.0, 0.29, -0.66, 0.0, 0.0], None, "outwards by 3.2%"),
+        ("OPENCV", [956.0, 920.0, 512.0, 384.0, 0.0, 0.0, 0.0, 0.0], None, "fx is 1.039 of fy"),
+        ("SIMPLE_PINHOLE", [4.3, 512.0, 384.0], None, "field of view of 179"),
+        ("SIMPLE_PINHOLE", [820.0, 512.0, 384.0], 1640.0, "820 pixels, but 1640 by the EXIF"),
+        (
+            "SIMPLE_PINHOLE",
+            [820.0, 1100.0, 384.0],
+            None,
+            r"principal point \(1100, 384\) is outside",
+        ),
+    ],
+)
+def test_a_lens_in_doubt_is_named(model, params, exif, message):
+    (found,) = findings_of(lens(model, params), exif)
+    assert re.search(message, found.text)
+
+
+def mapped(tmp_path, walk, exif, lens, **options):
+    """The model of a walk, and a function as `Refine`."""
+    database = walk.write(tmp_path / "database.db", exif, lens)
+    mapping = Mapping(database, tmp_path, 1.0, 1, silent, lens.held, **options)
+    models = mapping.run("incremental")
+
+    def refine(model, cameras, held):
+        other = Mapping(database, tmp_path, 1.0, 1, silent, held, **options)
+        return other.with_cameras(model, cameras)
+
+    return models, refine
+
+
+def test_a_walk_straight_ahead(tmp_path):
+    """No two photos have the angle with which COLMAP starts a model."""
+    walk = walks.forward()
+    (tmp_path / "before").mkdir()
+    assert mapped(tmp_path / "before", walk, None, Lens())[0] == []
+    (model,), _ = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
+    assert model.num_reg_images() == len(walk.centres)
+    images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda i: i.name)
+    centres = np.array([image.projection_center() for image in images])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    true = np.linalg.norm(np.diff(walk.centres, axis=0), axis=1)
+    np.testing.assert_allclose(steps / steps.mean(), true / true.mean(), rtol=0.05)
+
+
+def test_photos_that_do_not_determine_the_focal_length_keep_that_of_exif(tmp_path):
+    walk = walks.forward()
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
+    found = settled(model, walk.photos(500.0), Lens().fixed, refine)
+    assert found.held
+    assert found.notes == []
+    assert found.model.cameras[1].mean_focal_length() == 500.0
+
+
+def test_photos_that_do_not_determine_two_focal_lengths_get_one(tmp_path):
+    walk = walks.facing()
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens())
+    assert abs(model.cameras[1].focal_length_x / model.cameras[1].focal_length_y - 1) > 0.005
+    found = settled(model, walk.photos(500.0), Lens(), refine)
+    assert found.model.cameras[1].model_name == "RADIAL"
+    assert not found.held
+
+
+def test_pixels_that_are_not_square(tmp_path):
+    """Such as those of an anamorphic video: the photos decide."""
+    walk = walks.sideways()
+    for pixels in walk.pixels:
+        pixels[:, 0] *= 1.2
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens())
+    found = settled(model, walk.photos(500.0), Lens(), refine)
+    camera = found.model.cameras[1]
+    assert camera.focal_length_x / camera.focal_length_y == pytest.approx(1.2, abs=0.01)
+
+
+@pytest.mark.parametrize("exif", [250.0, 1000.0])
+def test_a_wrong_focal_length_in_exif_is_told(tmp_path, exif):
+    walk = walks.sideways()
+    (model,), refine = mapped(tmp_path, walk, exif, Lens())
+    found = settled(model, walk.photos(exif), Lens(), refine)
+    assert not found.held
+    assert found.model.cameras[1].mean_focal_length() == pytest.approx(walks.FOCAL, rel=0.01)
+    (note,) = found.notes
+    assert f"the focal length in EXIF ({exif:.0f} pixels) does not agree" in note
+
+
+def test_a_right_lens_is_kept_as_it_is(tmp_path):
+    walk = walks.sideways()
+    (model,), _ = mapped(tmp_path, walk, 505.0, Lens())
+    found = settled(model, walk.photos(505.0), Lens(), refine=None)
+    assert found.model is model
+
+
+def test_a_panorama_is_kept_as_it_is(tmp_path):
+    """It has no focal length; COLMAP ends the process if it is asked for one."""
+    walk = walks.sideways()
+    (model,), _ = mapped(tmp_path, walk, None, Lens())
+    camera = model.cameras[1]
+    camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
+    camera.params = [camera.width, camera.height]
+    found = settled(model, walk.photos(None), Lens(), refine=None)
+    assert found.model is model
+    assert (found.held, found.notes) == (False, [])
+
+
+def test_an_impossible_lens_is_replaced(tmp_path):
+    """Pixels that are not square, and a distortion that no lens has."""
+    walk = walks.forward()
+    (model,), refine = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
+    camera = model.cameras[1]
+    camera.model = pycolmap.CameraModelId.OPENCV
+    camera.params = [480.0, 460.0, 320.0, 240.0, 0.9, -1.2, 0.0, 0.0]
+    found = settled(model, walk.photos(None), Lens(), refine)
+    assert found.held
+    assert found.model.cameras[1].params[0] == cameras_of(walk.photos(None), Lens())[0].params[0]
+    assert all(not finding.impossible for finding in findings_of(found.model.cameras[1], None))
