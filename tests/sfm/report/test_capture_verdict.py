@@ -14,7 +14,7 @@ from snowsplat.sfm.report.capture_verdict import capture_verdict, recorded_verdi
 from snowsplat.sfm.report.coverage import Coverage, measure_coverage
 from snowsplat.sfm.report.photo_problems import BLURRED, DARK
 
-CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "captures"
+CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "captures"
 
 
 def coverage(

@@ -20,7 +20,7 @@ from snowsplat.sfm.report import dataset_report
 from snowsplat.sfm.report.dataset_report import write_report
 from snowsplat.sfm.report.photo_problems import DARK
 
-from ..browser import chinese_labels
+from ...browser import chinese_labels
 
 NAMES = [
     "one.jpg",

@@ -20,7 +20,7 @@ from snowsplat.sfm.colmap.pairs.choice import PairChoice
 from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
 from snowsplat.sfm.progress import silent
 
-from . import look_alikes
+from .. import look_alikes
 
 pytestmark = pytest.mark.sfm
 

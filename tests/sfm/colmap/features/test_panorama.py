@@ -7,7 +7,7 @@ from snowsplat.data.lens.project import LensModel, directions
 from snowsplat.sfm.colmap.features.panorama import detect_in_panorama
 from snowsplat.sfm.colmap.pairs.matching import match_descriptors
 
-from ...scenes.lenses import Equirectangular
+from ....scenes.lenses import Equirectangular
 
 WIDTH = 640
 LENS = LensModel("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (float(WIDTH), WIDTH / 2))

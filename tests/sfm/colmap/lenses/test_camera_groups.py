@@ -25,7 +25,7 @@ from snowsplat.sfm.colmap.pairs.choice import PairChoice
 from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
 from snowsplat.sfm.progress import silent
 
-from . import walks
+from .. import walks
 
 pytestmark = pytest.mark.sfm
 

@@ -18,8 +18,8 @@ from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.progress import silent
 from snowsplat.synthetic.lens import Lens as PhoneLens
 
-from ...scenes.lenses import FisheyeLens
-from . import walks
+from ....scenes.lenses import FisheyeLens
+from .. import walks
 
 pytestmark = pytest.mark.sfm
 

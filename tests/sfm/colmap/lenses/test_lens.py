@@ -10,7 +10,7 @@ from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, sett
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.progress import silent
 
-from . import walks
+from .. import walks
 
 pytestmark = pytest.mark.sfm
 

@@ -5,7 +5,7 @@ import torch
 
 from snowsplat.sfm.colmap.process.check_model import can_be_read
 
-from ..conftest import make_model
+from ...conftest import make_model
 
 
 def test_a_model_of_panoramas_can_be_read(tmp_path):

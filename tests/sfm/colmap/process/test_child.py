@@ -15,9 +15,9 @@ from snowsplat.sfm.colmap import SfmOptions, estimate_poses
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
-from ...fork_server import popen
-from . import scenes
-from .forks import children_in_forks
+from ....fork_server import popen
+from .. import scenes
+from ..forks import children_in_forks
 
 DRAFT = SfmOptions(effort="draft", threads=2)
 CHILDREN = Path("/proc/self/task") / str(os.getpid()) / "children"

@@ -6,7 +6,7 @@ import pytest
 
 from snowsplat.sfm.ingest.content.fixed_parts import box_of, describe, find_fixed_parts
 
-from ..pictures import HEIGHT, WIDTH, blurred, pan, wall
+from ...pictures import HEIGHT, WIDTH, blurred, pan, wall
 
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 

@@ -18,7 +18,7 @@ from snowsplat.sfm.ingest.inputs import GatherOptions, gather
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
-from ..pictures import pan, photo, wall, write_photos, write_video
+from ...pictures import pan, photo, wall, write_photos, write_video
 
 _XMP = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '

@@ -15,7 +15,7 @@ from snowsplat.sfm.ingest.content.sharpness import (
     why_unusable,
 )
 
-from ..pictures import blurred, pan, wall
+from ...pictures import blurred, pan, wall
 
 
 def grey(picture: np.ndarray) -> np.ndarray:

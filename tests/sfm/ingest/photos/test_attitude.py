@@ -10,7 +10,7 @@ from pillow_heif import register_heif_opener
 from snowsplat.sfm.ingest.photos.exif import read_exif
 from snowsplat.sfm.ingest.photos.photo_files import read_header
 
-from ..pictures import exif, photo
+from ...pictures import exif, photo
 
 
 def gimbal(pitch, roll=0.0, yaw=0.0, form='drone-dji:Gimbal{}Degree="{:+.2f}"'):

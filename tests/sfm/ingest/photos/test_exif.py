@@ -8,7 +8,7 @@ from PIL import Image
 
 from snowsplat.sfm.ingest.photos.exif import ExifInfo, exif_for_copy, read_exif
 
-from ..pictures import exif, photo
+from ...pictures import exif, photo
 
 GPS = {1: "S", 2: (33.0, 51.0, 24.5), 3: "E", 4: (151.0, 12.0, 0.0), 5: b"\x00", 6: 12.5}
 

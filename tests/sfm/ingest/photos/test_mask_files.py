@@ -9,7 +9,7 @@ from snowsplat.sfm.ingest.photos.mask_files import read_mask, shrunk, write_mask
 from snowsplat.sfm.ingest.photos.photo_files import Header
 from snowsplat.util.errors import UserError
 
-from ..pictures import exif
+from ...pictures import exif
 
 
 def header(width, height, orientation=1):

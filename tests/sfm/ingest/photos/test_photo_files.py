@@ -16,7 +16,7 @@ from snowsplat.sfm.ingest.photos.photo_files import (
     save,
 )
 
-from ..pictures import HEIGHT, WIDTH, exif, photo, wall
+from ...pictures import HEIGHT, WIDTH, exif, photo, wall
 
 
 def stored(upright: Image.Image, orientation: int) -> Image.Image:

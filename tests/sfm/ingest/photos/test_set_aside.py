@@ -9,7 +9,7 @@ from PIL import Image
 from snowsplat.sfm.ingest.inputs import GatherOptions, gather
 from snowsplat.sfm.progress import silent
 
-from ..pictures import HEIGHT, WIDTH, pan, write_video
+from ...pictures import HEIGHT, WIDTH, pan, write_video
 
 pytestmark = pytest.mark.slow  # writes and decodes photos and videos
 

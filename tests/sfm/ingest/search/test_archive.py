@@ -13,7 +13,7 @@ from snowsplat.sfm.ingest.search.archive import files_in, unpack
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.util.errors import UserError
 
-from ..pictures import photo
+from ...pictures import photo
 
 
 def jpeg(seed=0) -> bytes:

@@ -8,7 +8,7 @@ from PIL import Image
 
 from snowsplat.sfm.ingest.search.copies import find_copies
 
-from ..pictures import photo, write_photos
+from ...pictures import photo, write_photos
 
 
 def copies(root):

@@ -7,7 +7,7 @@ import pytest
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.util.errors import UserError
 
-from ..pictures import WIDTH, pan, photo, write_photos, write_video
+from ...pictures import WIDTH, pan, photo, write_photos, write_video
 
 
 @pytest.fixture(scope="module")

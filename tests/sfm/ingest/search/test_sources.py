@@ -10,7 +10,7 @@ from snowsplat.sfm.ingest.search.sources import find_sources, free_names, kind_o
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
-from ..pictures import pan, photo, write_photos, write_video
+from ...pictures import pan, photo, write_photos, write_video
 
 
 def names(*inputs):

@@ -17,7 +17,7 @@ from snowsplat.sfm.ingest.video.clip import (
 )
 from snowsplat.util.errors import UserError
 
-from ..pictures import HEIGHT, WIDTH, pan, write_video
+from ...pictures import HEIGHT, WIDTH, pan, write_video
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from snowsplat.sfm.ingest.video.interlace import field_order
 from snowsplat.sfm.ingest.video.video_frames import extract_frames
 from snowsplat.sfm.progress import silent
 
-from ..pictures import pan, write_video
+from ...pictures import pan, write_video
 
 
 def woven(pictures, first_row) -> list[np.ndarray]:

@@ -7,7 +7,7 @@ from PIL import Image
 from snowsplat.sfm.ingest.content.sharpness import CONTENT_SIDE, grey_copy
 from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved
 
-from ..pictures import blurred, pan, wall
+from ...pictures import blurred, pan, wall
 
 
 def grey(picture: np.ndarray) -> np.ndarray:

@@ -16,9 +16,9 @@ from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW, extract_frames
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
-from ..pictures import HEIGHT, WIDTH, blurred, pan, wall, write_video
+from ...pictures import HEIGHT, WIDTH, blurred, pan, wall, write_video
 
-REAL = Path(__file__).resolve().parents[4] / "shared" / "captures" / "walkaround.mp4"
+REAL = Path(__file__).resolve().parents[5] / "shared" / "captures" / "walkaround.mp4"
 
 pytestmark = pytest.mark.slow  # decodes videos
 
