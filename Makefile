@@ -34,6 +34,9 @@ unexport PYTHONDONTWRITEBYTECODE
 BUILD := build/native
 # Only one build at a time in a checkout.
 LOCK := $(shell command -v flock >/dev/null 2>&1 && echo flock build/native.lock)
+# The formatter and linter of JavaScript (biome.json).
+BIOME = $(and $(shell command -v node),$(wildcard tests/node/node_modules/.bin/biome))
+NO_BIOME := lint: JavaScript is not checked; that needs Node, and npm ci --prefix tests/node --ignore-scripts
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
 .PHONY: demo quick test nightly dev docs format native wheel compiler lint types layers clean
@@ -112,11 +115,13 @@ format: $(ENVIRONMENT)
 	ruff format .
 	ruff check --fix .
 	$(if $(CXX_FILES),clang-format -i $(CXX_FILES))
+	$(if $(BIOME),$(BIOME) check --write .)
 
 lint: $(ENVIRONMENT)
 	ruff format --check .
 	ruff check .
 	$(if $(CXX_FILES),clang-format --dry-run --Werror $(CXX_FILES))
+	@$(if $(BIOME),$(BIOME) check --error-on-warnings .,echo "$(NO_BIOME)")
 
 types: $(ENVIRONMENT)
 	mypy

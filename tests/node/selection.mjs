@@ -4,7 +4,19 @@ import { Edits } from "../../src/snowsplat/studio/pages/edits.js";
 import { along, outside, project, within } from "../../src/snowsplat/studio/pages/selection.js";
 import { levelling, turned } from "../../src/snowsplat/studio/pages/turning.js";
 
-const { count, calls, centers, matrix, shape, width, height, box, floor, eye, drags = [] } = JSON.parse(readFileSync(0, "utf-8"));
+const {
+    count,
+    calls,
+    centers,
+    matrix,
+    shape,
+    width,
+    height,
+    box,
+    floor,
+    eye,
+    drags = [],
+} = JSON.parse(readFileSync(0, "utf-8"));
 const edits = new Edits(count);
 const steps = calls.map(([name, ...values]) => {
     edits[name](...values);

@@ -7,7 +7,12 @@ import { say } from "./text.js";
 
 const AXES = ["x", "y", "z"];
 const SIGNS = [-1, -1, 1]; // of the axes of the scene: the viewer has turned it by 180° about z
-const ARROWS = new Map([["ArrowRight", 1], ["ArrowUp", 1], ["ArrowLeft", -1], ["ArrowDown", -1]]);
+const ARROWS = new Map([
+    ["ArrowRight", 1],
+    ["ArrowUp", 1],
+    ["ArrowLeft", -1],
+    ["ArrowDown", -1],
+]);
 const STEP = 0.01; // of an arrow key, as a share of the first box; ten times as much with Shift
 const PAUSE = 1000; // milliseconds without a key, after which the next one begins another step
 const BEYOND = 0.5; // of the first box, to both sides of it: the range of a slider
@@ -54,14 +59,23 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
         const label = say(side ? "edit_to" : "edit_from", name);
         const first = sides[side][axis];
         const slider = /** @type {HTMLInputElement} */ (
-            make("input", { type: "range", step: "any", "aria-label": label, title: label,
+            make("input", {
+                type: "range",
+                step: "any",
+                "aria-label": label,
+                title: label,
                 input: () => move(side, axis, Number(slider.value)),
                 pointerdown: () => step++,
-                keydown: begin })
+                keydown: begin,
+            })
         );
         slider.min = String(first - (side ? 1 : BEYOND) * spans[axis]);
         slider.max = String(first + (side ? BEYOND : 1) * spans[axis]);
-        const handle = make("div.snow-handle", { role: "slider", tabindex: 0, "aria-label": label, "data-axis": name }, name);
+        const handle = make(
+            "div.snow-handle",
+            { role: "slider", tabindex: 0, "aria-label": label, "data-axis": name },
+            name,
+        );
         /** @type {{from: number, place: number[], point: number[]} | null} */
         let held = null;
         handle.addEventListener("pointerdown", event => {
@@ -69,7 +83,11 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
             event.stopPropagation(); // it is not for the camera
             handle.setPointerCapture(event.pointerId);
             step++;
-            held = { from: sides[side][axis], place: [event.clientX, event.clientY], point: middle(side, axis) };
+            held = {
+                from: sides[side][axis],
+                place: [event.clientX, event.clientY],
+                point: middle(side, axis),
+            };
         });
         handle.addEventListener("pointermove", event => {
             if (!held || !event.isPrimary) return;
@@ -88,7 +106,11 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
             move(side, axis, sides[side][axis] + way * STEP * (event.shiftKey ? 10 : 1) * spans[axis]);
         });
         // They are not for the camera.
-        for (const kind of ["keydown", "keyup"]) handle.addEventListener(kind, event => ARROWS.has(/** @type {KeyboardEvent} */ (event).key) && event.stopPropagation());
+        for (const kind of ["keydown", "keyup"])
+            handle.addEventListener(
+                kind,
+                event => ARROWS.has(/** @type {KeyboardEvent} */ (event).key) && event.stopPropagation(),
+            );
         function show() {
             const value = sides[side][axis];
             slider.value = String(value);
@@ -116,7 +138,11 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
             [0, 1, 2, 3].flatMap(edge => {
                 const ends = AXES.map((_, k) => (edge >> Number((k + 3 - axis) % 3 === 1)) & 1);
                 const point = (/** @type {number} */ share) =>
-                    inScene(AXES.map((_, k) => (k === axis ? sides[0][k] + share * (sides[1][k] - sides[0][k]) : sides[ends[k]][k])));
+                    inScene(
+                        AXES.map((_, k) =>
+                            k === axis ? sides[0][k] + share * (sides[1][k] - sides[0][k]) : sides[ends[k]][k],
+                        ),
+                    );
                 return Array.from({ length: pieces }, (_, i) => [point(i / pieces), point((i + 1) / pieces)]);
             }),
         );
@@ -124,12 +150,25 @@ export function addBox({ edits, centers, canvas, overlay, model, select, show })
 
     function selectOutside() {
         const [a, b] = sides.map(inScene);
-        select(outside(centers, AXES.map((_, k) => Math.min(a[k], b[k])), AXES.map((_, k) => Math.max(a[k], b[k]))));
+        select(
+            outside(
+                centers,
+                AXES.map((_, k) => Math.min(a[k], b[k])),
+                AXES.map((_, k) => Math.max(a[k], b[k])),
+            ),
+        );
     }
 
     const handles = make("div.snow-handles", { hidden: true }, ...faces.map(face => face.handle));
     overlay.element.after(handles);
-    const sliders = AXES.map((name, k) => make("div.snow-sides", {}, make("b", {}, name), ...faces.filter(face => face.axis === k).map(face => face.slider)));
+    const sliders = AXES.map((name, k) =>
+        make(
+            "div.snow-sides",
+            {},
+            make("b", {}, name),
+            ...faces.filter(face => face.axis === k).map(face => face.slider),
+        ),
+    );
     return {
         element: make("div", {}, make("p", {}, say("edit_box_how")), ...sliders, button("edit_outside", selectOutside)),
         choose() {

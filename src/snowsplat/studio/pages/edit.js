@@ -89,7 +89,10 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
             paint((painted = state));
             marked = edits.counts();
         }
-        counts.textContent = !marked[SELECTED] && !marked[DELETED] ? say("edit_first") : say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
+        counts.textContent =
+            !marked[SELECTED] && !marked[DELETED]
+                ? say("edit_first")
+                : say("edit_counts", marked[SELECTED].toLocaleString(), marked[DELETED].toLocaleString());
         remove.disabled = !marked[SELECTED];
         undo.disabled = !edits.past.length;
         redo.disabled = !edits.future.length;
@@ -102,10 +105,12 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
         overlay.clear();
         tools.get(tool)?.draw?.();
     }
-    const change = (/** @type {(event?: any) => void} */ run) => (/** @type {any} */ event = undefined) => {
-        run(event);
-        show();
-    };
+    const change =
+        (/** @type {(event?: any) => void} */ run) =>
+        (/** @type {any} */ event = undefined) => {
+            run(event);
+            show();
+        };
     app.on("update", () => {
         if (!overlay.element.hidden) draw();
     });
@@ -115,17 +120,37 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     const choices = (/** @type {Iterable<string>} */ list, /** @type {(name: string) => void} */ choose) => {
         const names = [...list];
         const buttons = names.map(name => button(`edit_${name}`, () => choose(name)));
-        const mark = (/** @type {string} */ chosen) => buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
+        const mark = (/** @type {string} */ chosen) =>
+            buttons.forEach((each, i) => (each.ariaPressed = String(names[i] === chosen)));
         return { buttons, mark };
     };
     let tool = "";
     let mode = "replace";
     const modes = choices(["replace", "add", "remove"], name => modes.mark((mode = name)));
-    const forSelection = make("div.snow-buttons", { role: "group", "aria-label": say("edit_mode") }, ...modes.buttons, button("edit_invert", change(() => edits.invert())));
+    const forSelection = make(
+        "div.snow-buttons",
+        { role: "group", "aria-label": say("edit_mode") },
+        ...modes.buttons,
+        button(
+            "edit_invert",
+            change(() => edits.invert()),
+        ),
+    );
     const world = () => times(camera.projectionMatrix.data, camera.viewMatrix.data);
     /** @type {Editing} */
     const editing = {
-        edits, centers, scene, canvas, presentView, overlay, placement, world, show, draw, change, tell,
+        edits,
+        centers,
+        scene,
+        canvas,
+        presentView,
+        overlay,
+        placement,
+        world,
+        show,
+        draw,
+        change,
+        tell,
         model: () => times(world(), entity.getWorldTransform().data),
         select(found, keys) {
             edits.select(found, keys?.shiftKey ? "add" : keys?.altKey ? "remove" : mode);
@@ -134,15 +159,17 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     };
     const shapes = addShapes(editing);
     /** @type {Map<string, Tool>} */
-    const tools = new Map(Object.entries({
-        rectangle: shapes,
-        lasso: shapes,
-        brush: shapes,
-        box: addBox(editing),
-        measure: addRuler(editing),
-        note: addNotes(editing),
-        level: addLevel(editing),
-    }));
+    const tools = new Map(
+        Object.entries({
+            rectangle: shapes,
+            lasso: shapes,
+            brush: shapes,
+            box: addBox(editing),
+            measure: addRuler(editing),
+            note: addNotes(editing),
+            level: addLevel(editing),
+        }),
+    );
     const forTools = new Set(tools.values());
     const toolButtons = choices(tools.keys(), name => choose(tool === name ? "" : name));
     function choose(/** @type {string} */ name) {
@@ -164,16 +191,28 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
         if (!event.isPrimary || event.button || !chosen) return;
         event.preventDefault();
         if (!chosen.point) return chosen.press?.(event);
-        const found = await picker?.pickSurface(event.offsetX / canvas.clientWidth, event.offsetY / canvas.clientHeight);
+        const found = await picker?.pickSurface(
+            event.offsetX / canvas.clientWidth,
+            event.offsetY / canvas.clientHeight,
+        );
         tell(found ? "" : say("edit_no_surface"));
         if (found) chosen.point(placement.unplaced([found.position.x, found.position.y, found.position.z]));
     });
 
     // The panel
 
-    const remove = button("edit_delete", change(() => edits.delete()));
-    const undo = button("edit_undo", change(() => go("undo")));
-    const redo = button("edit_redo", change(() => go("redo")));
+    const remove = button(
+        "edit_delete",
+        change(() => edits.delete()),
+    );
+    const undo = button(
+        "edit_undo",
+        change(() => go("undo")),
+    );
+    const redo = button(
+        "edit_redo",
+        change(() => go("redo")),
+    );
     function go(/** @type {"undo" | "redo"} */ way) {
         const { box } = edits.present;
         edits[way]();
@@ -215,7 +254,8 @@ export function addEditor(page, picker, centers, version, isEdited, isWhole) {
     show();
     if (isWhole) open.click();
 
-    const isField = (/** @type {Event} */ event) => event.target instanceof HTMLInputElement && ["text", "number"].includes(event.target.type);
+    const isField = (/** @type {Event} */ event) =>
+        event.target instanceof HTMLInputElement && ["text", "number"].includes(event.target.type);
     // Keys in fields are not for the camera.
     for (const kind of ["keydown", "keyup"])
         content.addEventListener(kind, event => {

@@ -21,7 +21,14 @@ export class Edits {
      */
     constructor(count, notes = [], box = []) {
         /** @type {Edit} */
-        this.present = { state: new Uint8Array(count), turn: UNTURNED, scale: 1, start: null, notes, box };
+        this.present = {
+            state: new Uint8Array(count),
+            turn: UNTURNED,
+            scale: 1,
+            start: null,
+            notes,
+            box,
+        };
         /** @type {Edit[]} */
         this.past = [];
         /** @type {Edit[]} */
@@ -108,7 +115,8 @@ export class Edits {
             if (byte === DELETED) bytes[i >> 3] |= 1 << (i & 7);
         });
         let text = "";
-        for (let at = 0; at < bytes.length; at += 1 << 14) text += String.fromCharCode(...bytes.subarray(at, at + (1 << 14)));
+        for (let at = 0; at < bytes.length; at += 1 << 14)
+            text += String.fromCharCode(...bytes.subarray(at, at + (1 << 14)));
         return btoa(text);
     }
 }

@@ -56,7 +56,9 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
 
     // The plan
 
-    const seconds = /** @type {HTMLInputElement} */ (make("input", { type: "number", min: 1, max: 600, step: "any", value: 10, change: changed }));
+    const seconds = /** @type {HTMLInputElement} */ (
+        make("input", { type: "number", min: 1, max: 600, step: "any", value: 10, change: changed })
+    );
     const size = /** @type {HTMLSelectElement} */ (
         make("select", { change: changed }, ...SIZES.map(value => make("option", { value }, say(`film_${value}`))))
     );
@@ -64,14 +66,29 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     const loop = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: changed }));
     // Its speeds are relative to each other, as the seconds are the length of the film.
     const speed = /** @type {HTMLInputElement} */ (
-        make("input", { type: "range", min: -FASTEST, max: FASTEST, step: 0.5, value: 0, input: () => setSpeed(), change: changed })
+        make("input", {
+            type: "range",
+            min: -FASTEST,
+            max: FASTEST,
+            step: 0.5,
+            value: 0,
+            input: () => setSpeed(),
+            change: changed,
+        })
     );
     function setSpeed() {
         keys[chosen].speed = 2 ** Number(speed.value);
         draw();
     }
     const speedText = make("span");
-    const plan = () => ({ keys: keys.map(key => key.view), speeds: keys.map(key => key.speed), seconds: Number(seconds.value), size: size.value, ease: ease.checked, loop: loop.checked });
+    const plan = () => ({
+        keys: keys.map(key => key.view),
+        speeds: keys.map(key => key.speed),
+        seconds: Number(seconds.value),
+        size: size.value,
+        ease: ease.checked,
+        loop: loop.checked,
+    });
     const canPlay = () => keys.length >= (loop.checked ? 3 : 2) && Number(seconds.value) > 0;
 
     function changed() {
@@ -89,8 +106,19 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
                     flyTo(key.view.slice(0, 7));
                     draw();
                 };
-                const label = say("film_key", i + 1) + (key.speed === 1 ? "" : `, ${say("film_speed")} ${times(key.speed)}`);
-                return make("button", { type: "button", "aria-label": label, "aria-current": i === chosen && "true", click: show }, String(i + 1), key.speed !== 1 && make("small", {}, times(key.speed)));
+                const label =
+                    say("film_key", i + 1) + (key.speed === 1 ? "" : `, ${say("film_speed")} ${times(key.speed)}`);
+                return make(
+                    "button",
+                    {
+                        type: "button",
+                        "aria-label": label,
+                        "aria-current": i === chosen && "true",
+                        click: show,
+                    },
+                    String(i + 1),
+                    key.speed !== 1 && make("small", {}, times(key.speed)),
+                );
             }),
         );
         speedOfKey.hidden = chosen < 0;
@@ -135,7 +163,15 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     // The preview
 
     const position = /** @type {HTMLInputElement} */ (
-        make("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0, "aria-label": say("film_line"), input: () => scrub() })
+        make("input", {
+            type: "range",
+            min: 0,
+            max: 1,
+            step: 0.001,
+            value: 0,
+            "aria-label": say("film_line"),
+            input: () => scrub(),
+        })
     );
     const frame = make("div.snow-frame", { hidden: true, "aria-hidden": "true" });
     canvas.after(frame);
@@ -162,17 +198,20 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         begin().then(draw, fail);
     }
 
-    const play = button("film_preview", action(async () => {
-        if (playing) {
-            playing = false;
-        } else {
-            await begin().catch(fail);
-            playing = previewing;
-            if (share >= 1) share = 0;
-        }
-        // The action enables its button when this has ended.
-        setTimeout(draw);
-    }));
+    const play = button(
+        "film_preview",
+        action(async () => {
+            if (playing) {
+                playing = false;
+            } else {
+                await begin().catch(fail);
+                playing = previewing;
+                if (share >= 1) share = 0;
+            }
+            // The action enables its button when this has ended.
+            setTimeout(draw);
+        }),
+    );
 
     /** The camera is that of the visitor again. */
     function stopPreview() {
@@ -205,25 +244,40 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
         viewer.app.renderNextFrame = true;
     });
     // Whoever moves the camera wants it back.
+    const takeBack = () => {
+        stopPreview();
+        draw();
+    };
     canvas.addEventListener("pointerdown", () => {
-        if (previewing) stopPreview(), draw();
+        if (previewing) takeBack();
     });
 
     addEventListener("keydown", event => {
-        if (event.key === "Escape" && previewing) stopPreview(), draw();
+        if (event.key === "Escape" && previewing) takeBack();
     });
 
     // The video
 
-    const progress = make("progress", { max: 1, value: 0, hidden: true, "aria-label": say("film_rendering") });
+    const progress = make("progress", {
+        max: 1,
+        value: 0,
+        hidden: true,
+        "aria-label": say("film_rendering"),
+    });
     const result = make("div");
-    const render = button("film_render", action(async () => {
-        stopPreview();
-        await ask(`${ADDRESS}?version=${version}`, "POST", plan()).catch(fail);
-        await look();
-        setTimeout(draw);
-    }));
-    const stop = button("stop", action(() => ask(ADDRESS, "DELETE").then(look, fail)));
+    const render = button(
+        "film_render",
+        action(async () => {
+            stopPreview();
+            await ask(`${ADDRESS}?version=${version}`, "POST", plan()).catch(fail);
+            await look();
+            setTimeout(draw);
+        }),
+    );
+    const stop = button(
+        "stop",
+        action(() => ask(ADDRESS, "DELETE").then(look, fail)),
+    );
 
     /** What the studio has; while it renders, again and again. */
     async function look() {
@@ -243,14 +297,22 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
             timer = setTimeout(look, 1000);
             return left;
         }
-        if (wasRunning) tell(now.outcome === "failed" ? told(now.error) : now.outcome === "done" ? "" : say("film_stopped"));
+        if (wasRunning)
+            tell(now.outcome === "failed" ? told(now.error) : now.outcome === "done" ? "" : say("film_stopped"));
         result.replaceChildren();
         if (now.bytes && !now.running) {
-            const download = make("a", { href: `${ADDRESS}/file`, download: true }, say("film_download", bytes(now.bytes)));
+            const download = make(
+                "a",
+                { href: `${ADDRESS}/file`, download: true },
+                say("film_download", bytes(now.bytes)),
+            );
             result.append(make("p", {}, download), command(now.command));
         }
         if (!keys.length && now.plan) {
-            keys = now.plan.keys.map((/** @type {number[]} */ each, /** @type {number} */ i) => ({ view: each, speed: now.plan.speeds[i] ?? 1 }));
+            keys = now.plan.keys.map((/** @type {number[]} */ each, /** @type {number} */ i) => ({
+                view: each,
+                speed: now.plan.speeds[i] ?? 1,
+            }));
             chosen = keys.length - 1;
             seconds.value = now.plan.seconds;
             size.value = now.plan.size;
@@ -295,7 +357,8 @@ export function addFilm({ viewer, scene, camera, canvas, panel, presentView, fly
     // Keys in fields are not for the camera.
     for (const kind of ["keydown", "keyup"])
         content.addEventListener(kind, event => {
-            if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement) event.stopPropagation();
+            if (event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement)
+                event.stopPropagation();
         });
     stop.hidden = true;
     draw();

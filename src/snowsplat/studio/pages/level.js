@@ -13,10 +13,23 @@ export function addLevel({ edits, overlay, world, placement, presentView, draw, 
     let floor = []; // at most two points
     const turns = AXES.map((axis, k) => {
         const by = (/** @type {number} */ degrees) =>
-            make("button", { type: "button", "aria-label": say("edit_turn", axis, degrees), click: change(() => edits.turnBy(about(k, degrees))) }, `${degrees > 0 ? "+" : "−"}90°`);
+            make(
+                "button",
+                {
+                    type: "button",
+                    "aria-label": say("edit_turn", axis, degrees),
+                    click: change(() => edits.turnBy(about(k, degrees))),
+                },
+                `${degrees > 0 ? "+" : "−"}90°`,
+            );
         const fine = /** @type {HTMLInputElement} */ (
             make("input", {
-                type: "range", min: -FINE, max: FINE, step: "any", value: 0, "aria-label": say("edit_turn_fine", axis),
+                type: "range",
+                min: -FINE,
+                max: FINE,
+                step: "any",
+                value: 0,
+                "aria-label": say("edit_turn_fine", axis),
                 input: () => placement.show(about(k, Number(fine.value))),
                 change: change(() => {
                     if (Number(fine.value)) edits.turnBy(about(k, Number(fine.value)));

@@ -26,16 +26,33 @@ export function addNotes({ edits, scene, overlay, world, placement, presentView,
 
     function write() {
         listed = edits.present.notes;
-        const replaced = (/** @type {number} */ i, /** @type {any} */ changes) => edits.present.notes.map((note, k) => (k === i ? { ...note, ...changes } : note));
+        const replaced = (/** @type {number} */ i, /** @type {any} */ changes) =>
+            edits.present.notes.map((note, k) => (k === i ? { ...note, ...changes } : note));
         const field = (/** @type {number} */ i, /** @type {"title" | "text"} */ key, /** @type {number} */ most) =>
-            make("input", { type: "text", maxlength: most, value: listed[i][key], "aria-label": say(`edit_note_${key}`), placeholder: say(`edit_note_${key}`),
+            make("input", {
+                type: "text",
+                maxlength: most,
+                value: listed[i][key],
+                "aria-label": say(`edit_note_${key}`),
+                placeholder: say(`edit_note_${key}`),
                 input: change((/** @type {any} */ event) => {
                     edits.change({ notes: replaced(i, { [key]: event.target.value }) }, `${key} ${i}`);
                     listed = edits.present.notes; // the field has the text already
-                }) });
-        const drop = (/** @type {number} */ i) => change(() => edits.change({ notes: edits.present.notes.filter((_, k) => k !== i) }));
+                }),
+            });
+        const drop = (/** @type {number} */ i) =>
+            change(() => edits.change({ notes: edits.present.notes.filter((_, k) => k !== i) }));
         list.replaceChildren(
-            ...listed.map((_, i) => make("div.snow-buttons", {}, make("b", {}, String(i + 1)), field(i, "title", 60), field(i, "text", 280), button("film_remove", drop(i)))),
+            ...listed.map((_, i) =>
+                make(
+                    "div.snow-buttons",
+                    {},
+                    make("b", {}, String(i + 1)),
+                    field(i, "title", 60),
+                    field(i, "text", 280),
+                    button("film_remove", drop(i)),
+                ),
+            ),
         );
     }
 
@@ -48,10 +65,15 @@ export function addNotes({ edits, scene, overlay, world, placement, presentView,
             const { notes } = edits.present;
             if (notes.length >= MOST) return tell(told(`a scene has at most ${MOST} annotations`));
             const view = presentView();
-            const note = { title: say("edit_note_new", notes.length + 1), text: "", view: [...placement.unplaced(view.slice(0, 3)), ...point, view[6], scene.aspect] };
+            const note = {
+                title: say("edit_note_new", notes.length + 1),
+                text: "",
+                view: [...placement.unplaced(view.slice(0, 3)), ...point, view[6], scene.aspect],
+            };
             edits.change({ notes: [...notes, note] });
             show();
         },
-        draw: () => listed.forEach(({ view }, i) => overlay.mark(world(), placement.placed(view.slice(3, 6)), String(i + 1))),
+        draw: () =>
+            listed.forEach(({ view }, i) => overlay.mark(world(), placement.placed(view.slice(3, 6)), String(i + 1))),
     };
 }

@@ -13,7 +13,8 @@ export function addOverlay(canvas) {
         event.preventDefault();
         canvas.dispatchEvent(new WheelEvent("wheel", event));
     });
-    const seen = (/** @type {Float64Array} */ m, /** @type {number[]} */ point) => project(m, point, canvas.clientWidth, canvas.clientHeight);
+    const seen = (/** @type {Float64Array} */ m, /** @type {number[]} */ point) =>
+        project(m, point, canvas.clientWidth, canvas.clientHeight);
     return {
         element,
         drawing,

@@ -41,7 +41,8 @@ export class Refused extends Error {
 }
 
 /** Why a request failed, for people. `away` is the text if there was no answer. */
-export const reasonOf = (/** @type {unknown} */ error, away = "no_answer") => (error instanceof Refused ? error.message : say(away));
+export const reasonOf = (/** @type {unknown} */ error, away = "no_answer") =>
+    error instanceof Refused ? error.message : say(away);
 
 /**
  * The JSON answer of the server.
@@ -104,7 +105,11 @@ export function command(/** @type {string} */ line) {
 
 /** @param {number} count of bytes */
 export function bytes(count) {
-    for (const [unit, name] of /** @type {[number, string][]} */ ([[1e9, "GB"], [1e6, "MB"], [1e3, "kB"]])) {
+    for (const [unit, name] of /** @type {[number, string][]} */ ([
+        [1e9, "GB"],
+        [1e6, "MB"],
+        [1e3, "kB"],
+    ])) {
         if (count >= unit) return `${(count / unit).toFixed(count < 10 * unit ? 1 : 0)} ${name}`;
     }
     return `${count} B`;

@@ -26,7 +26,9 @@ export function addPlacement({ viewer: { app, annotations }, scene }, edits) {
             markers?.setLocalRotation(turn[1], turn[2], turn[3], turn[0]);
             markers?.setLocalPosition(...origin);
             views.forEach((view, i) => {
-                const [position, target] = [view.slice(0, 3), view.slice(3, 6)].map(point => turned(turn, point, middle));
+                const [position, target] = [view.slice(0, 3), view.slice(3, 6)].map(point =>
+                    turned(turn, point, middle),
+                );
                 Object.assign(annotations[i], { position: target });
                 Object.assign(annotations[i].camera.initial, { position, target });
             });

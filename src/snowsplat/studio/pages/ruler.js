@@ -8,7 +8,15 @@ export function addRuler({ edits, scene, overlay, world, placement, draw, show }
     /** @type {number[][]} */
     let measured = []; // at most two points
     const told = make("span", { role: "status" }, say("edit_two_points"));
-    const truth = /** @type {HTMLInputElement} */ (make("input", { type: "number", min: 0, step: "any", "aria-label": say("edit_truth"), placeholder: say("edit_truth") }));
+    const truth = /** @type {HTMLInputElement} */ (
+        make("input", {
+            type: "number",
+            min: 0,
+            step: "any",
+            "aria-label": say("edit_truth"),
+            placeholder: say("edit_truth"),
+        })
+    );
     const rescale = button("edit_rescale", () => {
         const wanted = Number(truth.value);
         if (!(wanted > 0)) return truth.focus();

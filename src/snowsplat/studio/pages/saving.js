@@ -13,17 +13,43 @@ export function addSaving({ edits, scene, placement, presentView, change, show, 
     const { notes: noted } = edits.present;
     let saving = false;
     const hides = /** @type {HTMLInputElement} */ (make("input", { type: "checkbox", change: change(() => {}) }));
-    const title = /** @type {HTMLInputElement} */ (make("input", { type: "text", maxlength: 80, value: scene.title, "aria-label": say("title_label"), input: change(() => {}) }));
-    const view = button("edit_start", change(() => {
-        const seen = presentView();
-        edits.change({ start: [...placement.unplaced(seen.slice(0, 3)), ...placement.unplaced(seen.slice(3, 6)), seen[6], scene.aspect] });
-        tell(say("edit_start_set"));
-    }));
+    const title = /** @type {HTMLInputElement} */ (
+        make("input", {
+            type: "text",
+            maxlength: 80,
+            value: scene.title,
+            "aria-label": say("title_label"),
+            input: change(() => {}),
+        })
+    );
+    const view = button(
+        "edit_start",
+        change(() => {
+            const seen = presentView();
+            edits.change({
+                start: [
+                    ...placement.unplaced(seen.slice(0, 3)),
+                    ...placement.unplaced(seen.slice(3, 6)),
+                    seen[6],
+                    scene.aspect,
+                ],
+            });
+            tell(say("edit_start_set"));
+        }),
+    );
     const hidden = () => (hides.checked ? hiding.limits() : null);
     const haveNotesChanged = () => JSON.stringify(edits.present.notes) !== JSON.stringify(noted);
     const isChanged = () => {
         const { start, scale } = edits.present;
-        return Boolean(start || scale !== 1 || placement.isTurned() || title.value.trim() !== scene.title || isDeleted() || hidden() || haveNotesChanged());
+        return Boolean(
+            start ||
+                scale !== 1 ||
+                placement.isTurned() ||
+                title.value.trim() !== scene.title ||
+                isDeleted() ||
+                hidden() ||
+                haveNotesChanged(),
+        );
     };
 
     /** Sends a change to the studio, and shows the scene as it is then. */

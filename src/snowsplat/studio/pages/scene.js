@@ -27,7 +27,11 @@ export function upload(/** @type {string} */ name, /** @type {import("./upload.j
 }
 
 /** Shows a scene in an element, until `closed` is aborted. */
-export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */ name, /** @type {AbortSignal} */ closed) {
+export function showScene(
+    /** @type {HTMLElement} */ main,
+    /** @type {string} */ name,
+    /** @type {AbortSignal} */ closed,
+) {
     const address = `scenes/${encodeURIComponent(name)}`;
     const title = make("h1");
     const status = make("p.status", { role: "status" });
@@ -71,8 +75,18 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             shown = parts;
             update = undefined;
             /** @type {Record<string, (scene: any) => HTMLElement[]>} */
-            const builders = { upload: sendingPart, new: startPart, running: progressPart, done: resultPart, found: openingPart, opening: openingPart };
-            body.replaceChildren(...(builders[parts] ?? stoppedPart)(scene), ...(["upload", "running", "found", "opening"].includes(parts) ? [] : [keptPart(scene)]));
+            const builders = {
+                upload: sendingPart,
+                new: startPart,
+                running: progressPart,
+                done: resultPart,
+                found: openingPart,
+                opening: openingPart,
+            };
+            body.replaceChildren(
+                ...(builders[parts] ?? stoppedPart)(scene),
+                ...(["upload", "running", "found", "opening"].includes(parts) ? [] : [keptPart(scene)]),
+            );
         }
         update?.(scene);
     }
@@ -113,7 +127,14 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
     /** Its name, its folder, and how to remove it. */
     function keptPart(/** @type {any} */ scene) {
-        const name = /** @type {HTMLInputElement} */ (make("input", { type: "text", value: scene.title, maxlength: 80, "aria-label": say("title_label") }));
+        const name = /** @type {HTMLInputElement} */ (
+            make("input", {
+                type: "text",
+                value: scene.title,
+                maxlength: 80,
+                "aria-label": say("title_label"),
+            })
+        );
         const rename = async () => {
             await ask(`${address}/rename`, "POST", { title: name.value });
             shown = "";
@@ -130,9 +151,21 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             "section.card",
             {},
             // The form that starts the job has the name, too.
-            scene.status === "done" && make("form.row", {}, name, make("button.plain", { type: "submit", click: action(rename) }, say("rename"))),
+            scene.status === "done" &&
+                make(
+                    "form.row",
+                    {},
+                    name,
+                    make("button.plain", { type: "submit", click: action(rename) }, say("rename")),
+                ),
             make("p.soft", {}, say("kept_at", scene.folder)),
-            !scene.found && make("div.row", {}, make("button.plain", { type: "button", click: action(remove) }, say("remove")), make("span.soft", {}, say("remove_help"))),
+            !scene.found &&
+                make(
+                    "div.row",
+                    {},
+                    make("button.plain", { type: "button", click: action(remove) }, say("remove")),
+                    make("span.soft", {}, say("remove_help")),
+                ),
         );
     }
 
@@ -186,12 +219,27 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
     function startForm(/** @type {any} */ scene, /** @type {string} */ label) {
         const minutes = /** @type {HTMLInputElement} */ (
-            make("input", { type: "number", min: 0.5, max: 10080, step: "any", value: scene.minutes ?? 10, "aria-label": say("minutes_label") })
+            make("input", {
+                type: "number",
+                min: 0.5,
+                max: 10080,
+                step: "any",
+                value: scene.minutes ?? 10,
+                "aria-label": say("minutes_label"),
+            })
         );
         const before = scene.minutes ? "within" : (scene.quality ?? "normal");
         const choice = (/** @type {string} */ value, /** @type {Node} */ more) =>
-            make("label.choice", {}, make("input", { type: "radio", name: "quality", value, checked: value === before }), make("b", {}, say(value)), more);
-        const title = /** @type {HTMLInputElement} */ (make("input", { type: "text", value: scene.title, maxlength: 80 }));
+            make(
+                "label.choice",
+                {},
+                make("input", { type: "radio", name: "quality", value, checked: value === before }),
+                make("b", {}, say(value)),
+                more,
+            );
+        const title = /** @type {HTMLInputElement} */ (
+            make("input", { type: "text", value: scene.title, maxlength: 80 })
+        );
         const form = /** @type {HTMLFormElement} */ (
             make(
                 "form.card",
@@ -201,7 +249,9 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
                     "fieldset",
                     {},
                     make("legend", {}, say("quality")),
-                    ...["draft", "normal", "best"].map(quality => choice(quality, make("span.soft", { "data-quality": quality }))),
+                    ...["draft", "normal", "best"].map(quality =>
+                        choice(quality, make("span.soft", { "data-quality": quality })),
+                    ),
                     choice("within", make("span", {}, minutes, " ", make("span.soft", {}, say("minutes_label")))),
                 ),
                 make("button.main", { type: "submit", click: action(start(wanted)) }, label),
@@ -222,13 +272,23 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const stages = make("ol.stages");
         const figures = make("dl.figures");
         const curve = make("div.curve");
-        const strip = make("div.strip", { role: "group", "aria-label": say("placed"), tabindex: 0 });
+        const strip = make("div.strip", {
+            role: "group",
+            "aria-label": say("placed"),
+            tabindex: 0,
+        });
         const map = make("img.map", { alt: say("map") });
         const mapBox = make("figure", { hidden: true }, map, make("figcaption", {}, say("map")));
         const notes = make("ul.notes");
         const notesPart = make("section", { hidden: true }, make("h2", {}, say("log")), notes);
-        const stop = make("button.plain", { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) }, say("stop"));
-        const live = /** @type {HTMLIFrameElement} */ (make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true }));
+        const stop = make(
+            "button.plain",
+            { type: "button", click: action(() => ask(`${address}/stop`, "POST", {})) },
+            say("stop"),
+        );
+        const live = /** @type {HTMLIFrameElement} */ (
+            make("iframe.viewer", { title: say("live"), allow: "fullscreen", hidden: true })
+        );
         let listed = "";
         let drawn = 0; // the map that is shown
         update = (/** @type {any} */ now) => {
@@ -236,7 +296,9 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             showStages(stages, now);
             showFigures(figures, curve, state);
             notesPart.hidden = !state.notes?.length;
-            notes.replaceChildren(...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, told(line))));
+            notes.replaceChildren(
+                ...(state.notes ?? []).map((/** @type {string} */ line) => make("li", {}, told(line))),
+            );
             if (live.hidden === now.has_page) {
                 live.hidden = !now.has_page;
                 live.src = now.has_page ? dressed(`${address}/live/`) : "about:blank";
@@ -247,13 +309,21 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
             const key = [now.map, ...(state.stages ?? []).map((/** @type {any} */ each) => each.stage)].join();
             if (key !== listed) {
                 listed = key;
-                ask(`${address}/photos`).then(photos => showPhotos(strip, address, photos), () => (listed = ""));
+                ask(`${address}/photos`).then(
+                    photos => showPhotos(strip, address, photos),
+                    () => (listed = ""),
+                );
             }
         };
         return [
             live,
             // The map is beside the stages, so that it is seen while it grows.
-            make("div.row.wide", {}, make("section.card", {}, stages, make("div.row", {}, stop, make("span.soft", {}, say("stop_help")))), mapBox),
+            make(
+                "div.row.wide",
+                {},
+                make("section.card", {}, stages, make("div.row", {}, stop, make("span.soft", {}, say("stop_help")))),
+                mapBox,
+            ),
             strip,
             figures,
             curve,
@@ -263,7 +333,11 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
     function stoppedPart(/** @type {any} */ scene) {
         const state = scene.state;
-        const why = { failed: state.error, stopped: say("was_stopped"), interrupted: say("was_killed") }[/** @type {string} */ (scene.status)];
+        const why = {
+            failed: state.error,
+            stopped: say("was_stopped"),
+            interrupted: say("was_killed"),
+        }[/** @type {string} */ (scene.status)];
         const wanted = () => (scene.minutes ? { minutes: scene.minutes } : { quality: scene.quality });
         const stages = make("ol.stages");
         showStages(stages, scene);
@@ -282,11 +356,18 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 
     function resultPart(/** @type {any} */ scene) {
         const result = scene.state.result;
-        const fact = (/** @type {string} */ key, /** @type {string} */ value) => [make("dt", {}, say(key)), make("dd", {}, value)];
+        const fact = (/** @type {string} */ key, /** @type {string} */ value) => [
+            make("dt", {}, say(key)),
+            make("dd", {}, value),
+        ];
         const site = `${address}/site/index.html`;
         const shownSite = dressed(site);
         const reports = Object.entries(result.reports).map(([kind, path]) =>
-            make("a.button.plain", { href: dressed(`${address}/made/${path}`), target: "_blank", rel: "noopener" }, say(`report_${kind}`)),
+            make(
+                "a.button.plain",
+                { href: dressed(`${address}/made/${path}`), target: "_blank", rel: "noopener" },
+                say(`report_${kind}`),
+            ),
         );
         const film = make("section.card", { hidden: true });
         let filmed = 0;
@@ -298,14 +379,26 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
         const phone = make("section.card");
         showPhone(phone, site);
         return [
-            make("iframe.viewer", { src: shownSite, title: say("viewer"), allow: "fullscreen; xr-spatial-tracking" }),
-            make("div.row", {}, make("a.button.plain", { href: shownSite, target: "_blank", rel: "noopener" }, say("full")), ...reports, scene.edited > 0 && make("span.soft", {}, say("edited"))),
+            make("iframe.viewer", {
+                src: shownSite,
+                title: say("viewer"),
+                allow: "fullscreen; xr-spatial-tracking",
+            }),
+            make(
+                "div.row",
+                {},
+                make("a.button.plain", { href: shownSite, target: "_blank", rel: "noopener" }, say("full")),
+                ...reports,
+                scene.edited > 0 && make("span.soft", {}, say("edited")),
+            ),
             make(
                 "dl.figures",
                 {},
                 ...fact("gaussians", result.gaussians.toLocaleString()),
                 ...fact("size", bytes(result.bytes)),
-                ...(result.psnr === null ? [] : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
+                ...(result.psnr === null
+                    ? []
+                    : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
                 ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
             ),
             result.verdict.length > 0 &&
@@ -324,7 +417,11 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     }
 
     function download(/** @type {string} */ kind) {
-        const button = make("button.plain", { type: "button", "aria-label": say("download_kind", kind.toUpperCase()) }, kind.toUpperCase());
+        const button = make(
+            "button.plain",
+            { type: "button", "aria-label": say("download_kind", kind.toUpperCase()) },
+            kind.toUpperCase(),
+        );
         const about = make("span", {}, say(`kind_${kind}`));
         button.addEventListener(
             "click",
@@ -345,12 +442,19 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
     const over = (/** @type {Event} */ event) => event.preventDefault();
     const drop = async (/** @type {DragEvent} */ event) => {
         event.preventDefault();
-        if (event.dataTransfer && uploaded && shown !== "running" && (shown !== "upload" || uploads.get(name)?.error)) add(await dropped(event.dataTransfer));
+        if (event.dataTransfer && uploaded && shown !== "running" && (shown !== "upload" || uploads.get(name)?.error))
+            add(await dropped(event.dataTransfer));
     };
     main.addEventListener("dragover", over, { signal: closed });
     main.addEventListener("drop", drop, { signal: closed });
-    document.addEventListener("uploaded", () => (uploads.has(name) && shown === "upload" ? update?.({}) : refresh()), { signal: closed });
-    document.addEventListener("edited", () => ((shown = ""), refresh()), { signal: closed });
+    document.addEventListener("uploaded", () => (uploads.has(name) && shown === "upload" ? update?.({}) : refresh()), {
+        signal: closed,
+    });
+    const showAnew = () => {
+        shown = "";
+        refresh();
+    };
+    document.addEventListener("edited", showAnew, { signal: closed });
     closed.addEventListener("abort", () => clearTimeout(timer));
     refresh();
 }
@@ -359,7 +463,9 @@ export function showScene(/** @type {HTMLElement} */ main, /** @type {string} */
 function verdictOf(/** @type {string[]} */ lines) {
     const trimmed = lines.map(line => line.trim());
     const reasons = trimmed.filter(line => line.startsWith("- ")).map(line => make("li", {}, told(line.slice(2))));
-    const [judgement, ...advice] = trimmed.filter(line => !line.startsWith("- ")).map(line => make("p", {}, told(line)));
+    const [judgement, ...advice] = trimmed
+        .filter(line => !line.startsWith("- "))
+        .map(line => make("p", {}, told(line)));
     return [judgement, reasons.length > 0 && make("ul", {}, ...reasons), ...advice];
 }
 
@@ -367,11 +473,22 @@ function factsOf(/** @type {any} */ facts) {
     const words = (/** @type {any} */ value) => {
         if (value === true) return say("given");
         if (typeof value !== "object") return told(String(value));
-        const parts = Object.entries(value).map(([name, what]) => [name.split("/").pop()?.replace(/^(\d+)x(\d+)$/, "$1 × $2"), told(String(what))]);
-        return parts.length === 1 && parts[0][1] === String(facts.photos) ? parts[0][0] : parts.map(part => part.join(": ")).join(", ");
+        const parts = Object.entries(value).map(([name, what]) => [
+            name
+                .split("/")
+                .pop()
+                ?.replace(/^(\d+)x(\d+)$/, "$1 × $2"),
+            told(String(what)),
+        ]);
+        return parts.length === 1 && parts[0][1] === String(facts.photos)
+            ? parts[0][0]
+            : parts.map(part => part.join(": ")).join(", ");
     };
     const known = (/** @type {any} */ value) => value && words(value) !== "unknown";
-    const rows = FACTS.filter(key => known(facts[key])).flatMap(key => [make("dt", {}, say(key)), make("dd", {}, words(facts[key]))]);
+    const rows = FACTS.filter(key => known(facts[key])).flatMap(key => [
+        make("dt", {}, say(key)),
+        make("dd", {}, words(facts[key])),
+    ]);
     return [make("dl.facts", {}, ...rows)];
 }
 
@@ -379,22 +496,46 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {any} */ scene) {
     const { stages = [], now, steps } = scene.state;
     const done = new Map(stages.map((/** @type {any} */ each) => [each.stage, each]));
     const current = now?.stage;
-    const names = STAGES.filter(name => done.has(name) || name === current || (scene.status === "running" && STAGES.indexOf(name) > STAGES.indexOf(current)));
+    const names = STAGES.filter(
+        name =>
+            done.has(name) ||
+            name === current ||
+            (scene.status === "running" && STAGES.indexOf(name) > STAGES.indexOf(current)),
+    );
     list.replaceChildren(
         ...names.map(name => {
             const past = done.get(name);
-            const item = make("li", { "data-state": past ? "done" : name === current ? "now" : "later" }, make("b", {}, say(`stage_${name}`)));
+            const item = make(
+                "li",
+                { "data-state": past ? "done" : name === current ? "now" : "later" },
+                make("b", {}, say(`stage_${name}`)),
+            );
             if (past) {
                 const result = name === "report" ? "" : `${told(past.lines[0])} `;
-                item.append(make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`));
+                item.append(
+                    make("span.soft", {}, ` ${result}(${past.again ? say("before") : duration(past.seconds)})`),
+                );
             } else if (name === current) {
                 const training = name === "scene" && steps;
-                const [count, total, left] = training ? [steps.step, steps.iterations, steps.left] : [now.done, now.total, now.left];
+                const [count, total, left] = training
+                    ? [steps.step, steps.iterations, steps.left]
+                    : [now.done, now.total, now.left];
                 const what = training ? say("step").toLowerCase() : told(now.what ?? "");
                 const time = left ? ` – ${say("left", duration(left))}` : "";
                 item.append(
-                    make("span.soft", {}, total ? ` ${what} ${say("of", count.toLocaleString(), total.toLocaleString())}${time}` : ` ${what}${time}`),
-                    make("progress", total ? { max: total, value: count, "aria-label": say(`stage_${name}`) } : { "aria-label": say(`stage_${name}`) }),
+                    make(
+                        "span.soft",
+                        {},
+                        total
+                            ? ` ${what} ${say("of", count.toLocaleString(), total.toLocaleString())}${time}`
+                            : ` ${what}${time}`,
+                    ),
+                    make(
+                        "progress",
+                        total
+                            ? { max: total, value: count, "aria-label": say(`stage_${name}`) }
+                            : { "aria-label": say(`stage_${name}`) },
+                    ),
                 );
             }
             return item;
@@ -402,9 +543,16 @@ function showStages(/** @type {HTMLElement} */ list, /** @type {any} */ scene) {
     );
 }
 
-function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement} */ curve, /** @type {any} */ { steps, curve: points = [] }) {
+function showFigures(
+    /** @type {HTMLElement} */ figures,
+    /** @type {HTMLElement} */ curve,
+    /** @type {any} */ { steps, curve: points = [] },
+) {
     if (!steps) return;
-    const fact = (/** @type {string} */ key, /** @type {string} */ value) => [make("dt", {}, say(key)), make("dd", {}, value)];
+    const fact = (/** @type {string} */ key, /** @type {string} */ value) => [
+        make("dt", {}, say(key)),
+        make("dd", {}, value),
+    ];
     figures.replaceChildren(
         ...fact("step", say("of", steps.step.toLocaleString(), steps.iterations.toLocaleString())),
         ...fact("gaussians", steps.gaussians.toLocaleString()),
@@ -414,7 +562,10 @@ function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement}
     const values = points.map((/** @type {number[]} */ point) => Math.log(Math.max(point[1], 1e-9)));
     const [low, high] = [Math.min(...values), Math.max(...values)];
     const last = points[points.length - 1][0];
-    const way = values.map((/** @type {number} */ value, /** @type {number} */ i) => `${((300 * points[i][0]) / last).toFixed(1)},${(78 - (76 * (value - low)) / (high - low || 1)).toFixed(1)}`);
+    const way = values.map(
+        (/** @type {number} */ value, /** @type {number} */ i) =>
+            `${((300 * points[i][0]) / last).toFixed(1)},${(78 - (76 * (value - low)) / (high - low || 1)).toFixed(1)}`,
+    );
     const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
     svg.setAttribute("viewBox", "0 0 300 80");
     svg.setAttribute("preserveAspectRatio", "none");
@@ -427,10 +578,24 @@ function showFigures(/** @type {HTMLElement} */ figures, /** @type {HTMLElement}
 }
 
 /** Pictures that are there already remain; those of photos without a pose are dim. */
-function showPhotos(/** @type {HTMLElement} */ strip, /** @type {string} */ address, /** @type {{name: string, placed: boolean}[]} */ photos) {
+function showPhotos(
+    /** @type {HTMLElement} */ strip,
+    /** @type {string} */ address,
+    /** @type {{name: string, placed: boolean}[]} */ photos,
+) {
     const there = /** @type {HTMLImageElement[]} */ ([...strip.children]);
     const same = there.length === photos.length && photos.every(({ name }, i) => there[i].alt === name);
-    if (!same) strip.replaceChildren(...photos.map(({ name }, i) => make("img", { src: `${address}/photos/${i}?${encodeURIComponent(name)}`, alt: name, title: name, loading: "lazy" })));
+    if (!same)
+        strip.replaceChildren(
+            ...photos.map(({ name }, i) =>
+                make("img", {
+                    src: `${address}/photos/${i}?${encodeURIComponent(name)}`,
+                    alt: name,
+                    title: name,
+                    loading: "lazy",
+                }),
+            ),
+        );
     photos.forEach(({ placed }, i) => strip.children[i].classList.toggle("waits", !placed));
 }
 
@@ -442,7 +607,12 @@ async function showFilm(/** @type {HTMLElement} */ card, /** @type {string} */ a
     const file = `${address}/film/file?${made}`;
     card.replaceChildren(
         make("h2", {}, say("film")),
-        make("video.film", { src: file, controls: true, preload: "metadata", "aria-label": say("film") }),
+        make("video.film", {
+            src: file,
+            controls: true,
+            preload: "metadata",
+            "aria-label": say("film"),
+        }),
         make("div.row", {}, make("a.button.plain", { href: file, download: true }, say("film_download", bytes(size)))),
         line && command(line),
     );
@@ -450,11 +620,19 @@ async function showFilm(/** @type {HTMLElement} */ card, /** @type {string} */ a
 
 /** The addresses of the scene for phones, with codes. */
 async function showPhone(/** @type {HTMLElement} */ card, /** @type {string} */ site) {
-    const { addresses } = await ask(`about?path=${encodeURIComponent(site)}`).catch(() => ({ addresses: [] }));
+    const { addresses } = await ask(`about?path=${encodeURIComponent(site)}`).catch(() => ({
+        addresses: [],
+    }));
     card.append(
         make("h2", {}, say("phone")),
-        make("div.row", {}, ...(addresses.length
-            ? addresses.map((/** @type {any} */ { url, code }) => make("div.phone", {}, make("img", { src: code, alt: "" }), make("a", { href: url }, url)))
-            : [make("p.soft", {}, say("phone_how"))])),
+        make(
+            "div.row",
+            {},
+            ...(addresses.length
+                ? addresses.map((/** @type {any} */ { url, code }) =>
+                      make("div.phone", {}, make("img", { src: code, alt: "" }), make("a", { href: url }, url)),
+                  )
+                : [make("p.soft", {}, say("phone_how"))]),
+        ),
     );
 }

@@ -38,7 +38,9 @@ export function within(centers, m, shape, width, height) {
     const found = new Uint8Array(centers.length / 3);
     const [halfWidth, halfHeight] = [0.5 * width, 0.5 * height];
     for (let i = 0, at = 0; i < found.length; i++, at += 3) {
-        const x = centers[at], y = centers[at + 1], z = centers[at + 2];
+        const x = centers[at],
+            y = centers[at + 1],
+            z = centers[at + 2];
         const w = m[3] * x + m[7] * y + m[11] * z + m[15];
         if (!(w > 0)) continue;
         const column = halfWidth + (halfWidth * (m[0] * x + m[4] * y + m[8] * z + m[12])) / w;

@@ -29,7 +29,9 @@ export function addShapes({ canvas, centers, overlay, model, select }) {
 
     function selectStroke(/** @type {PointerEvent} */ event) {
         const { clientWidth: width, clientHeight: height } = canvas;
-        const context = /** @type {CanvasRenderingContext2D} */ (Object.assign(document.createElement("canvas"), { width, height }).getContext("2d"));
+        const context = /** @type {CanvasRenderingContext2D} */ (
+            Object.assign(document.createElement("canvas"), { width, height }).getContext("2d")
+        );
         trace(context);
         const pixels = context.getImageData(0, 0, width, height).data;
         const shape = new Uint8Array(width * height);

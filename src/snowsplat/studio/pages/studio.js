@@ -46,10 +46,14 @@ function showStart(/** @type {AbortSignal} */ closed) {
     };
     main.addEventListener("dragover", over(true), { signal: closed });
     main.addEventListener("dragleave", over(false), { signal: closed });
-    main.addEventListener("drop", event => {
-        over(false)(event);
-        if (event.dataTransfer) dropped(event.dataTransfer).then(begin);
-    }, { signal: closed });
+    main.addEventListener(
+        "drop",
+        event => {
+            over(false)(event);
+            if (event.dataTransfer) dropped(event.dataTransfer).then(begin);
+        },
+        { signal: closed },
+    );
 
     Promise.all([ask("scenes"), ask("about")]).then(
         ([scenes, about]) => {
@@ -67,7 +71,11 @@ function tile(/** @type {any} */ scene) {
         { href: `#${encodeURIComponent(scene.name)}` },
         scene.picture ? make("img", { src: `${address}/picture`, alt: "", loading: "lazy" }) : make("div.empty"),
         make("b", {}, scene.title),
-        make("span.soft", { "data-status": scene.status }, `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString(document.documentElement.lang)}`}`),
+        make(
+            "span.soft",
+            { "data-status": scene.status },
+            `${say(scene.status)}${scene.created && ` · ${new Date(scene.created).toLocaleDateString(document.documentElement.lang)}`}`,
+        ),
     );
 }
 
@@ -89,7 +97,15 @@ async function begin(/** @type {import("./upload.js").Item[]} */ items) {
 
 /** Chooses a folder of the machine where the studio runs. */
 function machinePart() {
-    const path = /** @type {HTMLInputElement} */ (make("input", { type: "text", autocomplete: "off", spellcheck: "false", "aria-label": say("path"), placeholder: say("path") }));
+    const path = /** @type {HTMLInputElement} */ (
+        make("input", {
+            type: "text",
+            autocomplete: "off",
+            spellcheck: "false",
+            "aria-label": say("path"),
+            placeholder: say("path"),
+        })
+    );
     const list = make("div.folders");
     const use = async (/** @type {string} */ where) => {
         const { name } = await ask("scenes", "POST", { path: where });
@@ -101,9 +117,21 @@ function machinePart() {
         const inside = (/** @type {string} */ name) => `${found.path.replace(/[/\\]$/, "")}/${name}`;
         list.replaceChildren(
             make("button.plain", { type: "button", click: action(() => look(found.parent)) }, `↑ ${say("up")}`),
-            ...(found.photos > 0 ? [make("button.main", { type: "button", click: action(() => use(found.path)) }, say("use_this", found.photos))] : []),
-            ...found.folders.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: action(() => look(inside(name))) }, `${name}/`)),
-            ...found.files.map((/** @type {string} */ name) => make("button.plain", { type: "button", click: action(() => use(inside(name))) }, name)),
+            ...(found.photos > 0
+                ? [
+                      make(
+                          "button.main",
+                          { type: "button", click: action(() => use(found.path)) },
+                          say("use_this", found.photos),
+                      ),
+                  ]
+                : []),
+            ...found.folders.map((/** @type {string} */ name) =>
+                make("button.plain", { type: "button", click: action(() => look(inside(name))) }, `${name}/`),
+            ),
+            ...found.files.map((/** @type {string} */ name) =>
+                make("button.plain", { type: "button", click: action(() => use(inside(name))) }, name),
+            ),
         );
     };
     return make(

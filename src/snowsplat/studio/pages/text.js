@@ -10,7 +10,10 @@ const TEXTS = {
     colours: ["Colours: {0}", "颜色：{0}"],
     title: ["Photos in, a 3D scene out", "放入照片，得到三维场景"],
     drop: ["Drop photos, a folder, a zip file or a video here", "把照片、文件夹、zip 文件或视频拖到这里"],
-    advice: ["30 to 100 sharp photos of one object or place from all sides, or a slow video. Each photo shows most of what the one before shows.", "围绕一个物体或地方，从各个方向拍 30 到 100 张清晰的照片，或一段缓慢移动的视频。每张照片都应包含前一张的大部分内容。"],
+    advice: [
+        "30 to 100 sharp photos of one object or place from all sides, or a slow video. Each photo shows most of what the one before shows.",
+        "围绕一个物体或地方，从各个方向拍 30 到 100 张清晰的照片，或一段缓慢移动的视频。每张照片都应包含前一张的大部分内容。",
+    ],
     private: ["Everything stays on this computer.", "一切都留在这台电脑上。"],
     choose_files: ["Choose files", "选择文件"],
     choose_folder: ["Choose a folder", "选择文件夹"],
@@ -32,8 +35,14 @@ const TEXTS = {
     kept_at: ["It is kept in {0}", "保存在 {0}"],
     rename: ["Rename", "重命名"],
     remove: ["Remove this scene", "删除此场景"],
-    remove_help: ["The scene, its downloads and its site are removed. Photos are kept.", "场景、下载文件和网站会被删除。照片会保留。"],
-    remove_sure: ["Remove the scene {0}? This cannot be undone. Photos are kept.", "删除场景“{0}”？此操作无法撤销。照片会保留。"],
+    remove_help: [
+        "The scene, its downloads and its site are removed. Photos are kept.",
+        "场景、下载文件和网站会被删除。照片会保留。",
+    ],
+    remove_sure: [
+        "Remove the scene {0}? This cannot be undone. Photos are kept.",
+        "删除场景“{0}”？此操作无法撤销。照片会保留。",
+    ],
     removed: ["The scene is removed.", "场景已删除。"],
     removed_but: ["The scene is removed. Its photos are still in {0}", "场景已删除。照片仍在 {0}"],
     stopped: ["Stopped", "已停止"],
@@ -42,9 +51,18 @@ const TEXTS = {
     uploading: ["{0} of {1} have arrived", "已上传 {0}，共 {1}"],
     files: ["{0} of {1} files", "{0} / {1} 个文件"],
     left: ["about {0} left", "大约还需 {0}"],
-    not_arrived: ["Files that have not arrived completely: {0}. They are not used; drop them again.", "有 {0} 个文件没有传完，不会被使用：请再次拖入这些文件。"],
-    no_files: ["Drop the photos here, or the same ones again: what has arrived is kept.", "请把照片拖到这里；如果上传中断，请再次拖入同样的照片，已上传的部分会保留。"],
-    no_answer: ["The studio does not answer; try again, or start it anew with: snowsplat studio", "工作室没有响应，请重试，或用此命令重新启动：snowsplat studio"],
+    not_arrived: [
+        "Files that have not arrived completely: {0}. They are not used; drop them again.",
+        "有 {0} 个文件没有传完，不会被使用：请再次拖入这些文件。",
+    ],
+    no_files: [
+        "Drop the photos here, or the same ones again: what has arrived is kept.",
+        "请把照片拖到这里；如果上传中断，请再次拖入同样的照片，已上传的部分会保留。",
+    ],
+    no_answer: [
+        "The studio does not answer; try again, or start it anew with: snowsplat studio",
+        "工作室没有响应，请重试，或用此命令重新启动：snowsplat studio",
+    ],
     offline: ["The studio does not answer; trying again …", "工作室没有响应，正在重试……"],
     looking: ["Looking at the photos …", "正在检查照片……"],
     photos: ["Photos", "照片"],
@@ -69,8 +87,14 @@ const TEXTS = {
     again: ["Make it again", "重新制作"],
     resume: ["Continue", "继续"],
     stop: ["Stop", "停止"],
-    stop_help: ["What is done is kept; Continue goes on from there. You can close this page, too.", "已完成的部分会保留，可以随时继续。也可以关闭此页面。"],
-    was_killed: ["The job ended without a word, as if it was killed or the computer was switched off. Continue goes on from what was saved.", "任务意外结束（可能被终止或电脑关机）。点击“继续”从已保存的部分接着做。"],
+    stop_help: [
+        "What is done is kept; Continue goes on from there. You can close this page, too.",
+        "已完成的部分会保留，可以随时继续。也可以关闭此页面。",
+    ],
+    was_killed: [
+        "The job ended without a word, as if it was killed or the computer was switched off. Continue goes on from what was saved.",
+        "任务意外结束（可能被终止或电脑关机）。点击“继续”从已保存的部分接着做。",
+    ],
     was_stopped: ["Continue goes on from what was saved.", "点击“继续”从已保存的部分接着做。"],
     stage_photos: ["Reading the photos", "读取照片"],
     stage_poses: ["Finding the cameras", "估计相机位置"],
@@ -109,14 +133,20 @@ const TEXTS = {
     kind_html: ["One page with a viewer", "带查看器的单个网页"],
     kind_zip: ["A web site; unpack it on any web host", "网站，解压到任意网站主机即可"],
     phone: ["Open it on a phone in the same network", "在同一网络的手机上打开"],
-    phone_how: ["To open it on phones, start the studio with: snowsplat studio --host 0.0.0.0", "要在手机上打开，请用此命令启动：snowsplat studio --host 0.0.0.0"],
+    phone_how: [
+        "To open it on phones, start the studio with: snowsplat studio --host 0.0.0.0",
+        "要在手机上打开，请用此命令启动：snowsplat studio --host 0.0.0.0",
+    ],
     command: ["The same in a terminal", "在终端中的相同命令"],
     copy: ["Copy", "复制"],
     copied: ["Copied", "已复制"],
     viewer: ["The scene", "场景"],
     live: ["The training, live", "实时训练画面"],
     film: ["Film", "影片"],
-    film_empty: ["Move the camera, and add two or more views. The film passes them in their order.", "移动相机并添加两个或更多视角，影片会依次经过这些视角。"],
+    film_empty: [
+        "Move the camera, and add two or more views. The film passes them in their order.",
+        "移动相机并添加两个或更多视角，影片会依次经过这些视角。",
+    ],
     film_add: ["Add this view", "添加此视角"],
     film_replace: ["Replace", "替换"],
     film_remove: ["Remove", "移除"],
@@ -126,9 +156,9 @@ const TEXTS = {
     film_line: ["Time line", "时间线"],
     film_seconds: ["Seconds", "秒数"],
     film_size: ["Format", "画幅"],
-    "film_1920x1080": ["Wide, 1920 × 1080", "横屏 1920 × 1080"],
-    "film_1080x1920": ["Portrait, 1080 × 1920", "竖屏 1080 × 1920"],
-    "film_1080x1080": ["Square, 1080 × 1080", "方形 1080 × 1080"],
+    film_1920x1080: ["Wide, 1920 × 1080", "横屏 1920 × 1080"],
+    film_1080x1920: ["Portrait, 1080 × 1920", "竖屏 1080 × 1920"],
+    film_1080x1080: ["Square, 1080 × 1080", "方形 1080 × 1080"],
     film_ease: ["Begin and end slowly", "缓入缓出"],
     film_loop: ["Back to the first view", "回到第一个视角"],
     film_preview: ["Preview", "预览"],
@@ -138,7 +168,10 @@ const TEXTS = {
     film_stopped: ["Stopped; there is no new film", "已停止，没有新的影片"],
     film_download: ["Download the film (MP4, {0})", "下载影片（MP4，{0}）"],
     edit: ["Edit", "编辑"],
-    edit_whole: ["Preparing all Gaussians for editing. Use a computer with enough graphics memory, not a phone …", "正在准备全部高斯以供编辑。请使用显存充足的电脑，而不是手机……"],
+    edit_whole: [
+        "Preparing all Gaussians for editing. Use a computer with enough graphics memory, not a phone …",
+        "正在准备全部高斯以供编辑。请使用显存充足的电脑，而不是手机……",
+    ],
     edit_rectangle: ["Rectangle", "矩形"],
     edit_lasso: ["Lasso", "套索"],
     edit_brush: ["Brush", "画笔"],
@@ -146,12 +179,18 @@ const TEXTS = {
     edit_measure: ["Measure", "测量"],
     edit_note: ["Annotate", "标注"],
     edit_level: ["Level and turn", "调平与旋转"],
-    edit_level_how: ["Click three points of the floor to level the scene, or turn it about an axis; y is up.", "点击地面上的三个点即可调平场景，或绕某个轴旋转；y 轴朝上。"],
+    edit_level_how: [
+        "Click three points of the floor to level the scene, or turn it about an axis; y is up.",
+        "点击地面上的三个点即可调平场景，或绕某个轴旋转；y 轴朝上。",
+    ],
     edit_level_points: ["{0} of 3 points", "已点击 {0} / 3 个点"],
     edit_on_a_line: ["The three points are on a line; click others", "三个点在一条直线上；请点击其他位置"],
     edit_turn: ["Turn about {0} by {1}°", "绕 {0} 轴旋转 {1}°"],
     edit_turn_fine: ["Turn about {0}, finely", "绕 {0} 轴微调"],
-    edit_note_how: ["Click a place of the scene to annotate it; the present view is that of the annotation.", "点击场景中的位置添加标注；当前视角即为标注的视角。"],
+    edit_note_how: [
+        "Click a place of the scene to annotate it; the present view is that of the annotation.",
+        "点击场景中的位置添加标注；当前视角即为标注的视角。",
+    ],
     edit_note_new: ["Annotation {0}", "标注 {0}"],
     edit_note_title: ["Title", "标题"],
     edit_note_text: ["Text", "文字"],
@@ -165,12 +204,18 @@ const TEXTS = {
     edit_delete: ["Delete", "删除"],
     edit_undo: ["Undo", "撤销"],
     edit_redo: ["Redo", "重做"],
-    edit_first: ["Choose a tool to select something, then delete it. Nothing is changed before Save, and the original is kept.", "选择一个工具选中要去掉的部分，再删除。保存之前不会有任何改动，原场景也会保留。"],
+    edit_first: [
+        "Choose a tool to select something, then delete it. Nothing is changed before Save, and the original is kept.",
+        "选择一个工具选中要去掉的部分，再删除。保存之前不会有任何改动，原场景也会保留。",
+    ],
     edit_counts: ["{0} selected, {1} deleted", "已选 {0}，已删 {1}"],
     edit_radius: ["Radius", "半径"],
     edit_from: ["{0} from", "{0} 从"],
     edit_to: ["{0} to", "{0} 到"],
-    edit_box_how: ["Drag the faces of the box, or focus one and use the arrow keys.", "拖动裁剪框的面，或选中一个面后使用方向键。"],
+    edit_box_how: [
+        "Drag the faces of the box, or focus one and use the arrow keys.",
+        "拖动裁剪框的面，或选中一个面后使用方向键。",
+    ],
     edit_outside: ["Select what is outside", "选择框外部分"],
     edit_two_points: ["Click two points of the scene", "点击场景中的两个点"],
     edit_no_surface: ["There is no surface; click another place", "这里没有表面；请点击别处"],
@@ -190,7 +235,8 @@ const TEXTS = {
 let column = 0;
 
 /** The language that was chosen in the browser. */
-export const chosenLanguage = () => localStorage.getItem("language") ?? (navigator.language.startsWith("zh") ? "zh" : "en");
+export const chosenLanguage = () =>
+    localStorage.getItem("language") ?? (navigator.language.startsWith("zh") ? "zh" : "en");
 
 /** The colours that were chosen in the browser: "light", "dark" or "auto". */
 export const chosenTheme = () => localStorage.getItem("theme") ?? "auto";

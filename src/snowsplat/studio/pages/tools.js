@@ -6,7 +6,11 @@ import { addFilm } from "./film.js";
 import { ask, make, reasonOf } from "./page.js";
 import { chosenLanguage, say, speak } from "./text.js";
 
-const { page: kind, edited, version } = /** @type {HTMLElement} */ (document.querySelector("script[data-page]")).dataset;
+const {
+    page: kind,
+    edited,
+    version,
+} = /** @type {HTMLElement} */ (document.querySelector("script[data-page]")).dataset;
 
 function addTools(/** @type {any} */ page) {
     const { app, events, state } = page.viewer;

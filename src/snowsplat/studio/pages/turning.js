@@ -4,7 +4,12 @@ export const UNTURNED = [1, 0, 0, 0];
 
 /** The rotation by b, and then by a. */
 export function product(/** @type {number[]} */ [a, b, c, d], /** @type {number[]} */ [w, x, y, z]) {
-    return [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w];
+    return [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ];
 }
 
 export const inverse = (/** @type {number[]} */ [w, x, y, z]) => [w, -x, -y, -z];
@@ -22,7 +27,11 @@ export function about(/** @type {number} */ axis, /** @type {number} */ degrees)
     return [Math.cos(half), ...[0, 1, 2].map(k => (k === axis ? Math.sin(half) : 0))];
 }
 
-const cross = (/** @type {number[]} */ [a, b, c], /** @type {number[]} */ [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
+const cross = (/** @type {number[]} */ [a, b, c], /** @type {number[]} */ [d, e, f]) => [
+    b * f - c * e,
+    c * d - a * f,
+    a * e - b * d,
+];
 const minus = (/** @type {number[]} */ a, /** @type {number[]} */ b) => a.map((value, k) => value - b[k]);
 
 /**

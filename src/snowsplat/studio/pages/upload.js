@@ -57,7 +57,8 @@ export function titleOf(/** @type {Item[]} */ items) {
 const timeOf = (/** @type {File} */ file) => Math.max(0, Math.floor(file.lastModified));
 
 /** Tells a file from others of the same name. */
-const nameOf = (/** @type {string} */ path, /** @type {number} */ size, /** @type {number} */ modified) => `${path} ${size} ${modified}`;
+const nameOf = (/** @type {string} */ path, /** @type {number} */ size, /** @type {number} */ modified) =>
+    `${path} ${size} ${modified}`;
 
 /** The upload of files to a scene; `changed` is called after each part. */
 export class Upload {
@@ -113,7 +114,12 @@ export class Upload {
         const item = /** @type {Item} */ (this.items.find(each => each.file === file));
         let start = this.sent.get(item) ?? 0;
         do {
-            const query = new URLSearchParams({ path, size: String(file.size), modified: String(timeOf(file)), start: String(start) });
+            const query = new URLSearchParams({
+                path,
+                size: String(file.size),
+                modified: String(timeOf(file)),
+                start: String(start),
+            });
             try {
                 const part = file.slice(start, start + PART);
                 start = (await ask(`${this.scene}/uploads?${query}`, "PUT", part)).received;

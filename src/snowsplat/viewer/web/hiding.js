@@ -21,7 +21,7 @@ fn modifySplatRotationScale(center: vec3f, modified: vec3f, rotation: ptr<functi
         *scale = vec3f(0.0);
     }
 }
-fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {}`
+fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {}`,
 };
 const EVERYTHING = 1e30;
 
@@ -37,47 +37,50 @@ const element = (name, properties, ...children) => {
  */
 const hidingSliders = (app, [x, y, z], limits) => {
     let gsplat;
-    const use = (code) => {
-        ({ gsplat } = app.root.findByName('gsplat'));
+    const use = code => {
+        ({ gsplat } = app.root.findByName("gsplat"));
         gsplat.setWorkBufferModifier(code);
     };
     /** The largest distance and the largest size that are shown. */
-    const shown = () => sliders.map(({ value }, i) => {
-        const [all, least] = limits[['distance', 'size'][i]];
-        return value > 0 ? all * (least / all) ** (value / 100) : EVERYTHING;
-    });
+    const shown = () =>
+        sliders.map(({ value }, i) => {
+            const [all, least] = limits[["distance", "size"][i]];
+            return value > 0 ? all * (least / all) ** (value / 100) : EVERYTHING;
+        });
     const apply = () => {
         const [distance, size] = shown();
         if (!gsplat) {
             if (Math.min(distance, size) === EVERYTHING) return;
             use(HIDING);
         }
-        gsplat.setParameter('snowKept', [x, y, z, distance]);
-        gsplat.setParameter('snowLargest', size);
+        gsplat.setParameter("snowKept", [x, y, z, distance]);
+        gsplat.setParameter("snowLargest", size);
         app.renderNextFrame = true;
     };
-    const sliders = limits.start.map((value) =>
-        element('input', { type: 'range', min: 0, max: 100, value, oninput: apply })
+    const sliders = limits.start.map(value =>
+        element("input", { type: "range", min: 0, max: 100, value, oninput: apply }),
     );
     return {
         element: element(
-            'div',
-            { className: 'snow-hiding snow-card' },
-            element('label', {}, say('Crop'), sliders[0]),
-            element('label', {}, say('Hide floaters'), sliders[1])
+            "div",
+            { className: "snow-hiding snow-card" },
+            element("label", {}, say("Crop"), sliders[0]),
+            element("label", {}, say("Hide floaters"), sliders[1]),
         ),
         code: HIDING,
         /** Gives the engine code that contains this one. */
-        use: (code) => {
+        use: code => {
             use(code);
             apply();
         },
         /** Everything that is hidden: from [x, y, z], beyond a distance, or larger than a size; null if nothing is. */
         limits: () => (sliders.some(({ value }) => value > 0) ? [x, y, z, ...shown()] : null),
         values: () => sliders.map(({ value }) => Number(value)),
-        set: (values) => {
-            values.forEach((value, i) => { sliders[i].value = value; });
+        set: values => {
+            values.forEach((value, i) => {
+                sliders[i].value = value;
+            });
             apply();
-        }
+        },
     };
 };

@@ -8,11 +8,17 @@ const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
 // Orbit of the globe, as in snowsplat/extras/globe/globe_video.py. Rows of `axes`: right, down, forward.
 function orbit(azimuth, elevation, distance) {
-    const ce = Math.cos(elevation), se = Math.sin(elevation);
-    const ca = Math.cos(azimuth), sa = Math.sin(azimuth);
+    const ce = Math.cos(elevation),
+        se = Math.sin(elevation);
+    const ca = Math.cos(azimuth),
+        sa = Math.sin(azimuth);
     return {
         position: [distance * ce * sa, C.MIDDLE - distance * se, -distance * ce * ca],
-        axes: [[ca, 0, sa], [se * sa, ce, -se * ca], [-ce * sa, se, ce * ca]],
+        axes: [
+            [ca, 0, sa],
+            [se * sa, ce, -se * ca],
+            [-ce * sa, se, ce * ca],
+        ],
     };
 }
 
@@ -21,7 +27,8 @@ function orbit(azimuth, elevation, distance) {
 const SWING = Math.PI / 6; // the scene turns by this angle to each side if its back is unknown
 const TURN_SECONDS = 60;
 const SLOW = 1000 / 30; // milliseconds per frame
-const LEAST_COUNT = 10000, LEAST_RATIO = 0.6;
+const LEAST_COUNT = 10000,
+    LEAST_RATIO = 0.6;
 
 class Globe {
     constructor() {
@@ -52,7 +59,7 @@ class Globe {
         this.waiting = null;
         this.listen();
         this.request([], true);
-        requestAnimationFrame((now) => this.frame(now));
+        requestAnimationFrame(now => this.frame(now));
     }
 
     // ---- Simulation
@@ -65,15 +72,16 @@ class Globe {
     // Ask the worker for the state after these steps. One request is under way at a time.
     request(steps, force) {
         const forward = this.cameras().scene.axes[2];
-        const key = `${forward.map((f) => f.toFixed(3))} ${this.count}`;
+        const key = `${forward.map(f => f.toFixed(3))} ${this.count}`;
         const rests = this.result.standing && !steps.some(([, a]) => Math.hypot(...a) > 0);
         if (!this.buffers || (!force && rests && key === this.sorted)) return false;
         this.sorted = key;
         const { state, order } = this.buffers;
         this.buffers = null;
-        this.worker.postMessage(
-            { steps, forward, count: this.count, remember: this.remembers, state, order },
-            [state.buffer, order.buffer]);
+        this.worker.postMessage({ steps, forward, count: this.count, remember: this.remembers, state, order }, [
+            state.buffer,
+            order.buffer,
+        ]);
         this.remembers = false;
         return true;
     }
@@ -93,12 +101,14 @@ class Globe {
         const since = this.shaken + seconds;
         let inCamera = this.push;
         if (since < C.SHAKE_SECONDS) {
-            const strength = C.SHAKE_ACCELERATION * Math.sin((Math.PI * since) / C.SHAKE_SECONDS)
-                * Math.sin(2 * Math.PI * C.SHAKE_FREQUENCY * since);
+            const strength =
+                C.SHAKE_ACCELERATION *
+                Math.sin((Math.PI * since) / C.SHAKE_SECONDS) *
+                Math.sin(2 * Math.PI * C.SHAKE_FREQUENCY * since);
             inCamera = C.SHAKE_DIRECTION.map((share, i) => strength * share + this.push[i]);
         }
         const { axes } = this.cameras().scene;
-        return [0, 1, 2].map((i) => axes.reduce((sum, axis, j) => sum + axis[i] * inCamera[j], 0));
+        return [0, 1, 2].map(i => axes.reduce((sum, axis, j) => sum + axis[i] * inCamera[j], 0));
     }
 
     shake() {
@@ -114,26 +124,25 @@ class Globe {
     // Steps for this time, none of which is longer than the simulation allows.
     steps(seconds) {
         const number = Math.max(1, Math.ceil(seconds / C.LONGEST_STEP - 1e-6));
-        return Array.from({ length: number }, (_, i) => [
-            seconds / number, this.acceleration((i * seconds) / number)]);
+        return Array.from({ length: number }, (_, i) => [seconds / number, this.acceleration((i * seconds) / number)]);
     }
 
     // Advance at once, without drawing: for tests. The promise is fulfilled when it is done.
     async advance(seconds) {
         for (let left = seconds; left > 1e-6; left -= C.LONGEST_STEP) {
-            while (!this.buffers) await new Promise((done) => (this.waiting = done));
+            while (!this.buffers) await new Promise(done => (this.waiting = done));
             const now = Math.min(left, C.LONGEST_STEP);
             const steps = this.steps(now);
             this.shaken += now;
             this.request(steps, true);
         }
-        while (!this.buffers) await new Promise((done) => (this.waiting = done));
+        while (!this.buffers) await new Promise(done => (this.waiting = done));
     }
 
     // ---- Drawing
 
     frame(now) {
-        requestAnimationFrame((next) => this.frame(next));
+        requestAnimationFrame(next => this.frame(next));
         const interval = Math.min(now - (this.last ?? now), 250);
         this.last = now;
         if (this.paused || document.hidden) return;
@@ -146,7 +155,7 @@ class Globe {
         if (this.owed > 0 && this.buffers) {
             this.request(this.steps(this.owed), this.remembers);
             this.shaken += this.owed;
-            this.push = this.push.map((a) => a * Math.exp(-this.owed / 0.06));
+            this.push = this.push.map(a => a * Math.exp(-this.owed / 0.06));
             this.owed = 0;
         }
         this.draw();
@@ -169,10 +178,11 @@ class Globe {
         const focal = C.FOCAL * Math.min(width, 0.94 * height) * this.zoom;
         const centre = [0.5 * width, 0.47 * height];
         if (this.shaken < C.SHAKE_SECONDS && !reducedMotion.matches) {
-            const strength = Math.sin((Math.PI * this.shaken) / C.SHAKE_SECONDS)
-                * Math.sin(2 * Math.PI * C.SHAKE_FREQUENCY * this.shaken);
-            const offset = (-C.SHAKE_ACCELERATION * strength * focal)
-                / (2 * Math.PI * C.SHAKE_FREQUENCY) ** 2 / C.DISTANCE;
+            const strength =
+                Math.sin((Math.PI * this.shaken) / C.SHAKE_SECONDS) *
+                Math.sin(2 * Math.PI * C.SHAKE_FREQUENCY * this.shaken);
+            const offset =
+                (-C.SHAKE_ACCELERATION * strength * focal) / (2 * Math.PI * C.SHAKE_FREQUENCY) ** 2 / C.DISTANCE;
             centre[0] += offset * C.SHAKE_DIRECTION[0];
             centre[1] += offset * C.SHAKE_DIRECTION[1];
         }
@@ -201,35 +211,45 @@ class Globe {
 
     listen() {
         const { canvas } = this;
-        let x = 0, y = 0, time = 0, vx = 0, vy = 0;
-        canvas.addEventListener("pointerdown", (event) => {
+        let x = 0,
+            y = 0,
+            time = 0,
+            vx = 0,
+            vy = 0;
+        canvas.addEventListener("pointerdown", event => {
             canvas.setPointerCapture(event.pointerId);
             [x, y, time] = [event.clientX, event.clientY, event.timeStamp];
             vx = vy = 0;
             this.dragging = true;
         });
-        canvas.addEventListener("pointermove", (event) => {
+        canvas.addEventListener("pointermove", event => {
             if (!this.dragging) return;
-            const dx = event.clientX - x, dy = event.clientY - y;
+            const dx = event.clientX - x,
+                dy = event.clientY - y;
             const seconds = Math.max((event.timeStamp - time) / 1000, 0.004);
             [x, y, time] = [event.clientX, event.clientY, event.timeStamp];
             this.rotate(-dx * 0.007, dy * 0.004);
             // Fast changes of direction shake the globe. Velocities are in radii per second.
             const radius = 0.36 * Math.min(canvas.clientWidth, canvas.clientHeight);
             const [wx, wy] = [dx / seconds / radius, dy / seconds / radius];
-            const ax = (wx - vx) / Math.max(seconds, 0.016), ay = (wy - vy) / Math.max(seconds, 0.016);
+            const ax = (wx - vx) / Math.max(seconds, 0.016),
+                ay = (wy - vy) / Math.max(seconds, 0.016);
             [vx, vy] = [wx, wy];
             if (Math.hypot(ax, ay) > 150) this.pushBy(0.12 * ax, 0.12 * ay, 0);
         });
         for (const end of ["pointerup", "pointercancel"]) {
             canvas.addEventListener(end, () => (this.dragging = false));
         }
-        canvas.addEventListener("wheel", (event) => {
-            event.preventDefault();
-            this.zoom = Math.min(2.5, Math.max(0.6, this.zoom * Math.exp(-0.001 * event.deltaY)));
-            this.drawn = false;
-        }, { passive: false });
-        addEventListener("keydown", (event) => {
+        canvas.addEventListener(
+            "wheel",
+            event => {
+                event.preventDefault();
+                this.zoom = Math.min(2.5, Math.max(0.6, this.zoom * Math.exp(-0.001 * event.deltaY)));
+                this.drawn = false;
+            },
+            { passive: false },
+        );
+        addEventListener("keydown", event => {
             const onButton = event.target instanceof HTMLButtonElement;
             if (event.key === " " && !onButton) this.shake();
             else if (event.key === "Enter" && !onButton) this.remember();
@@ -256,8 +276,9 @@ class Globe {
     }
 
     pushBy(x, y, z) {
-        const size = Math.hypot(x, y, z), most = C.SHAKE_ACCELERATION;
-        this.push = [x, y, z].map((a) => (a * Math.min(size, most)) / size);
+        const size = Math.hypot(x, y, z),
+            most = C.SHAKE_ACCELERATION;
+        this.push = [x, y, z].map(a => (a * Math.min(size, most)) / size);
     }
 
     // Safari asks the user for permission, after a click.
@@ -267,7 +288,7 @@ class Globe {
         const ask = globalThis.DeviceMotionEvent?.requestPermission;
         if (!ask) return;
         ask.call(DeviceMotionEvent)
-            .then((answer) => answer === "granted" && this.listenToMotion())
+            .then(answer => answer === "granted" && this.listenToMotion())
             .catch(() => {}); // not allowed: the buttons are enough
     }
 
@@ -293,7 +314,10 @@ if (chinese) {
     document.title = `${about.name} - 雪花球`;
     element("view").setAttribute("aria-label", `雪花球中的场景：${about.name}`);
     element("hint").textContent = "拖动可以转动雪花球，快速拖动可以摇晃它；在手机上，也可以摇晃手机。";
-    for (const [id, text, title] of [["shake", "摇晃", "空格键"], ["remember", "复原", "回车键"]]) {
+    for (const [id, text, title] of [
+        ["shake", "摇晃", "空格键"],
+        ["remember", "复原", "回车键"],
+    ]) {
         Object.assign(element(id), { textContent: text, title });
     }
 }

@@ -1,7 +1,7 @@
 // Decodes the data of the page, and draws the globe with WebGL 2.
 "use strict";
 
-const element = (id) => document.getElementById(id);
+const element = id => document.getElementById(id);
 const about = JSON.parse(element("about").textContent);
 const C = about.constants;
 
@@ -16,7 +16,7 @@ function decode() {
     const columns = {};
     for (const { name, kind, offset, length, scale, low } of about.columns) {
         const values = new kinds[kind](bytes.buffer, offset, length);
-        columns[name] = Float32Array.from(values, (value) => low + scale * value);
+        columns[name] = Float32Array.from(values, value => low + scale * value);
     }
     return columns;
 }
@@ -24,7 +24,8 @@ function decode() {
 // Six texels of parameters for each Gaussian: see splats.vert.
 function parametersOf(columns, count, width) {
     const data = new Float32Array(4 * width * Math.ceil((6 * count) / width));
-    const heights = randomNumbers(count, 9), azimuths = randomNumbers(count, 10);
+    const heights = randomNumbers(count, 9),
+        azimuths = randomNumbers(count, 10);
     for (let i = 0; i < count; i++) {
         const at = 24 * i;
         data.set(columns.log_scales.subarray(3 * i, 3 * i + 3), at);
@@ -45,9 +46,12 @@ function parametersOf(columns, count, width) {
 
 function program(gl, vertex, fragment) {
     const linked = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    for (const [kind, source] of [
+        [gl.VERTEX_SHADER, vertex],
+        [gl.FRAGMENT_SHADER, fragment],
+    ]) {
         const shader = gl.createShader(kind);
-        gl.shaderSource(shader, "#version 300 es\nprecision highp float;\n" + source);
+        gl.shaderSource(shader, `#version 300 es\nprecision highp float;\n${source}`);
         gl.compileShader(shader);
         if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) {
             throw new Error(gl.getShaderInfoLog(shader));
@@ -104,7 +108,8 @@ function engraving(name) {
     return canvas;
 }
 
-const STATE_WIDTH = 1024, PARAMETER_WIDTH = 1536; // texels; a multiple of 6
+const STATE_WIDTH = 1024,
+    PARAMETER_WIDTH = 1536; // texels; a multiple of 6
 
 class Renderer {
     constructor(canvas, columns, count) {
@@ -118,11 +123,18 @@ class Renderer {
         this.front = program(gl, screen, glsl + shaders.common + shaders.front);
         this.splats = program(gl, glsl + shaders.vertex, shaders.fragment);
         this.rows = Math.ceil(count / STATE_WIDTH);
-        this.state = texture(
-            gl, 0, gl.RGBA32F, STATE_WIDTH, this.rows, gl.RGBA, gl.FLOAT, null);
+        this.state = texture(gl, 0, gl.RGBA32F, STATE_WIDTH, this.rows, gl.RGBA, gl.FLOAT, null);
         const parameters = parametersOf(columns, count, PARAMETER_WIDTH);
-        texture(gl, 1, gl.RGBA32F, PARAMETER_WIDTH, parameters.length / 4 / PARAMETER_WIDTH,
-            gl.RGBA, gl.FLOAT, parameters);
+        texture(
+            gl,
+            1,
+            gl.RGBA32F,
+            PARAMETER_WIDTH,
+            parameters.length / 4 / PARAMETER_WIDTH,
+            gl.RGBA,
+            gl.FLOAT,
+            parameters,
+        );
         texture(gl, 2, gl.R8, 0, 0, gl.RED, gl.UNSIGNED_BYTE, engraving(about.name));
         gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
         const corners = new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]);
@@ -144,8 +156,7 @@ class Renderer {
         const { gl } = this;
         gl.activeTexture(gl.TEXTURE0);
         gl.bindTexture(gl.TEXTURE_2D, this.state);
-        gl.texSubImage2D(
-            gl.TEXTURE_2D, 0, 0, 0, STATE_WIDTH, this.rows, gl.RGBA, gl.FLOAT, state);
+        gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, STATE_WIDTH, this.rows, gl.RGBA, gl.FLOAT, state);
         gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
         gl.bufferSubData(gl.ARRAY_BUFFER, 0, order, 0, count);
         this.count = count;
@@ -159,8 +170,7 @@ class Renderer {
         if (this.inside) gl.deleteTexture(this.inside);
         this.inside = texture(gl, 3, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null);
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-        gl.framebufferTexture2D(
-            gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.inside, 0);
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.inside, 0);
     }
 
     // globe, scene: cameras {position, axes} in front of the globe, and of the turned scene.
@@ -171,7 +181,7 @@ class Renderer {
             gl.uniform2fv(uniforms.centre, centre);
             gl.uniform2f(uniforms.size, canvas.width, canvas.height);
         };
-        const backdrop = (pass) => {
+        const backdrop = pass => {
             gl.useProgram(pass.linked);
             lens(pass);
             gl.uniformMatrix3fv(pass.uniforms.turn, false, globe.axes.flat());

@@ -16,8 +16,7 @@ function randomNumbers(count, channel) {
     return numbers;
 }
 
-const inRange = (limits, shares) =>
-    Float32Array.from(shares, (share) => limits[0] + (limits[1] - limits[0]) * share);
+const inRange = (limits, shares) => Float32Array.from(shares, share => limits[0] + (limits[1] - limits[0]) * share);
 
 class Snow {
     // home: Float32Array, x y z of each Gaussian; C: the constants of physics.py.
@@ -36,14 +35,15 @@ class Snow {
         this.time = 0;
         this.remembering = null;
         const random = Array.from({ length: 9 }, (_, i) => randomNumbers(count, i));
-        const level = (i) =>
-            Math.min(1, Math.max(0, (C.FLOOR - home[3 * i + 1]) / (C.FLOOR + C.WALL)));
-        this.hold = inRange(C.HOLD, random[0].map((r, i) => 0.55 * r + 0.45 * (1 - level(i))));
-        this.turn = Float32Array.from(random[1], (r) => (r < 0.5 ? -C.SPIN : C.SPIN));
+        const level = i => Math.min(1, Math.max(0, (C.FLOOR - home[3 * i + 1]) / (C.FLOOR + C.WALL)));
+        this.hold = inRange(
+            C.HOLD,
+            random[0].map((r, i) => 0.55 * r + 0.45 * (1 - level(i))),
+        );
+        this.turn = Float32Array.from(random[1], r => (r < 0.5 ? -C.SPIN : C.SPIN));
         this.drag = inRange(C.DRAG, random[2]);
         this.fall = inRange(C.FALL, random[3]);
-        this.start = Float32Array.from(
-            random[4], (r, i) => C.STARTS * (0.35 * r + 0.65 * level(i)));
+        this.start = Float32Array.from(random[4], (r, i) => C.STARTS * (0.35 * r + 0.65 * level(i)));
         this.lift = inRange(C.LIFT, random[5]);
         this.rate = inRange(C.CIRCLE_RATE, random[6]);
         this.phase = inRange([0, 2 * Math.PI], random[7]);
@@ -94,19 +94,29 @@ class Snow {
     // The flow of strength 1 on the grid.
     updateFlow() {
         const { C, grid, waves } = this;
-        const n = C.FLOW_CELLS, cells = n ** 3;
+        const n = C.FLOW_CELLS,
+            cells = n ** 3;
         for (let i = 0; i < cells; i++) {
             const x = ((i % n) * 2) / (n - 1) - 1;
-            const y = (((i / n | 0) % n) * 2) / (n - 1) - 1;
-            const z = ((i / (n * n) | 0) * 2) / (n - 1) - 1;
-            let px = -C.RING * z, py = 0, pz = C.RING * x;
-            let cx = 0, cy = -2 * C.RING, cz = 0;
+            const y = ((((i / n) | 0) % n) * 2) / (n - 1) - 1;
+            const z = (((i / (n * n)) | 0) * 2) / (n - 1) - 1;
+            let px = -C.RING * z,
+                py = 0,
+                pz = C.RING * x;
+            let cx = 0,
+                cy = -2 * C.RING,
+                cz = 0;
             for (let wave = 0; wave < waves.length; wave += 8) {
-                const kx = waves[wave], ky = waves[wave + 1], kz = waves[wave + 2];
-                const ax = waves[wave + 3], ay = waves[wave + 4], az = waves[wave + 5];
+                const kx = waves[wave],
+                    ky = waves[wave + 1],
+                    kz = waves[wave + 2];
+                const ax = waves[wave + 3],
+                    ay = waves[wave + 4],
+                    az = waves[wave + 5];
                 const now = waves[wave + 6] * this.time + waves[wave + 7];
                 const angle = kx * x + ky * y + kz * z + now;
-                const sin = Math.sin(angle), cos = Math.cos(angle);
+                const sin = Math.sin(angle),
+                    cos = Math.cos(angle);
                 px += sin * ax;
                 py += sin * ay;
                 pz += sin * az;
@@ -137,7 +147,8 @@ class Snow {
         pile.fill(0);
         for (let i = 0; i < this.count; i++) {
             if (!this.resting[i]) continue;
-            const x = this.cell(position[3 * i]), z = this.cell(position[3 * i + 2]);
+            const x = this.cell(position[3 * i]),
+                z = this.cell(position[3 * i + 2]);
             pile[z * this.cells + x] += height;
         }
         for (let i = 0; i < pile.length; i++) pile[i] = Math.min(pile[i], C.HIGHEST);
@@ -145,12 +156,16 @@ class Snow {
 
     fallStep(seconds, acceleration) {
         const { C, position, velocity, grid, pile } = this;
-        const n = C.FLOW_CELLS, cells = n ** 3, half = (n - 1) / 2, last = n - 1.001;
+        const n = C.FLOW_CELLS,
+            cells = n ** 3,
+            half = (n - 1) / 2,
+            last = n - 1.001;
         const strength = this.strength;
         for (let i = 0; i < this.count; i++) if (strength > this.lift[i]) this.resting[i] = 0;
         this.updateFlow();
         this.updatePile();
-        const { perUnit, cells: pileCells } = this, lastCell = pileCells - 1.001;
+        const { perUnit, cells: pileCells } = this,
+            lastCell = pileCells - 1.001;
         const atGlass = (C.FLOOR_RADIUS - 1 / perUnit) ** 2;
         const push = C.SHARE * seconds;
         const circling = C.CIRCLE[0] + C.CIRCLE[1] * strength;
@@ -159,16 +174,27 @@ class Snow {
         for (let i = 0; i < this.count; i++) {
             if (this.resting[i] || this.loosening <= this.hold[i]) continue;
             if (this.remembering !== null && this.remembering >= this.start[i]) continue;
-            let x = position[3 * i], y = position[3 * i + 1], z = position[3 * i + 2];
+            let x = position[3 * i],
+                y = position[3 * i + 1],
+                z = position[3 * i + 2];
 
             // The flow, interpolated.
-            const gx = clamp((x + 1) * half, last), gy = clamp((y + 1) * half, last);
+            const gx = clamp((x + 1) * half, last),
+                gy = clamp((y + 1) * half, last);
             const gz = clamp((z + 1) * half, last);
-            const ix = gx | 0, iy = gy | 0, iz = gz | 0;
-            const fx = gx - ix, fy = gy - iy, fz = gz - iz;
-            let ux = 0, uy = 0, uz = 0;
+            const ix = gx | 0,
+                iy = gy | 0,
+                iz = gz | 0;
+            const fx = gx - ix,
+                fy = gy - iy,
+                fz = gz - iz;
+            let ux = 0,
+                uy = 0,
+                uz = 0;
             for (let corner = 0; corner < 8; corner++) {
-                const dx = corner & 1, dy = (corner >> 1) & 1, dz = corner >> 2;
+                const dx = corner & 1,
+                    dy = (corner >> 1) & 1,
+                    dz = corner >> 2;
                 const weight = (dx ? fx : 1 - fx) * (dy ? fy : 1 - fy) * (dz ? fz : 1 - fz);
                 const at = ((iz + dz) * n + iy + dy) * n + ix + dx;
                 ux += weight * grid[at];
@@ -176,13 +202,16 @@ class Snow {
                 uz += weight * grid[2 * cells + at];
             }
             const angle = this.phase[i] + this.rate[i] * (this.time % 1000);
-            const sin = Math.sin(angle), cos = Math.cos(angle);
+            const sin = Math.sin(angle),
+                cos = Math.cos(angle);
             ux = strength * ux + circling * cos;
             uy = strength * uy + this.fall[i] - circling * 2 * sin * cos;
             uz = strength * uz + circling * sin;
 
             const share = 1 - Math.exp(-seconds * this.drag[i]);
-            let vx = velocity[3 * i], vy = velocity[3 * i + 1], vz = velocity[3 * i + 2];
+            let vx = velocity[3 * i],
+                vy = velocity[3 * i + 1],
+                vz = velocity[3 * i + 2];
             vx += (ux - vx) * share - acceleration[0] * push;
             vy += (uy - vy) * share - acceleration[1] * push;
             vz += (uz - vz) * share - acceleration[2] * push;
@@ -193,11 +222,17 @@ class Snow {
             // The pile, interpolated: its height, and its slopes.
             const px = clamp((x + C.FLOOR_RADIUS) * perUnit - 0.5, lastCell);
             const pz = clamp((z + C.FLOOR_RADIUS) * perUnit - 0.5, lastCell);
-            const jx = px | 0, jz = pz | 0, qx = px - jx, qz = pz - jz;
+            const jx = px | 0,
+                jz = pz | 0,
+                qx = px - jx,
+                qz = pz - jz;
             const at = jz * pileCells + jx;
-            const a = pile[at], b = pile[at + 1];
-            const c = pile[at + pileCells], d = pile[at + pileCells + 1];
-            const low = a + (b - a) * qx, high = c + (d - c) * qx;
+            const a = pile[at],
+                b = pile[at + 1];
+            const c = pile[at + pileCells],
+                d = pile[at + pileCells + 1];
+            const low = a + (b - a) * qx,
+                high = c + (d - c) * qx;
             const ground = C.FLOOR - (low + (high - low) * qz);
             if (y > ground) {
                 y = ground;
@@ -205,10 +240,7 @@ class Snow {
                 const slopeZ = (high - low) * perUnit;
                 if (strength > this.lift[i]) {
                     vy = -C.HOP * strength * (0.5 + this.lift[i]);
-                } else if (
-                    slopeX * slopeX + slopeZ * slopeZ > C.REPOSE * C.REPOSE
-                    && x * x + z * z < atGlass
-                ) {
+                } else if (slopeX * slopeX + slopeZ * slopeZ > C.REPOSE * C.REPOSE && x * x + z * z < atGlass) {
                     vx = -C.SLIDE * slopeX;
                     vy = 0;
                     vz = -C.SLIDE * slopeZ;
@@ -235,11 +267,15 @@ class Snow {
 
     collideWithGlass(i) {
         const { C, position, velocity } = this;
-        const x = position[3 * i], y = position[3 * i + 1], z = position[3 * i + 2];
+        const x = position[3 * i],
+            y = position[3 * i + 1],
+            z = position[3 * i + 2];
         const square = x * x + y * y + z * z;
         if (square <= C.WALL * C.WALL) return;
         const distance = Math.sqrt(square);
-        const nx = x / distance, ny = y / distance, nz = z / distance;
+        const nx = x / distance,
+            ny = y / distance,
+            nz = z / distance;
         const outward = velocity[3 * i] * nx + velocity[3 * i + 1] * ny + velocity[3 * i + 2] * nz;
         const change = Math.max(outward, 0) * (1 + C.BOUNCE);
         position[3 * i] = nx * C.WALL;
@@ -262,9 +298,11 @@ class Snow {
                 velocity[3 * i + 2] += C.LAUNCH_VORTEX * position[3 * i];
                 this.angle[i] -= 2 * Math.PI * Math.round(this.angle[i] / (2 * Math.PI));
             }
-            const left = Math.max(C.FLIGHT - since, seconds), s = seconds / left;
+            const left = Math.max(C.FLIGHT - since, seconds),
+                s = seconds / left;
             for (let axis = 3 * i; axis < 3 * i + 3; axis++) {
-                const way = home[axis] - position[axis], v = velocity[axis];
+                const way = home[axis] - position[axis],
+                    v = velocity[axis];
                 position[axis] += way * s * s * (3 - 2 * s) + v * left * s * (1 - s) ** 2;
                 velocity[axis] = (way * 6 * s * (1 - s)) / left + v * (1 - s) * (1 - 3 * s);
             }
@@ -289,8 +327,7 @@ class Snow {
             state[4 * i + 1] = position[3 * i + 1];
             state[4 * i + 2] = position[3 * i + 2];
             // The integer part is the angle, in 1/4096 of a turn.
-            state[4 * i + 3] =
-                Math.floor((turns - Math.floor(turns)) * 4095.99) + 0.999 * this.morph[i];
+            state[4 * i + 3] = Math.floor((turns - Math.floor(turns)) * 4095.99) + 0.999 * this.morph[i];
         }
     }
 
@@ -334,7 +371,9 @@ function serve(scope) {
                 order: data.order,
                 count: data.count,
                 milliseconds: performance.now() - started,
-                standing, remembering, time,
+                standing,
+                remembering,
+                time,
             },
             [data.state.buffer, data.order.buffer],
         );

@@ -1,5 +1,5 @@
 // The camera: it looks at a point, in orbit about it, and keeps its up direction.
-import { add, axesOf, cross, dot, norm, quatOf, scaled, subtract, turned, unit } from './vectors.js';
+import { add, axesOf, cross, dot, norm, quatOf, scaled, subtract, turned, unit } from "./vectors.js";
 
 /** @typedef {import('./vectors.js').Vec} Vec */
 /** @typedef {import('./vectors.js').Quat} Quat */
@@ -115,6 +115,14 @@ export class Camera {
     /** What the server gets. @param {Size} size @param {number} number of this view */
     view(size, number) {
         const fov = 2 * Math.atan(this.shown(size)[1]);
-        return { type: 'view', number, quat: quatOf(this.axes()), position: this.position, fov, ...size, photo: this.photo };
+        return {
+            type: "view",
+            number,
+            quat: quatOf(this.axes()),
+            position: this.position,
+            fov,
+            ...size,
+            photo: this.photo,
+        };
     }
 }

@@ -18,21 +18,21 @@ export class Connection {
         this.receiver = receiver;
         this.pause = FIRST_PAUSE;
         this.socket = this.connect();
-        addEventListener('online', () => this.retry());
-        document.addEventListener('visibilitychange', () => this.retry());
+        addEventListener("online", () => this.retry());
+        document.addEventListener("visibilitychange", () => this.retry());
     }
 
     connect() {
-        const url = new URL('live', location.href);
-        url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
+        const url = new URL("live", location.href);
+        url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
         const socket = new WebSocket(url);
-        socket.binaryType = 'arraybuffer';
+        socket.binaryType = "arraybuffer";
         socket.onopen = () => {
             this.pause = FIRST_PAUSE;
             this.receiver.opened();
         };
         socket.onmessage = ({ data }) => {
-            if (typeof data === 'string') this.receiver.told(JSON.parse(data));
+            if (typeof data === "string") this.receiver.told(JSON.parse(data));
             else this.receive(data);
         };
         socket.onclose = () => {
@@ -53,7 +53,7 @@ export class Connection {
     /** Before a JPEG: its kind; its number and that of its view, or the index of the photo. @param {ArrayBuffer} data */
     receive(data) {
         const head = new DataView(data, 0, 12);
-        const blob = new Blob([new Uint8Array(data, 12)], { type: 'image/jpeg' });
+        const blob = new Blob([new Uint8Array(data, 12)], { type: "image/jpeg" });
         const [number, view] = [head.getUint32(4, true), head.getUint32(8, true)];
         if (head.getUint8(0) === 0) this.receiver.image({ number, view, blob });
         else this.receiver.thumbnail({ index: number, blob });

@@ -1,5 +1,5 @@
 // The cameras of the photos, drawn over the image, as pyramids with the photo at their base.
-import { add, axesOf, dot, subtract } from './vectors.js';
+import { add, axesOf, dot, subtract } from "./vectors.js";
 
 /** @typedef {import('./vectors.js').Vec} Vec */
 /** @typedef {import('./camera.js').Photo} Photo */
@@ -24,8 +24,16 @@ export class Frustums {
         this.corners = photos.map(({ quat, position, half: [across, down] }, index) => {
             if (index % every) return undefined;
             const { right, down: below, ahead } = axesOf(quat);
-            const base = /** @type {Vec[]} */ ([[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) =>
-                add(add(add(position, ahead, length), right, x * across * length), below, y * down * length)));
+            const base = /** @type {Vec[]} */ (
+                [
+                    [-1, -1],
+                    [1, -1],
+                    [1, 1],
+                    [-1, 1],
+                ].map(([x, y]) =>
+                    add(add(add(position, ahead, length), right, x * across * length), below, y * down * length),
+                )
+            );
             return [position, ...base];
         });
     }
@@ -38,17 +46,17 @@ export class Frustums {
         canvas.width = Math.round(width * ratio);
         canvas.height = Math.round(height * ratio);
         this.drawn = visible ? this.project(view, width, height) : [];
-        const context = canvas.getContext('2d');
+        const context = canvas.getContext("2d");
         if (!context) return;
         const style = getComputedStyle(canvas);
-        context.lineJoin = 'round';
+        context.lineJoin = "round";
         for (const each of this.drawn) {
             const { apex, base } = each;
             const thumbnail = this.thumbnails.get(each.index);
             context.setTransform(ratio, 0, 0, ratio, 0, 0);
             context.globalAlpha = each.index === this.pointed ? 1 : 0.9;
             context.lineWidth = each.index === this.pointed ? 3 : 1.5;
-            context.strokeStyle = style.getPropertyValue(this.photos[each.index].heldOut ? '--held-out' : '--camera');
+            context.strokeStyle = style.getPropertyValue(this.photos[each.index].heldOut ? "--held-out" : "--camera");
             const path = new Path2D();
             base.forEach(([x, y], i) => (i ? path.lineTo(x, y) : path.moveTo(x, y)));
             path.closePath();
@@ -77,10 +85,14 @@ export class Frustums {
         const found = [];
         this.corners.forEach((corners, index) => {
             if (!corners) return;
-            const points = corners.map((corner) => {
+            const points = corners.map(corner => {
                 const from = subtract(corner, position);
                 const depth = dot(from, ahead);
-                return [width / 2 + (focal * dot(from, right)) / depth, height / 2 + (focal * dot(from, down)) / depth, depth];
+                return [
+                    width / 2 + (focal * dot(from, right)) / depth,
+                    height / 2 + (focal * dot(from, down)) / depth,
+                    depth,
+                ];
             });
             if (points.some(([, , depth]) => depth < NEAR * this.length)) return;
             if (points.every(([x, y]) => x < 0 || y < 0 || x > width || y > height)) return;
@@ -94,7 +106,10 @@ export class Frustums {
         const within = this.drawn.filter(({ base }) => contains(base, x, y)).pop();
         if (within) return within.index;
         const far = (/** @type {Drawn} */ { apex }) => Math.hypot(apex[0] - x, apex[1] - y);
-        return this.drawn.filter((each) => far(each) < REACH).sort((a, b) => far(b) - far(a)).pop()?.index;
+        return this.drawn
+            .filter(each => far(each) < REACH)
+            .sort((a, b) => far(b) - far(a))
+            .pop()?.index;
     }
 }
 

@@ -18,18 +18,26 @@ const TURN = 1.2; // of the arrow keys, radians per second
 
 /** The direction of a key: right, down, ahead; and of the arrows: to turn across and down. */
 const MOVES = /** @type {Record<string, [number, number, number]>} */ ({
-    KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyE: [0, -1, 0], KeyQ: [0, 1, 0], KeyW: [0, 0, 1], KeyS: [0, 0, -1],
+    KeyA: [-1, 0, 0],
+    KeyD: [1, 0, 0],
+    KeyE: [0, -1, 0],
+    KeyQ: [0, 1, 0],
+    KeyW: [0, 0, 1],
+    KeyS: [0, 0, -1],
 });
 const TURNS = /** @type {Record<string, [number, number]>} */ ({
-    ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1],
+    ArrowLeft: [1, 0],
+    ArrowRight: [-1, 0],
+    ArrowUp: [0, 1],
+    ArrowDown: [0, -1],
 });
 
 /** Whether a key belongs to the control that has the keyboard. @param {KeyboardEvent} event */
 const isForControl = ({ target, key }) => {
     if (!(target instanceof HTMLElement)) return false;
     if (target instanceof HTMLSelectElement) return true;
-    if (key.startsWith('Arrow') && target.closest('aside')) return true; // moves a slider, or scrolls
-    return target.matches('button, summary, input') && [' ', 'Enter'].includes(key);
+    if (key.startsWith("Arrow") && target.closest("aside")) return true; // moves a slider, or scrolls
+    return target.matches("button, summary, input") && [" ", "Enter"].includes(key);
 };
 
 /** @param {HTMLElement} stage @param {Actions} actions */
@@ -56,13 +64,13 @@ export const listen = (stage, { camera, moved, clicked, hovered, keys }) => {
         now.move([-dx * unit, -dy * unit, 0]);
     };
 
-    stage.addEventListener('pointerdown', (event) => {
+    stage.addEventListener("pointerdown", event => {
         if (event.target instanceof HTMLButtonElement) return;
         stage.setPointerCapture(event.pointerId);
         pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
         if (pointers.size === 1) travelled = 0;
     });
-    stage.addEventListener('pointermove', (event) => {
+    stage.addEventListener("pointermove", event => {
         const last = pointers.get(event.pointerId);
         const now = camera();
         if (!last || !now) {
@@ -86,41 +94,41 @@ export const listen = (stage, { camera, moved, clicked, hovered, keys }) => {
         }
         moved();
     });
-    stage.addEventListener('pointerup', (event) => {
+    stage.addEventListener("pointerup", event => {
         const isClick = pointers.size === 1 && travelled < CLICK && event.button === 0;
         pointers.delete(event.pointerId);
         if (isClick) clicked(event.offsetX, event.offsetY);
     });
-    stage.addEventListener('pointercancel', (event) => pointers.delete(event.pointerId));
-    stage.addEventListener('contextmenu', (event) => event.preventDefault());
+    stage.addEventListener("pointercancel", event => pointers.delete(event.pointerId));
+    stage.addEventListener("contextmenu", event => event.preventDefault());
     stage.addEventListener(
-        'wheel',
-        (event) => {
+        "wheel",
+        event => {
             event.preventDefault();
             const pixels = event.deltaY * (event.deltaMode ? LINE : 1);
             camera()?.zoom(ZOOM ** Math.max(-400, Math.min(400, pixels)));
             moved();
         },
-        { passive: false }
+        { passive: false },
     );
 
     /** @type {Set<string>} */
     const held = new Set();
     let last = 0;
     /** @param {number} now milliseconds */
-    const fly = (now) => {
+    const fly = now => {
         const [seconds, moving] = [Math.min((now - last) / 1000, 0.1), camera()];
         last = now;
         if (!held.size || !moving) return;
         const far = SPEED * seconds * Math.max(moving.distance, 0.1 * moving.extent);
         for (const code of held) {
-            if (code in MOVES) moving.move(/** @type {any} */ (MOVES[code].map((each) => far * each)));
+            if (code in MOVES) moving.move(/** @type {any} */ (MOVES[code].map(each => far * each)));
             else moving.orbit(TURN * seconds * TURNS[code][0], TURN * seconds * TURNS[code][1]);
         }
         moved();
         requestAnimationFrame(fly);
     };
-    addEventListener('keydown', (event) => {
+    addEventListener("keydown", event => {
         if (event.ctrlKey || event.metaKey || event.altKey || isForControl(event)) return;
         if (event.code in MOVES || event.code in TURNS) {
             event.preventDefault();
@@ -134,6 +142,6 @@ export const listen = (stage, { camera, moved, clicked, hovered, keys }) => {
             keys[event.key.toLowerCase()]();
         }
     });
-    addEventListener('keyup', (event) => held.delete(event.code));
-    addEventListener('blur', () => held.clear());
+    addEventListener("keyup", event => held.delete(event.code));
+    addEventListener("blur", () => held.clear());
 };

@@ -20,10 +20,10 @@ export const subtract = (a, b) => add(a, b, -1);
 export const scaled = ([x, y, z], by) => [by * x, by * y, by * z];
 
 /** @type {(a: Vec) => number} */
-export const norm = (a) => Math.hypot(...a);
+export const norm = a => Math.hypot(...a);
 
 /** @type {(a: Vec) => Vec} */
-export const unit = (a) => scaled(a, 1 / norm(a));
+export const unit = a => scaled(a, 1 / norm(a));
 
 /** A vector turned about a unit vector (Rodrigues). @type {(v: Vec, axis: Vec, angle: number) => Vec} */
 export const turned = (v, axis, angle) => {
@@ -49,5 +49,5 @@ export const quatOf = ({ right: [a, b, c], down: [d, e, f], ahead: [g, h, i] }) 
     ];
     const best = rows.reduce((found, row, k) => (row[k] > rows[found][found] ? k : found), 0);
     const length = Math.hypot(...rows[best]);
-    return /** @type {Quat} */ (rows[best].map((value) => value / length));
+    return /** @type {Quat} */ (rows[best].map(value => value / length));
 };
