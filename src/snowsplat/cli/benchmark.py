@@ -12,6 +12,7 @@ from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
 from snowsplat.cli.flags import flag
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 
 @dataclass
@@ -82,5 +83,11 @@ class Benchmark(Reports):
             self.folder, self.output, options, on_line=lambda line: print(line, flush=True)
         )
         self.report = report
-        print(f"\n{report}\n\n{self.output / 'index.html'}: the results as a page")
+        print(
+            message(
+                "\n{report}\n\n{output}: the results as a page",
+                report=report,
+                output=self.output / "index.html",
+            )
+        )
         return 2 if report.failures else 0

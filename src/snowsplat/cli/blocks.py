@@ -13,6 +13,7 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 # The flags of each action; the others have no effect and are rejected.
 _FLAGS = {
@@ -104,7 +105,7 @@ class Blocks:
         self._check_flags(self.action)
         if self.path is None:
             what = "a dataset" if self.action == "plan" else "the folder of a plan"
-            raise UserError(f"blocks {self.action} needs {what}")
+            raise UserError("blocks {action} needs {what}", action=self.action, what=what)
         if self.action == "plan":
             return self._plan(self.path)
         return self._train(self.path) if self.action == "train" else self._merge(self.path)
@@ -114,7 +115,12 @@ class Blocks:
         for field in fields(self)[2:]:
             if field.name not in _FLAGS[action] and getattr(self, field.name) != field.default:
                 owner = next(name for name, names in _FLAGS.items() if field.name in names)
-                raise UserError(f"`{field.name}` belongs to blocks {owner}, not to blocks {action}")
+                raise UserError(
+                    "`{name}` belongs to blocks {owner}, not to blocks {action}",
+                    name=field.name,
+                    owner=owner,
+                    action=action,
+                )
 
     def _plan(self, dataset: Path) -> int:
         if self.output is None:
@@ -137,11 +143,16 @@ class Blocks:
         for block in plan.blocks:
             limit = f"{block.max_gaussians:,}" if block.max_gaussians else "no limit"
             print(
-                f"{self.output / block.name}: {block.views} photos, {block.points:,} points, "
-                f"at most {limit} Gaussians"
+                message(
+                    "{name}: {views} photos, {points:,} points, at most {limit} Gaussians",
+                    name=self.output / block.name,
+                    views=block.views,
+                    points=block.points,
+                    limit=limit,
+                )
             )
         if distance := plan.settings.get("sky_distance"):
-            print(f"distance of the sky in all of them: {distance:g}")
+            print(message("distance of the sky in all of them: {distance:g}", distance=distance))
         print(next_step("train them with", "blocks", "train", self.output))
         return 0
 
@@ -161,7 +172,7 @@ class Blocks:
                     on_block=lambda line: print(line, flush=True),
                 )
             except TrainingStopped as stopped:
-                print(f"{stopped}; continue with the same command")
+                print(message("{stopped}; continue with the same command", stopped=stopped))
                 return 130
         print(next_step("when all blocks are trained", "blocks", "merge", folder))
         return 0
@@ -171,7 +182,19 @@ class Blocks:
 
         merged = merge_blocks(folder, self.output)
         kept, trained = sum(merged.gaussians), sum(merged.trained)
-        print(f"{merged.scene}: {kept:,} Gaussians of {len(merged.gaussians)} blocks")
-        print(f"{trained - kept:,} Gaussians outside of the cells of their blocks are left out")
+        print(
+            message(
+                "{scene}: {kept:,} Gaussians of {gaussians} blocks",
+                scene=merged.scene,
+                kept=kept,
+                gaussians=len(merged.gaussians),
+            )
+        )
+        print(
+            message(
+                "{kept:,} Gaussians outside of the cells of their blocks are left out",
+                kept=trained - kept,
+            )
+        )
         print(see_and_share(folder))
         return 0

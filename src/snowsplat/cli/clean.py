@@ -13,6 +13,7 @@ from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 
 @dataclass
@@ -61,8 +62,16 @@ class Clean(Reports):
             )
         before, after = done.psnr
         print(
-            f"{self.target}: {done.before - done.after:,} of {done.before:,} Gaussians removed; "
-            f"PSNR of {done.compared} {before:.2f} dB before, {after:.2f} dB after"
+            message(
+                "{target}: {after:,} of {before:,} Gaussians removed; PSNR of {compared} "
+                "{before2:.2f} dB before, {after2:.2f} dB after",
+                target=self.target,
+                after=done.before - done.after,
+                before=done.before,
+                compared=done.compared,
+                before2=before,
+                after2=after,
+            )
         )
         print(see_and_share(self.target))
         self.report = {"file": self.target, "bytes": self.target.stat().st_size, **vars(done)}

@@ -43,14 +43,18 @@ def expanded(kind: Any, arguments: Sequence[str]) -> list[str]:
     content = _content(file)
     if "training" in content:
         if kind.__name__ != "Train":
-            raise UserError(f"{file}: is the configuration of a training; use it with train")
+            raise UserError(
+                "{file}: is the configuration of a training; use it with train", file=file
+            )
         return rest
     for key, value in content.items():
         spelling = _spelling(f"--{key}")
         if spelling not in known or spelling in (_FLAG, "--help"):
             names = [name[2:] for name in known if name.startswith("--")]
             advice = suggestion(spelling[2:], names) or "; remove it"
-            raise UserError(f"{file}: {printable(key)}: unknown{advice}")
+            raise UserError(
+                "{file}: {name}: unknown{advice}", file=file, name=printable(key), advice=advice
+            )
         name, hint, _ = known[spelling]
         if name not in given and value is not None:
             try:
@@ -58,7 +62,9 @@ def expanded(kind: Any, arguments: Sequence[str]) -> list[str]:
                 repeated = tyro.conf.UseAppendAction in extras
                 added += _arguments(spelling, value, hint, repeated)
             except ValueError as error:
-                raise UserError(f"{file}: {printable(key)}: {error}") from None
+                raise UserError(
+                    "{file}: {name}: {error}", file=file, name=printable(key), error=error
+                ) from None
     return [*rest[:at], *rest[at + 1 + separate :], *added]
 
 
@@ -73,27 +79,31 @@ def training_in(file: Path) -> tuple[TrainConfig, DatasetSettings]:
 
     content = _content(file)
     if unknown := sorted(content.keys() - {"snowsplat", "dataset", "training"}):
-        raise UserError(f"{file}: {printable(unknown[0])}: unknown; remove it")
+        raise UserError(
+            "{file}: {unknown}: unknown; remove it", file=file, unknown=printable(unknown[0])
+        )
     try:
         dataset = from_json(DatasetSettings, content.get("dataset", {"path": ""}))
         return config_from_json(content["training"], strict=True), dataset
     except (ValueError, UserError) as error:
-        raise UserError(f"{file}: {error}") from None
+        raise UserError("{file}: {error}", file=file, error=error) from None
 
 
 def _content(file: Path) -> dict[str, Any]:
     try:
         content = _toml(file) if file.suffix.lower() == ".toml" else read_json(file)
     except ValueError as error:
-        raise UserError(f"{file}: neither JSON nor a .toml file ({error})") from None
+        raise UserError(
+            "{file}: neither JSON nor a .toml file ({error})", file=file, error=error
+        ) from None
     if not isinstance(content, dict):
-        raise UserError(f'{file}: has no names of flags; write {{"iterations": 3000}}')
+        raise UserError('{file}: has no names of flags; write {{"iterations": 3000}}', file=file)
     return content
 
 
 def _toml(file: Path) -> Any:
     if sys.version_info < (3, 11):
-        raise UserError(f"{file}: TOML needs Python 3.11; write the same as JSON")
+        raise UserError("{file}: TOML needs Python 3.11; write the same as JSON", file=file)
     import tomllib  # type: ignore[import-not-found,unused-ignore]
 
     return tomllib.loads(file.read_text(encoding="utf-8"))

@@ -14,6 +14,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
@@ -121,7 +122,14 @@ class Convert(Reports):
         size = format.size(target)
         written = f"{format_bytes(size)} of {format.name}"
         self.report = {"file": target, "bytes": size, "format": format.name, "lost": format.loses}
-        print(f"{target}: {written}; lost in this format: {format.loses}")
+        print(
+            message(
+                "{target}: {written}; lost in this format: {loses}",
+                target=target,
+                written=written,
+                loses=format.loses,
+            )
+        )
         page = format.name == "HTML"
         print(f"to see it: open {target} in a browser" if page else see_and_share(target))
         return 0

@@ -13,6 +13,7 @@ from snowsplat.cli.make import print_summary
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.view import View
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.synthetic.compare_poses import PoseErrors
@@ -49,7 +50,7 @@ class Demo:
         except KeyboardInterrupt as stopped:
             print(with_flags(str(stopped) or "stopped"))
             words = ["snowsplat", "demo", "-o", str(self.output)] + ["--open"] * self.open
-            print(f"resume with: {shlex.join(words)}")
+            print(message("resume with: {words}", words=shlex.join(words)))
             return 130
         print_summary(result.made)
         _print_errors(result.errors)
@@ -62,7 +63,7 @@ class Demo:
             return 1
         scene = result.made.folder.path.parent
         if not self.open:
-            print(f"\n{see_and_share(scene)}")
+            print(message("\n{see_and_share}", see_and_share=see_and_share(scene)))
             print("with your own photos: snowsplat make PHOTOS")
             return 0
         return View(scene).run()
@@ -74,11 +75,19 @@ def _print_errors(errors: PoseErrors) -> None:
     degrees, shares = errors.rotations, errors.centres
     found, total = len(errors.names), len(errors.names) + len(errors.missing)
     print(
-        f"\nEstimated poses compared with the true ones ({found} of {total} photos)\n"
-        f"                            median     worst      limit\n"
-        f"  rotation                  {degrees.median():.3f}°     {degrees.max():.3f}°     "
-        f"{MAX_DEGREES}°\n"
-        f"  position, of the extent   {shares.median():.3%}     {shares.max():.3%}     "
-        f"{MAX_SHARE:.1%}",
+        message(
+            "\nEstimated poses compared with the true ones ({found} of {total} "
+            "photos)\n                            median     worst      limit\n  "
+            "rotation                  {median:.3f}\xb0     {max:.3f}\xb0     {max_degrees}\xb0\n  "
+            "position, of the extent   {median2:.3%}     {max2:.3%}     {max_share:.1%}",
+            found=found,
+            total=total,
+            median=degrees.median(),
+            max=degrees.max(),
+            max_degrees=MAX_DEGREES,
+            median2=shares.median(),
+            max2=shares.max(),
+            max_share=MAX_SHARE,
+        ),
         flush=True,
     )

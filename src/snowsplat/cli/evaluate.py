@@ -10,6 +10,7 @@ from snowsplat.cli.flags import flag
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.scene_flags import SceneFlags
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
@@ -83,7 +84,7 @@ class Evaluate(SceneFlags, Reports):
         where = scene.folder.path / "metrics.json"
         which = f"{len(views)} {self.split} views of {evaluation.size}"
         step = f"iteration {scene.iteration}, " if scene.iteration else ""  # a file has none
-        print(f"{step}{which}: {where}")
+        print(message("{step}{which}: {where}", step=step, which=which, where=where))
         out = self.output_path()
         photos = [] if self.dataset is None else ["--dataset", self.dataset]
         print(next_step("to see the renders", "render", out, *photos, "--split", self.split))

@@ -20,6 +20,7 @@ from snowsplat.pipeline.stage_lines import photos_of_last_part
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.make import MakeResult
@@ -148,7 +149,7 @@ class Make(Reports):
             value = getattr(self, name)
             words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
         words += ["--view"] if self.view else []
-        print(f"resume with: {shlex.join(words)}")
+        print(message("resume with: {words}", words=shlex.join(words)))
         return 130
 
     def _show(self, made: MakeResult, page: LivePage) -> None:
@@ -159,7 +160,7 @@ class Make(Reports):
         if page.has_trained:
             with suppress(KeyboardInterrupt):  # Ctrl-C may arrive before the scene is shown
                 gaussians = read_gaussians(made.scene)
-                print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
+                print(message("the scene is shown at {url} until Ctrl-C", url=page.url), flush=True)
                 page.show_result(gaussians.to(Compute(self.device, self.threads).apply()))
             return
         from snowsplat.pipeline.watch import watch
@@ -178,7 +179,7 @@ def _hold_out(text: str) -> int | None:
     if text == "none":
         return None
     if not text.isdecimal() or int(text) < 2:
-        raise UserError(f"--hold-out: {text!r} is not valid; use 2 or more, or none")
+        raise UserError("--hold-out: {text!r} is not valid; use 2 or more, or none", text=text)
     return int(text)
 
 
@@ -186,11 +187,17 @@ def print_summary(made: MakeResult) -> None:
     """Print the files of a finished scene, its quality, and the verdict."""
     poses = made.dataset_report or f"those of {made.dataset} are used"
     print(
-        f"\nThe scene, for any viewer:  {made.scene} ({format_bytes(made.scene.stat().st_size)})\n"
-        f"{'Report on camera poses:' if made.dataset_report else 'Camera poses:':27} {poses}\n"
-        f"Report on the training:     {made.folder.report}\n"
-        f"{_quality(made)}"
-        f"Time:                       {duration(made.seconds)}"
+        message(
+            "\nThe scene, for any viewer:  {scene} ({st_size})\n{what:27} {poses}\nReport on the "
+            "training:     {report}\n{quality}Time:                       {seconds}",
+            scene=made.scene,
+            st_size=format_bytes(made.scene.stat().st_size),
+            what="Report on camera poses:" if made.dataset_report else "Camera poses:",
+            poses=poses,
+            report=made.folder.report,
+            quality=_quality(made),
+            seconds=duration(made.seconds),
+        )
     )
     if made.verdict is not None:
         print("\n" + "\n".join(made.verdict.lines("The scene")))

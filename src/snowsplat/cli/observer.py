@@ -12,6 +12,7 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.observer import Page
@@ -76,24 +77,30 @@ class TerminalObserver(Observer):
         steps = result.step - result.first_step
         count = f"{steps} more steps" if result.first_step else f"{steps} steps"
         print(
-            f"{result.scene}: {result.gaussians:,} Gaussians, "
-            f"{format_bytes(result.scene.stat().st_size)}, {count} in "
-            f"{duration(result.seconds)}, {result.memory}"
+            message(
+                "{scene}: {gaussians:,} Gaussians, {st_size}, {count} in {seconds}, {memory}",
+                scene=result.scene,
+                gaussians=result.gaussians,
+                st_size=format_bytes(result.scene.stat().st_size),
+                count=count,
+                seconds=duration(result.seconds),
+                memory=result.memory,
+            )
         )
         for line in result.reductions:
-            print(f"for lack of memory: {line}")
-        print(f"{result.report}: the report of the training")
+            print(message("for lack of memory: {line}", line=line))
+        print(message("{report}: the report of the training", report=result.report))
         if result.evaluation is not None:
             print(held_out_line(*result.evaluation))
         if result.poses is not None:
             print(result.poses)
         if result.time is not None:
             spent, given = map(duration, result.time)
-            print(f"{spent} in total, of {given}")
+            print(message("{spent} in total, of {given}", spent=spent, given=given))
         sys.stdout.flush()
 
     def page_opened(self, page: Page) -> None:
-        print(f"watch it in a browser: {page.url}", flush=True)
+        print(message("watch it in a browser: {url}", url=page.url), flush=True)
         for line in for_other_computers(page.url, page.others):
             print(line, flush=True)
 

@@ -38,7 +38,9 @@ def page_at(
         return LivePage(port, host, allow_host)
     for name, given in (("port", port), ("host", host), ("allow-host", allow_host or None)):
         if given is not None:
-            raise UserError(f"--{name} sets the address of a page; add --view to open one")
+            raise UserError(
+                "--{name} sets the address of a page; add --view to open one", name=name
+            )
     return None
 
 

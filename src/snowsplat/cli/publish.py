@@ -14,6 +14,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 
 @dataclass
@@ -69,7 +70,19 @@ class Publish(Reports):
                 observer=observer,
             )
         self.report = result
-        print(f"{result.folder}: {result.gaussians:,} Gaussians, {format_bytes(result.bytes)}")
+        print(
+            message(
+                "{folder}: {gaussians:,} Gaussians, {bytes}",
+                folder=result.folder,
+                gaussians=result.gaussians,
+                bytes=format_bytes(result.bytes),
+            )
+        )
         look = next_step("to look at it", "view", result.folder)
-        print(f"{look}; to share it: copy the folder to a web host, and send the address")
+        print(
+            message(
+                "{look}; to share it: copy the folder to a web host, and send the address",
+                look=look,
+            )
+        )
         return 0

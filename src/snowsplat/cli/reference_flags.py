@@ -165,7 +165,7 @@ def translated(subcommand: str, arguments: Sequence[str]) -> tuple[list[str], li
             result.append(argument)
             continue
         if flag.outcome == "refused":
-            raise UserError(f"{name}: {flag.note}")
+            raise UserError("{name}: {note}", name=name, note=flag.note)
         values = [value] if given else rest[: _count(flag, rest)]
         rest = rest if given else rest[len(values) :]
         if flag.outcome == "ignored" or (flag.only_with and flag.only_with not in arguments):

@@ -12,6 +12,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.scene_flags import SceneFlags
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.evaluate import Split
@@ -94,7 +95,7 @@ class Render(SceneFlags, Reports):
         around = self.projection == "equirectangular"
         for name in ("seconds", "fps", "ease", "size", "side_by_side", "video"):
             if getattr(self, name) and not (around and name == "size"):
-                raise UserError(f"`{name}` is for videos; add a camera path with --path")
+                raise UserError("`{name}` is for videos; add a camera path with --path", name=name)
         splits: list[Split] = []
         if self.split != "train" and not self.skip_test:
             splits.append("test")
@@ -114,7 +115,7 @@ class Render(SceneFlags, Reports):
             )
         self.report = {"images": rendered}
         for folder, count in rendered.items():
-            print(f"{folder}: {count} images")
+            print(message("{folder}: {count} images", folder=folder, count=count))
         print(next_step("for a video", "render", self.output_path(), "--path", "ellipse"))
         return 0
 

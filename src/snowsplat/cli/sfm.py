@@ -13,6 +13,7 @@ from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.sfm.dataset_folder import DatasetOptions
@@ -90,8 +91,14 @@ class Sfm(Reports):
         poses = outcomes["poses"].result
         found, count = len(poses["registered"]), len(poses["unregistered"])
         print(
-            f"{folder}: {found} of {found + count} photos placed, {poses['points']:,} points; "
-            f"see {folder / outcomes['report'].result['file']}"
+            message(
+                "{folder}: {found} of {count} photos placed, {poses:,} points; see {result}",
+                folder=folder,
+                found=found,
+                count=found + count,
+                poses=poses["points"],
+                result=folder / outcomes["report"].result["file"],
+            )
         )
         placement = placement_of(outcomes["images"].result)
         for line in placement.lines() if placement is not None else []:
@@ -111,8 +118,9 @@ class Sfm(Reports):
                 raise UserError("-s LOCATION uses the photos in LOCATION/input; leave out INPUT")
             if not (self.source_path / "input").is_dir():
                 raise UserError(
-                    f"{self.source_path / 'input'}: no such folder; put the photos there, or use "
-                    "snowsplat sfm PHOTOS -o DATASET"
+                    "{source_path}: no such folder; put the photos there, or use snowsplat sfm "
+                    "PHOTOS -o DATASET",
+                    source_path=self.source_path / "input",
                 )
             return (self.source_path / "input",), self.output or self.source_path
         if not self.inputs:

@@ -13,6 +13,7 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.page_flags import AllowHost
 from snowsplat.cli.view import serve, show
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.viewer.hosts import ANY_HOST, LOCAL_HOST, KnownHosts, is_loopback
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ class Studio:
             with suppress(OSError):  # a full disk: then a second studio is refused
                 address = Address(server.url, self.host, server.port, server.token, server.others)
                 write_address(library.folder, address)
-            print(f"scenes are kept in {library.folder}")
+            print(message("scenes are kept in {folder}", folder=library.folder))
             serve(server, browser=not self.no_browser)
 
     def _server(self, app: ASGIApp, killed: Address | None) -> WebServer:
@@ -103,8 +104,11 @@ class Studio:
         known = all(f"https://{name}/{address.token}/" in address.others for name in names)
         if other_host or not known or self.port not in (0, address.port):
             raise UserError(
-                f"{library.folder}: is open in another studio, with host {address.host} and port "
-                f"{address.port}; end that one with Ctrl-C first, or omit the flags"
+                "{folder}: is open in another studio, with host {host} and port {port}; end that "
+                "one with Ctrl-C first, or omit the flags",
+                folder=library.folder,
+                host=address.host,
+                port=address.port,
             )
-        print(f"scenes are kept in {library.folder}")
+        print(message("scenes are kept in {folder}", folder=library.folder))
         show("a studio has them open already", address.url, address.others, not self.no_browser)

@@ -11,6 +11,7 @@ import tyro
 from snowsplat.cli.flags import Threads, flag, switch
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.mesh import Surface
@@ -56,7 +57,15 @@ class SurfaceFlags(Reports):
 
     def tell(self, target: Path, surface: Surface, what: str) -> None:
         """Print the line of the result, and keep the result for --json."""
-        print(f"{target}: {what} from {surface.photos} photos, with voxels of {surface.voxel:.3g}")
+        print(
+            message(
+                "{target}: {what} from {photos} photos, with voxels of {voxel:.3g}",
+                target=target,
+                what=what,
+                photos=surface.photos,
+                voxel=surface.voxel,
+            )
+        )
         if surface.closer:
             print("finer voxels do not fit into memory; a smaller --far makes room for them")
         told = {name: value for name, value in vars(surface).items() if name != "mesh"}

@@ -13,6 +13,7 @@ from snowsplat.cli.page_flags import page_at
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.cli.train_flags import TrainFlags
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import one_run
 
 
@@ -100,6 +101,9 @@ class Train(TrainFlags, Reports):
                 print(see_and_share(self.output), flush=True)
             if page is not None:
                 with suppress(KeyboardInterrupt):  # Ctrl-C may arrive during the print
-                    print(f"the scene is shown at {page.url} until Ctrl-C", flush=True)
+                    print(
+                        message("the scene is shown at {url} until Ctrl-C", url=page.url),
+                        flush=True,
+                    )
                     page.show_result()
         return 0

@@ -17,6 +17,7 @@ from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.page_flags import AllowHost, for_other_computers, has_screen
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.viewer.http.server import WebServer
@@ -72,7 +73,13 @@ class View:
             ) as server,
         ):
             site = scene.gaussians is None
-            print(f"{scene.file}: {'a web site' if site else f'{scene.gaussians:,} Gaussians'}")
+            print(
+                message(
+                    "{file}: {value}",
+                    file=scene.file,
+                    value="a web site" if site else f"{scene.gaussians:,} Gaussians",
+                )
+            )
             serve(server, browser=not self.no_browser)
         return 0
 
@@ -85,7 +92,7 @@ def serve(server: WebServer, browser: bool) -> None:
 
 def show(how: str, url: str, others: Sequence[str], browser: bool) -> None:
     """Print the addresses of a page, and open it if there is a ``browser`` and a screen."""
-    print(f"{how}: {url}", flush=True)
+    print(message("{how}: {url}", how=how, url=url), flush=True)
     for line in for_other_computers(url, others):
         print(line, flush=True)
     if browser and has_screen():

@@ -116,18 +116,27 @@ class Dataset:
         bad = [view.name for view in views if not view.camera.is_finite()]
         if bad:
             raise UserError(
-                f"{prefix}{len(bad)} of {len(views)} cameras are not finite (the first is that of "
-                f"{bad[0]}); correct their poses or remove these photos"
+                "{prefix}{bad} of {views} cameras are not finite (the first is that of {bad2}); "
+                "correct their poses or remove these photos",
+                prefix=prefix,
+                bad=len(bad),
+                views=len(views),
+                bad2=bad[0],
             )
         if not 0.0 < self.extent < math.inf:
             raise UserError(
-                f"{prefix}the extent of the cameras is {self.extent}; correct their poses"
+                "{prefix}the extent of the cameras is {extent}; correct their poses",
+                prefix=prefix,
+                extent=self.extent,
             )
         if self.points is not None:
             rows = int((~self.points.xyz.isfinite().all(dim=1)).sum())
             if rows:
                 raise UserError(
-                    f"{prefix}{rows:,} of {len(self.points):,} points are not finite; remove them"
+                    "{prefix}{rows:,} of {points:,} points are not finite; remove them",
+                    prefix=prefix,
+                    rows=rows,
+                    points=len(self.points),
                 )
 
     @property

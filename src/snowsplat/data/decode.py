@@ -322,9 +322,11 @@ def _opened(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
             yield image
     except Exception as error:  # Pillow raises many kinds of exceptions for damaged files
         if not is_file(path):
-            raise UserError(f"{path}: no such image") from None
+            raise UserError("{path}: no such image", path=path) from None
         if isinstance(error, PermissionError):
-            raise UserError(f"{path}: no permission to read it") from None
+            raise UserError("{path}: no permission to read it", path=path) from None
         raise UserError(
-            f"{path}: cannot be decoded ({reason_of(error)}); replace the file or remove it"
+            "{path}: cannot be decoded ({reason_of}); replace the file or remove it",
+            path=path,
+            reason_of=reason_of(error),
         ) from None

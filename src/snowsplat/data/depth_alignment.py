@@ -67,8 +67,10 @@ def align(depth: Tensor, points: Tensor, camera: Camera, *, with_shift: bool) ->
     x, y = x[at.isfinite()], y[at.isfinite()]
     if len(x) < _LEAST_POINTS:
         raise UserError(
-            f"only {len(x)} points of the dataset are in the photo; aligning the depth needs "
-            f"{_LEAST_POINTS}, use another photo"
+            "only {x} points of the dataset are in the photo; aligning the depth needs "
+            "{least_points}, use another photo",
+            x=len(x),
+            least_points=_LEAST_POINTS,
         )
     limit = _RESIDUAL * float(y.median())
     scale, shift = _best_pair(x, y, limit, with_shift)

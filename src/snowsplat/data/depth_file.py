@@ -38,8 +38,11 @@ def read_depth_file(path: Path) -> np.ndarray:
         values = values[..., 0] if grey else values
     if values.ndim != 2 or values.dtype.kind not in "fiub":
         raise UserError(
-            f"{path}: has the shape {values.shape} and the type {values.dtype}; a depth map has "
-            "one number per pixel"
+            "{path}: has the shape {shape} and the type {dtype}; a depth map has one number per "
+            "pixel",
+            path=path,
+            shape=values.shape,
+            dtype=values.dtype,
         )
     return np.ascontiguousarray(values, np.float32)
 
@@ -82,7 +85,9 @@ def to_z(
     if (near is None) != (far is None):
         raise UserError("`near` and `far` are the two ends of a range; set both of them")
     if near is not None and far is not None and not 0.0 < near < far < np.inf:
-        raise UserError(f"`near` {near:g} and `far` {far:g} are no range; use 0 < near < far")
+        raise UserError(
+            "`near` {near:g} and `far` {far:g} are no range; use 0 < near < far", near=near, far=far
+        )
     depth = torch.from_numpy(np.asarray(values, np.float32)).double()
     known = depth.isfinite()
     if near is None and kind != "disparity":

@@ -127,8 +127,10 @@ class DatasetFiles:
             (test if image.name in self.test_names else train).extend(views)
         if not train:
             raise UserError(
-                f"{self.root}: all {len(self.images)} images are held out for testing, so no image "
-                "is left for training; hold out fewer or none"
+                "{root}: all {images} images are held out for testing, so no image is left for "
+                "training; hold out fewer or none",
+                root=self.root,
+                images=len(self.images),
             )
         points = None if self.points is None else self.points.xyz
         near = near_of([view.camera for view in [*train, *test]], points)
@@ -178,7 +180,9 @@ def read_files(
     count = Counter(image.name for image in posed)
     if len(count) < len(posed):
         repeated = next(name for name, n in sorted(count.items()) if n > 1)
-        raise UserError(f"{root}: has two images named {repeated}; remove one")
+        raise UserError(
+            "{root}: has two images named {repeated}; remove one", root=root, repeated=repeated
+        )
     _warn_of_cropped(posed)
     found = list(zip(posed, headers, sizes, strict=True))
     names = _test_names(posed, hold_out, first_held_out, test_list)
@@ -217,7 +221,7 @@ def _find_poses(root: Path, images: str, deep: bool = True) -> _Poses | None:
 def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str, float | None]:
     """Posed images, points, a description, and the metres in a unit of them if that is known."""
     if not root.exists():
-        raise UserError(f"{root}: no such folder")
+        raise UserError("{root}: no such folder", root=root)
     poses = _find_poses(root, images)
     if poses and poses.transforms:
         return *read_transforms(poses.transforms, images), None
@@ -225,25 +229,31 @@ def _read(root: Path, images: str) -> tuple[list[PosedImage], Points | None, str
         return *read_export(root, poses.export, images), poses.export.kind.metres_per_unit
     if root.suffix.lower() == ".zip" and root.is_file():
         raise UserError(
-            f"{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
-            f"it, run: snowsplat make {root} -o OUT"
+            "{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
+            "it, run: snowsplat make {root} -o OUT",
+            root=root,
         )
     if root.is_file():
-        raise UserError(f"{root}: not a dataset; use its folder, or a transforms.json")
+        raise UserError("{root}: not a dataset; use its folder, or a transforms.json", root=root)
     if not poses or not ((root / images).is_dir() or photos_below(root)):
         parents = root.absolute().parents[:2]
         above = next((p for p in parents if _find_poses(p, images, deep=False)), None)
         if above is not None:
-            raise UserError(f"{root}: a part of a dataset; use the whole: {above}")
+            raise UserError(
+                "{root}: a part of a dataset; use the whole: {above}", root=root, above=above
+            )
     if poses:
         placement = read_placement(root) if poses.models[0] == root / "sparse" / "0" else None
         metres = None if placement is None else stored_metres(placement.metres_per_unit)
         return *read_colmap(root, poses.models, images), metres
     if (known := advice(root)) is not None:
-        raise NoPosesError(f"{root}: no camera poses that can be read here; {known}")
+        raise NoPosesError(
+            "{root}: no camera poses that can be read here; {known}", root=root, known=known
+        )
     raise NoPosesError(
-        f"{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
-        "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET"
+        "{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
+        "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET",
+        root=root,
     )
 
 
@@ -335,9 +345,13 @@ def _file_sizes(posed: list[PosedImage], headers: list[Header]) -> list[tuple[in
         camera = image.camera
         if factor is None or not _is_divided(camera, size, usual[image.folder]):
             raise UserError(
-                f"{image.path}: is {header.width}x{header.height}, but its camera is "
-                f"{camera.width}x{camera.height}; use the images that the poses were estimated "
-                "from, or scale all of them by one factor"
+                "{path}: is {width}x{height}, but its camera is {width2}x{height2}; use the "
+                "images that the poses were estimated from, or scale all of them by one factor",
+                path=image.path,
+                width=header.width,
+                height=header.height,
+                width2=camera.width,
+                height2=camera.height,
             )
         sizes.append((*size, sideways))
     for folder, factor in usual.items():
@@ -427,8 +441,12 @@ def _pinhole_views(
     except ValueError as error:
         shown = ", ".join(f"{value:.5g}" for value in lens.params)
         raise UserError(
-            f"{image.path}: the lens distortion ({lens.model} {shown}) is not possible: {error}; "
-            "correct the calibration"
+            "{path}: the lens distortion ({model} {shown}) is not possible: {error}; correct the "
+            "calibration",
+            path=image.path,
+            model=lens.model,
+            shown=shown,
+            error=error,
         ) from None
 
 
@@ -484,7 +502,11 @@ def _final_size(
     if resolution is None or resolution == -1:
         return width, height
     if resolution < 1:
-        raise SettingError("resolution", f"{resolution} is not valid; use 1, 2, 4, 8 or a width")
+        raise SettingError(
+            "resolution",
+            "{resolution} is not valid; use 1, 2, 4, 8 or a width",
+            resolution=resolution,
+        )
     if resolution in _DIVISORS:
         divisor = resolution / image.divided
     else:
@@ -493,8 +515,11 @@ def _final_size(
     if divisor > 1 and min(new_width, new_height) < _SMALLEST_SIDE:
         raise SettingError(
             "resolution",
-            f"{resolution} makes images of {new_width}x{new_height} pixels; use 1, 2, 4 or 8 to "
+            "{resolution} makes images of {new_width}x{new_height} pixels; use 1, 2, 4 or 8 to "
             "divide their size, or a larger width",
+            resolution=resolution,
+            new_width=new_width,
+            new_height=new_height,
         )
     return new_width, new_height
 
@@ -509,8 +534,13 @@ def _check_mask(path: Path, size: tuple[int, int, bool]) -> None:
     # Sides are rounded to whole pixels of the mask, or of an image that is smaller.
     if abs(own[0] * height - own[1] * width) > max(width, height, *own):
         raise UserError(
-            f"{path}: the mask is {own[0]}x{own[1]}, but its image is {width}x{height}; use a mask "
-            "of the whole image"
+            "{path}: the mask is {own}x{own2}, but its image is {width}x{height}; use a mask of "
+            "the whole image",
+            path=path,
+            own=own[0],
+            own2=own[1],
+            width=width,
+            height=height,
         )
 
 
@@ -527,9 +557,9 @@ def _test_names(
     if hold_out is None:
         return set()
     if hold_out < 1:
-        raise SettingError("hold_out", f"{hold_out} is not valid; use 2 or more")
+        raise SettingError("hold_out", "{hold_out} is not valid; use 2 or more", hold_out=hold_out)
     if first < 0:
-        raise SettingError("first_held_out", f"{first} is not valid; use 0 or more")
+        raise SettingError("first_held_out", "{first} is not valid; use 0 or more", first=first)
     if any(image.split == "test" for image in posed):
         return {image.name for image in posed if image.split == "test"}
     frames = list(dict.fromkeys(together[name] for name in names))
@@ -558,7 +588,9 @@ def _listed(
             lines = Path(test_list).read_text(encoding="utf-8").splitlines()
         except (OSError, ValueError) as error:
             raise UserError(
-                f"{test_list}: the list of test images cannot be read ({error})"
+                "{test_list}: the list of test images cannot be read ({error})",
+                test_list=test_list,
+                error=error,
             ) from None
     else:
         lines = list(test_list)
@@ -574,6 +606,8 @@ def _listed(
             problem = (
                 "is the name of several images" if matches else "is not an image of the dataset"
             )
-            raise UserError(f"the list of test images: {quoted(line)} {problem}")
+            raise UserError(
+                "the list of test images: {line} {problem}", line=quoted(line), problem=problem
+            )
         listed |= matches
     return listed

@@ -30,10 +30,15 @@ def read_map(path: Path, kind: str, pick: Pick) -> np.ndarray:
         UserError: the file is missing, damaged or too large, or has no known suffix.
     """
     if not is_file(path):
-        raise UserError(f"{path}: no such {kind}")
+        raise UserError("{path}: no such {kind}", path=path, kind=kind)
     suffix = path.suffix.lower()
     if suffix not in MAP_SUFFIXES:
-        raise UserError(f"{path}: unknown kind of {kind}; use {', '.join(MAP_SUFFIXES)}")
+        raise UserError(
+            "{path}: unknown kind of {kind}; use {map_suffixes}",
+            path=path,
+            kind=kind,
+            map_suffixes=", ".join(MAP_SUFFIXES),
+        )
     try:
         if suffix == ".npy":
             return _read_npy(path)
@@ -47,7 +52,10 @@ def read_map(path: Path, kind: str, pick: Pick) -> np.ndarray:
         raise
     except Exception as error:  # each of these libraries raises many kinds of exceptions
         raise UserError(
-            f"{path}: cannot be read as a {kind} ({reason_of(error)}); export it again"
+            "{path}: cannot be read as a {kind} ({reason_of}); export it again",
+            path=path,
+            kind=kind,
+            reason_of=reason_of(error),
         ) from None
 
 
@@ -63,7 +71,8 @@ def _read_exr(path: Path, pick: Pick) -> np.ndarray:
         import OpenEXR
     except ImportError:
         raise UserError(
-            f"{path}: EXR files need a package; run pip install OpenEXR, or convert it to NPY"
+            "{path}: EXR files need a package; run pip install OpenEXR, or convert it to NPY",
+            path=path,
         ) from None
     with OpenEXR.File(str(path), header_only=True) as header:
         box = header.header()["dataWindow"]

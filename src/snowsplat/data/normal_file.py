@@ -33,8 +33,11 @@ def read_normal_file(path: Path) -> np.ndarray:
         values = values.transpose(1, 2, 0)
     if values.ndim != 3 or values.shape[2] not in (3, 4) or values.dtype.kind not in "fu":
         raise UserError(
-            f"{path}: has the shape {stored.shape} and the type {stored.dtype}; a normal map has "
-            "three numbers per pixel"
+            "{path}: has the shape {shape} and the type {dtype}; a normal map has three numbers "
+            "per pixel",
+            path=path,
+            shape=stored.shape,
+            dtype=stored.dtype,
         )
     values = values[..., :3]
     if values.dtype.kind == "u":
@@ -52,8 +55,10 @@ def read_normal_file(path: Path) -> np.ndarray:
     others = int((~known[..., 0] & ~marked).sum())
     if others > _MOST_OTHERS * (others + int(known.sum())):
         raise UserError(
-            f"{path}: its values are not normals: {100 * others / known.size:.0f}% of the pixels "
-            "have another length than 1; export x, y and z as red, green and blue"
+            "{path}: its values are not normals: {size:.0f}% of the pixels have another length "
+            "than 1; export x, y and z as red, green and blue",
+            path=path,
+            size=100 * others / known.size,
         )
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(known, normals / length, np.float32(np.nan)).astype(np.float32)

@@ -43,7 +43,7 @@ def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     """
     table = open_table(path)
     if not all(name in table.columns for name in _POSITION):
-        raise UserError(f"{path}: not a point cloud; the PLY file needs columns x, y, z")
+        raise UserError("{path}: not a point cloud; the PLY file needs columns x, y, z", path=path)
     double = any(np.dtype(table.columns[name]) == np.float64 for name in _POSITION)
     xyz = np.empty((table.count, 3), np.float64 if double else np.float32)
     rgb = np.full((table.count, 3), 128, np.uint8)

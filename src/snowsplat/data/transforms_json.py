@@ -95,7 +95,9 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
             continue
         if (file, frame.split) in seen:
             raise UserError(
-                f"{frame.where}: the image {file} also belongs to another frame; remove one of them"
+                "{where}: the image {file} also belongs to another frame; remove one of them",
+                where=frame.where,
+                file=file,
             )
         seen.add((file, frame.split))
         if file not in posed:
@@ -104,7 +106,12 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
     if not posed:
         problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"
         hint = f" (the first is {quoted(missing[0])})" if missing else ""
-        raise UserError(f"{files[0]}: {problem}{hint}; check where the images are")
+        raise UserError(
+            "{files}: {problem}{hint}; check where the images are",
+            files=files[0],
+            problem=problem,
+            hint=hint,
+        )
     warn_of_missing(root / shown, missing, len(frames))
     return list(posed.values()), _points(root, first_scene), shown
 
@@ -132,7 +139,7 @@ def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
         for number, frame in enumerate(scene["frames"]):
             where = f"{path}: frame {number}"
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-                raise UserError(f"{where}: no file_path; export the file again")
+                raise UserError("{where}: no file_path; export the file again", where=where)
             name = frame["file_path"]
             named = split or splits.get(safe_name(name))
             frames.append(_Frame(where, name, ChainMap(frame, scene), named))
@@ -191,7 +198,9 @@ def _posed_image(
 def _read_json(path: Path) -> _Json:
     scene = load_json(path, _JSON_RATIO)
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
-        raise UserError(f"{path}: has no list of frames, so it does not describe a dataset")
+        raise UserError(
+            "{path}: has no list of frames, so it does not describe a dataset", path=path
+        )
     return scene
 
 
@@ -218,8 +227,10 @@ def _path_inside(where: str, root: Path, name: str) -> Path:
         path = next((root / end for end in ends if is_file(root / end)), path)
     if path is None:
         raise UserError(
-            f"{where}: {quoted(name)} is not in the folder of the JSON file; copy it there and use "
-            "a relative path"
+            "{where}: {name} is not in the folder of the JSON file; copy it there and use a "
+            "relative path",
+            where=where,
+            name=quoted(name),
         )
     return path
 
@@ -253,7 +264,9 @@ def _mask(where: str, root: Path, frame: Mapping[str, Any]) -> Path | None:
     path = _path_inside(where, root, name)
     if not is_file(path):
         raise UserError(
-            f"{where}: the mask {path} is missing; add it or remove its entry from the file"
+            "{where}: the mask {path} is missing; add it or remove its entry from the file",
+            where=where,
+            path=path,
         )
     return path
 
@@ -282,7 +295,12 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
         header = read_header(image)
         width, height = header.width, header.height
     if width < 1 or height < 1:
-        raise UserError(f"{where}: the image size {width:g}x{height:g} is not valid; correct it")
+        raise UserError(
+            "{where}: the image size {width:g}x{height:g} is not valid; correct it",
+            where=where,
+            width=width,
+            height=height,
+        )
     width, height = round(width), round(height)
     fx, fy = _focal(where, values, "x", width), _focal(where, values, "y", height)
     # Pixels are square if there is only one focal length.
@@ -290,10 +308,15 @@ def _camera(where: str, values: Mapping[str, Any], image: Path) -> Camera:
     if is_panorama(values):
         fx = fy = width / (2 * math.pi)  # pixels per radian at the centre
     if fx is None or fy is None:
-        raise UserError(f"{where}: no focal length (fl_x or camera_angle_x); export it again")
+        raise UserError(
+            "{where}: no focal length (fl_x or camera_angle_x); export it again", where=where
+        )
     if fx <= 0 or fy <= 0:
         raise UserError(
-            f"{where}: the focal lengths {fx:g} and {fy:g} pixels are not valid; correct them"
+            "{where}: the focal lengths {fx:g} and {fy:g} pixels are not valid; correct them",
+            where=where,
+            fx=fx,
+            fy=fy,
         )
     cx, cy = number_of(where, values, "cx"), number_of(where, values, "cy")
     return Camera(
@@ -319,7 +342,9 @@ def _focal(where: str, values: Mapping[str, Any], axis: str, size: int) -> float
         return pixels
     if not 0 < angle < math.pi:
         raise UserError(
-            f"{where}: the field of view {math.degrees(angle):g}° is not valid; correct it"
+            "{where}: the field of view {degrees:g}° is not valid; correct it",
+            where=where,
+            degrees=math.degrees(angle),
         )
     return 0.5 * size / math.tan(0.5 * angle) if pixels is None else pixels
 
@@ -356,11 +381,14 @@ def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
     except (KeyError, TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < 1e15).all():
-        raise UserError(f"{where}: transform_matrix must be 4 rows of 4 numbers; export it again")
+        raise UserError(
+            "{where}: transform_matrix must be 4 rows of 4 numbers; export it again", where=where
+        )
     if matrix.shape == (4, 4) and matrix[3, :3].any() and not matrix[:3, 3].any():
         raise UserError(
-            f"{where}: transform_matrix is transposed: its last row must be 0 0 0 1, and its last "
-            "column the position; export it again"
+            "{where}: transform_matrix is transposed: its last row must be 0 0 0 1, and its last "
+            "column the position; export it again",
+            where=where,
         )
     axes = matrix[:3, :3]
     # A scaled camera object in Blender has a scaled matrix; only the directions are used. The
@@ -369,9 +397,9 @@ def _pose(where: str, frame: Mapping[str, Any]) -> torch.Tensor:
     u, _, vt = np.linalg.svd(axes / scale if scale > 1e-9 else np.zeros((3, 3)))
     rotation = u @ vt
     if scale <= 1e-9 or np.abs(rotation * scale - axes).max() > 1e-2 * scale:
-        raise UserError(f"{where}: transform_matrix is not a rotation; export it again")
+        raise UserError("{where}: transform_matrix is not a rotation; export it again", where=where)
     if np.linalg.det(rotation) < 0:
-        raise UserError(f"{where}: transform_matrix mirrors the world; export it again")
+        raise UserError("{where}: transform_matrix mirrors the world; export it again", where=where)
     world_from_cam = np.concatenate([rotation @ _FLIP, matrix[:3, 3:]], axis=1)
     return invert_rigid(torch.from_numpy(world_from_cam))
 

@@ -72,8 +72,10 @@ def lens_of(
         return LensModel("RAD_TAN_THIN_PRISM_FISHEYE", width, height, (*intrinsics, *numbers))
     if model not in _PERSPECTIVE | _FISHEYE:
         raise UserError(
-            f"{where}: the camera model {model[:40]} is not known; undistort the photos with the "
-            "program that made the file, or make a new dataset: snowsplat sfm PHOTOS -o DATASET"
+            "{where}: the camera model {model} is not known; undistort the photos with the "
+            "program that made the file, or make a new dataset: snowsplat sfm PHOTOS -o DATASET",
+            where=where,
+            model=model[:40],
         )
     if isinstance(values.get("distortion_params"), list):
         k1, k2, k3, k4, p1, p2 = _listed(where, values, 6)
@@ -101,7 +103,12 @@ def number_of(where: str, values: Mapping[str, Any], key: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise UserError(f"{where}: {key} should be a number, not {quoted(value)}; correct it")
+        raise UserError(
+            "{where}: {name} should be a number, not {value}; correct it",
+            where=where,
+            name=key,
+            value=quoted(value),
+        )
     return float(value)
 
 
@@ -110,8 +117,11 @@ def _listed(where: str, values: Mapping[str, Any], count: int) -> tuple[float, .
     numbers = [*listed] if isinstance(listed, list) else []
     if len(numbers) != count:
         raise UserError(
-            f"{where}: distortion_params should be {count} numbers for the camera model "
-            f"{_model(values)[:40]}; export the file again"
+            "{where}: distortion_params should be {count} numbers for the camera model {model}; "
+            "export the file again",
+            where=where,
+            count=count,
+            model=_model(values)[:40],
         )
     key = "distortion_params"
     return tuple(number_of(where, {key: value}, key) or 0.0 for value in numbers)

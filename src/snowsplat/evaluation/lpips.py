@@ -122,8 +122,11 @@ class Lpips:
             if value is None or tuple(value.shape) != shape:
                 found = "missing" if value is None else f"of shape {tuple(value.shape)}"
                 raise UserError(
-                    f"{path}: not LPIPS weights: {name} is {found}; the file must contain the "
-                    "state of lpips.LPIPS(net='alex') or net='vgg'"
+                    "{path}: not LPIPS weights: {name} is {found}; the file must contain the "
+                    "state of lpips.LPIPS(net='alex') or net='vgg'",
+                    path=path,
+                    name=name,
+                    found=found,
                 )
             return value.to(torch.float32).contiguous()
 
@@ -153,7 +156,9 @@ class Lpips:
             UserError: an image is smaller than 32 pixels.
         """
         if min(image.shape[:2]) < _MIN_SIDE:
-            raise UserError(f"LPIPS needs images of at least {_MIN_SIDE} pixels a side")
+            raise UserError(
+                "LPIPS needs images of at least {min_side} pixels a side", min_side=_MIN_SIDE
+            )
         distance = 0.0
         pairs = zip(self._features(image), self._features(target), strict=True)
         for head, (a, b) in zip(self.heads, pairs, strict=True):
@@ -192,15 +197,16 @@ def _packaged_state(name: str) -> dict[str, Tensor]:
         import lpips  # type: ignore[import-not-found,unused-ignore]
     except ImportError:
         raise UserError(
-            f"LPIPS ({name}) needs its weights: pip install lpips, or give a file of them; "
-            "see snowsplat evaluate --help"
+            "LPIPS ({name}) needs its weights: pip install lpips, or give a file of them; see "
+            "snowsplat evaluate --help",
+            name=name,
         ) from None
     try:
         with warnings.catch_warnings():  # it uses torchvision as that was years ago
             warnings.simplefilter("ignore")
             network = lpips.LPIPS(net=name, verbose=False)
     except OSError as error:  # of urllib
-        raise UserError(f"lpips: cannot download its network ({error})") from None
+        raise UserError("lpips: cannot download its network ({error})", error=error) from None
     return {key: value.clone() for key, value in network.state_dict().items()}
 
 
@@ -209,10 +215,13 @@ def _read_state(path: Path) -> dict[str, Tensor]:
         check_header(path)
         return safetensors.torch.load_file(path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise UserError(
+            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
+        ) from None
     except (safetensors.SafetensorError, ValueError, KeyError):
         raise UserError(
-            f"{path}: not a safetensors file; see snowsplat evaluate --help for how to make one"
+            "{path}: not a safetensors file; see snowsplat evaluate --help for how to make one",
+            path=path,
         ) from None
 
 

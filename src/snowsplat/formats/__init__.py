@@ -55,7 +55,12 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     path = Path(path)
     format = format_for_reading(path)
     if format.read is None:
-        raise UserError(f"{path}: {format.name} files cannot be read; {format.instead}")
+        raise UserError(
+            "{path}: {name} files cannot be read; {instead}",
+            path=path,
+            name=format.name,
+            instead=format.instead,
+        )
     scene = format.read(path)
     _name_coarse_positions(path, scene)
     if format.stores_origin:

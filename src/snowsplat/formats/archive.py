@@ -76,7 +76,9 @@ def read_archive(path: Path | str) -> GaussianArrays:
                 return _project(path, members, names)
             return _single(path, members, names)
     except Damaged as error:
-        raise UserError(f"{path}: {error}; copy or export it again") from None
+        raise UserError(
+            "{path}: {error}; copy or export it again", path=path, error=error
+        ) from None
 
 
 def _is_own(name: str) -> bool:
@@ -98,11 +100,22 @@ def _single(path: Path, members: ZipMembers, names: Sequence[str]) -> GaussianAr
     if len(scenes) == 1:
         return found[0]
     if scenes:
-        raise UserError(f"{path}: contains {len(scenes)} scenes; unzip it, and use {_some(scenes)}")
+        raise UserError(
+            "{path}: contains {scenes} scenes; unzip it, and use {some}",
+            path=path,
+            scenes=len(scenes),
+            some=_some(scenes),
+        )
     others = [name for name in names if name.lower().endswith(_OTHER_SCENES)]
     if others:
-        raise UserError(f"{path}: a zip file; unzip it, and use {_some(others)}")
-    raise UserError(f"{path}: a zip file without a scene; it contains {_some(names) or 'nothing'}")
+        raise UserError(
+            "{path}: a zip file; unzip it, and use {some}", path=path, some=_some(others)
+        )
+    raise UserError(
+        "{path}: a zip file without a scene; it contains {some}",
+        path=path,
+        some=_some(names) or "nothing",
+    )
 
 
 def _some(names: Sequence[str]) -> str:

@@ -65,12 +65,19 @@ def read_compressed_ply(path: Path | str, data: bytes | None = None) -> Gaussian
     missing = [n for n in _WORDS if vertices.columns.get(n) != "u4"]
     missing += [n for n in _GEOMETRY_BOUNDS if n not in chunks.columns]
     if missing:
-        raise UserError(f"{path}: not a supported compressed PLY file; it has no {missing[0]}")
+        raise UserError(
+            "{path}: not a supported compressed PLY file; it has no {missing}",
+            path=path,
+            missing=missing[0],
+        )
     n = vertices.count
     if chunks.count * _CHUNK < n:
         raise UserError(
-            f"{path}: the compressed PLY file has only {chunks.count} chunks for {n} Gaussians; "
-            "it is damaged, export it again"
+            "{path}: the compressed PLY file has only {count} chunks for {number} Gaussians; it "
+            "is damaged, export it again",
+            path=path,
+            count=chunks.count,
+            number=n,
         )
     bounds = _columns(chunks, _GEOMETRY_BOUNDS)
     colors = np.zeros((chunks.count, 6), np.float32)
@@ -108,8 +115,12 @@ def _read_sh(path: Path, vertices: PlyTable, data: bytes | None) -> np.ndarray:
     names = [f"f_rest_{i}" for i in range(3 * k)]
     if k not in SH_REST_COUNTS or list(table.columns) != names or table.count != n:
         raise UserError(
-            f"{path}: the 'sh' element of the compressed PLY file has {len(table.columns)} "
-            f"properties of {table.count} Gaussians; expected 9, 24 or 45 of {n}"
+            "{path}: the 'sh' element of the compressed PLY file has {columns} properties of "
+            "{count} Gaussians; expected 9, 24 or 45 of {number}",
+            path=path,
+            columns=len(table.columns),
+            count=table.count,
+            number=n,
         )
     steps = np.arange(256) + 0.5
     steps[[0, 255]] = 0, 256

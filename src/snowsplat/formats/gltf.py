@@ -88,7 +88,11 @@ def read_gltf(path: Path | str) -> GaussianArrays:
         notes: set[str] = set()
         parts = _parts(path, document, notes)
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
-            raise UserError(f"{path}: a glTF file without Gaussian splats ({EXTENSION})")
+            raise UserError(
+                "{path}: a glTF file without Gaussian splats ({extension})",
+                path=path,
+                extension=EXTENSION,
+            )
         if _are_logarithms([part.log_scales for part, _ in parts]):
             notes.add(
                 "SCALE has negative values, so it is read as logarithms, as in the draft of "
@@ -101,9 +105,13 @@ def read_gltf(path: Path | str) -> GaussianArrays:
             ]
         placed = [transformed(part, matrix) for part, matrix in parts]
     except Damaged as error:
-        raise UserError(f"{path}: {error}; copy or export it again") from None
+        raise UserError(
+            "{path}: {error}; copy or export it again", path=path, error=error
+        ) from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
-        raise UserError(f"{path}: its JSON is not valid glTF; copy or export it again") from None
+        raise UserError(
+            "{path}: its JSON is not valid glTF; copy or export it again", path=path
+        ) from None
     for note in sorted(notes):
         logger.warning("%s: %s", path, note)
     scene = GaussianArrays.cat(placed)
@@ -290,7 +298,11 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
         for name, values in attributes.items()
     }
     if sum(array.nbytes for array in attributes.values()) > _GLB_LIMIT - (1 << 20):
-        raise UserError(f"{path}: {len(means)} Gaussians are too many for .glb; write .ply or .spz")
+        raise UserError(
+            "{path}: {means} Gaussians are too many for .glb; write .ply or .spz",
+            path=path,
+            means=len(means),
+        )
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "snowsplat"}}
     document["extensionsUsed"] = [EXTENSION]
     if gaussians.metres_per_unit:

@@ -56,9 +56,11 @@ def read_checkpoint(path: Path | str) -> GaussianArrays:
         if shapes != [(n, 3), (n, 3), (n, 4), (n,), (n, 1, 3)] or shN.shape != (n, rest, 3):
             raise Damaged("its tensors do not have the shapes of Gaussians")
     except Damaged as error:
-        raise UserError(f"{path}: {error}; copy it again") from None
+        raise UserError("{path}: {error}; copy it again", path=path, error=error) from None
     if rest not in [(degree + 1) ** 2 - 1 for degree in range(11)]:
-        raise UserError(f"{path}: {rest} SH coefficients do not match an SH degree")
+        raise UserError(
+            "{path}: {rest} SH coefficients do not match an SH degree", path=path, rest=rest
+        )
     if rest > SH_REST_COUNTS[-1]:
         logger.warning("%s: its SH degree is reduced to 3", path)
     _name_other_ranks(path)
@@ -82,21 +84,25 @@ def _splats(path: Path, content: Any) -> dict[Any, Any]:
         if "sh0" in splats:
             return splats
         raise UserError(
-            f"{path}: a checkpoint of gsplat whose colours are a network (app_opt); train without "
-            "it, or save a .ply"
+            "{path}: a checkpoint of gsplat whose colours are a network (app_opt); train without "
+            "it, or save a .ply",
+            path=path,
         )
     if isinstance(content, tuple | list):
         raise UserError(
-            f"{path}: a checkpoint of the reference implementation; use its point_cloud.ply"
+            "{path}: a checkpoint of the reference implementation; use its point_cloud.ply",
+            path=path,
         )
     if isinstance(content, dict) and "pipeline" in content:
         raise UserError(
-            f"{path}: a checkpoint of nerfstudio; ns-export gaussian-splat makes a .ply"
+            "{path}: a checkpoint of nerfstudio; ns-export gaussian-splat makes a .ply", path=path
         )
     missing = [name for name in _NAMES[:5] if not isinstance(splats, dict) or name not in splats]
     raise UserError(
-        f"{path}: a checkpoint of PyTorch without the Gaussians of gsplat (no {', '.join(missing)} "
-        "in splats); save a .ply in the program that made it"
+        "{path}: a checkpoint of PyTorch without the Gaussians of gsplat (no {missing} in "
+        "splats); save a .ply in the program that made it",
+        path=path,
+        missing=", ".join(missing),
     )
 
 

@@ -60,12 +60,16 @@ def read_ksplat(path: Path | str) -> GaussianArrays:
     path = Path(path)
     data = packing.read_file(path)
     if len(data) < _HEADER_BYTES:
-        raise UserError(f"{path}: too short for a .ksplat file; copy or export it again")
+        raise UserError("{path}: too short for a .ksplat file; copy or export it again", path=path)
     major, minor, section_count, level = struct.unpack_from("<BB2xI12xH", data)
     if major != 0 or minor < 1 or level >= len(_TYPES):
         raise UserError(
-            f"{path}: not a supported .ksplat file (version {major}.{minor}, compression level "
-            f"{level}); supported is version 0.1 with levels 0 to 2"
+            "{path}: not a supported .ksplat file (version {major}.{minor}, compression level "
+            "{level}); supported is version 0.1 with levels 0 to 2",
+            path=path,
+            major=major,
+            minor=minor,
+            level=level,
         )
     low, high = struct.unpack_from("<2f", data, 36)
     bounds = low or -_DEFAULT_SH_BOUND, high or _DEFAULT_SH_BOUND
@@ -156,5 +160,6 @@ def _unpack(
 
 def _damaged(path: Path) -> UserError:
     return UserError(
-        f"{path}: damaged .ksplat file: its sections do not match its size; copy or export it again"
+        "{path}: damaged .ksplat file: its sections do not match its size; copy or export it again",
+        path=path,
     )

@@ -105,10 +105,14 @@ def read_index(path: Path) -> LodIndex:
         with reading(path):
             meta = read_json(path)
     except ValueError as error:
-        raise UserError(f"{path}: {error}; copy or export it again") from None
+        raise UserError(
+            "{path}: {error}; copy or export it again", path=path, error=error
+        ) from None
     try:
         if meta.get("version", 1) != 1:  # the first files had no version
-            raise UserError(f"{path}: version {quoted(meta['version'])}; supported is 1")
+            raise UserError(
+                "{path}: version {meta}; supported is 1", path=path, meta=quoted(meta["version"])
+            )
         levels, names = meta["lodLevels"], meta["filenames"]
         environment = meta.get("environment")
         leaves = list(_leaves(meta["tree"], _number(levels, 1, _MOST_LEVELS), len(names)))
@@ -116,7 +120,7 @@ def read_index(path: Path) -> LodIndex:
         always = None if environment is None else _file(path, environment)
     except (AttributeError, KeyError, TypeError, ValueError):
         raise UserError(
-            f"{path}: does not describe levels of detail; copy or export it again"
+            "{path}: does not describe levels of detail; copy or export it again", path=path
         ) from None
     return LodIndex(levels, files, leaves, always)
 
@@ -166,7 +170,9 @@ def _file(path: Path, name: Any) -> Path:
             raise ValueError
         found = inside(path.parent, name)
     if found is None:
-        raise UserError(f"{path}: refers to a file outside of its folder ({quoted(name)})")
+        raise UserError(
+            "{path}: refers to a file outside of its folder ({name})", path=path, name=quoted(name)
+        )
     return found
 
 
@@ -174,8 +180,14 @@ def _rows(path: Path, runs: list[Run]) -> GaussianArrays:
     """The rows of a SOG scene that belong to the runs."""
     scene = read_stored(path)
     if any(run.offset + run.count > len(scene.means) for run in runs):
-        raise UserError(f"{path}: has too few Gaussians for its {INDEX}; copy or export it again")
+        raise UserError(
+            "{path}: has too few Gaussians for its {index}; copy or export it again",
+            path=path,
+            index=INDEX,
+        )
     if sum(run.count for run in runs) > len(scene.means):
-        raise UserError(f"{path}: used twice by its {INDEX}; copy or export it again")
+        raise UserError(
+            "{path}: used twice by its {index}; copy or export it again", path=path, index=INDEX
+        )
     rows = [np.arange(run.offset, run.offset + run.count) for run in runs]
     return scene.select(np.concatenate(rows))

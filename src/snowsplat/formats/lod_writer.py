@@ -77,7 +77,9 @@ def write_lod(
     path, sizes = Path(path), sizes or LodSizes()
     if path.name != INDEX:
         raise UserError(
-            f"{path}: viewers find levels of detail by their name; write FOLDER/{INDEX}"
+            "{path}: viewers find levels of detail by their name; write FOLDER/{index}",
+            path=path,
+            index=INDEX,
         )
     packable = packing.packable(path, gaussians)
     levels = sizes.levels(len(packable.means))

@@ -30,11 +30,18 @@ def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     """Raises UserError: another suffix, or a package that it needs is missing."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        raise UserError(f"{path}: unknown format; use {', '.join(suffixes[:-1])} or {suffixes[-1]}")
+        raise UserError(
+            "{path}: unknown format; use {suffixes} or {suffixes2}",
+            path=path,
+            suffixes=", ".join(suffixes[:-1]),
+            suffixes2=suffixes[-1],
+        )
     for package in {".las": ("laspy",), ".laz": ("laspy", "lazrs")}.get(suffix, ()):
         if find_spec(package) is None:
             raise UserError(
-                f"{suffix} needs the package {package}: pip install 'snowsplat[mesh]'; or use .ply"
+                "{suffix} needs the package {package}: pip install 'snowsplat[mesh]'; or use .ply",
+                suffix=suffix,
+                package=package,
             )
 
 

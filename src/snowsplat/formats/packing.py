@@ -51,8 +51,11 @@ def check_count(path: Path, count: int, file_size: int) -> None:
     """
     if count > max(ALWAYS_ALLOWED, file_size):
         raise UserError(
-            f"{path}: a file of {file_size} bytes declares {count} Gaussians; "
-            "it is damaged or malicious"
+            "{path}: a file of {file_size} bytes declares {count} Gaussians; it is damaged or "
+            "malicious",
+            path=path,
+            file_size=file_size,
+            count=count,
         )
 
 

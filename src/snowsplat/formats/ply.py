@@ -94,7 +94,11 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     table = open_table(path, data=data)
     if missing := _missing(table):
         shown = ", ".join(missing[:4]) + (", …" if len(missing) > 4 else "")
-        raise UserError(f"{path}: a PLY file without 3D Gaussians; missing properties: {shown}")
+        raise UserError(
+            "{path}: a PLY file without 3D Gaussians; missing properties: {shown}",
+            path=path,
+            shown=shown,
+        )
     stored = _rest_count(table)
     k = min(stored, SH_REST_COUNTS[-1])
     if k < stored:
@@ -155,8 +159,10 @@ def _rest_count(table: PlyTable) -> int:
         or set(rest) != set(_rest_names(len(rest) // 3))
     ):
         raise UserError(
-            f"{table.path}: {len(rest)} f_rest properties do not match an SH degree; "
-            "expected 0, 9, 24, 45 or 72, numbered from 0"
+            "{path}: {rest} f_rest properties do not match an SH degree; expected 0, 9, 24, 45 "
+            "or 72, numbered from 0",
+            path=table.path,
+            rest=len(rest),
         )
     return len(rest) // 3
 

@@ -213,7 +213,7 @@ def format_for_reading(path: Path | str) -> Format:
     path = Path(path)
     with reading(path):
         if path.exists() and not (path.is_file() or path.is_dir()):
-            raise UserError(f"{path}: is a pipe or a device; use a file")
+            raise UserError("{path}: is a pipe or a device; use a file", path=path)
         with open(path, "rb") as file:
             head = file.read(_HEAD_BYTES)
     for format in FORMATS:
@@ -222,7 +222,9 @@ def format_for_reading(path: Path | str) -> Format:
     named = _by_suffix(path, FORMATS)
     if named is None:
         known = _suffixes([format for format in FORMATS if format.read is not None])
-        raise UserError(f"{path}: not a known scene file; supported are {known}")
+        raise UserError(
+            "{path}: not a known scene file; supported are {known}", path=path, known=known
+        )
     return named
 
 
@@ -237,7 +239,9 @@ def format_for_writing(path: Path | str) -> Format:
     format = _by_suffix(path, writable)
     if format is None:
         raise UserError(
-            f"{path}: the suffix selects no scene format; use one of {_suffixes(writable)}"
+            "{path}: the suffix selects no scene format; use one of {suffixes}",
+            path=path,
+            suffixes=_suffixes(writable),
         )
     return format
 

@@ -81,7 +81,9 @@ def read_stored(path: Path | str) -> GaussianArrays:
             arrays = _decode(files, layout)
             meta = files.meta()
     except Damaged as error:
-        raise UserError(f"{path}: {error}; copy or export it again") from None
+        raise UserError(
+            "{path}: {error}; copy or export it again", path=path, error=error
+        ) from None
     antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
     scene = placed(*arrays, antialiased=antialiased)
     asset = meta.get("asset")
@@ -103,7 +105,9 @@ def sog_files(path: Path) -> list[Path]:
         with Bundle(path) as files:
             return [path, *files.beside(_layout(files.meta()).files.values())]
     except Damaged as error:
-        raise UserError(f"{path}: {error}; copy or export it again") from None
+        raise UserError(
+            "{path}: {error}; copy or export it again", path=path, error=error
+        ) from None
 
 
 def sog_version(path: Path) -> str:
@@ -239,7 +243,11 @@ def sog_bytes(path: Path, gaussians: GaussianArrays) -> bytes:
     packable = packing.packable(path, gaussians)
     if len(packable.means) > (_SIDE_LIMIT - 3) ** 2:
         count = len(packable.means)
-        raise UserError(f"{path}: {count} Gaussians are too many for SOG; write .ply or .spz")
+        raise UserError(
+            "{path}: {count} Gaussians are too many for SOG; write .ply or .spz",
+            path=path,
+            count=count,
+        )
     members = encode_sog(packable.select(packing.spatial_order(packable.means)))
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as bundle:

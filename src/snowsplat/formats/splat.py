@@ -30,8 +30,11 @@ def read_splat(path: Path | str) -> GaussianArrays:
     data = packing.read_file(path)
     if len(data) % _ROW.itemsize:
         raise UserError(
-            f"{path}: not a .splat file: {len(data)} bytes are not a multiple of {_ROW.itemsize}; "
-            "copy or export it again"
+            "{path}: not a .splat file: {data} bytes are not a multiple of {itemsize}; copy or "
+            "export it again",
+            path=path,
+            data=len(data),
+            itemsize=_ROW.itemsize,
         )
     rows = np.frombuffer(data, _ROW)
     return decoded(

@@ -139,8 +139,10 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
             (number,) = struct.unpack_from("<I", extensions, start + 8)
             if number > len(_FRAMES):
                 raise UserError(
-                    f"{path}: SPZ coordinate system {number} (swapped y and z axes) is not "
-                    "supported; export the file with the default coordinate system RUB"
+                    "{path}: SPZ coordinate system {number} (swapped y and z axes) is not "
+                    "supported; export the file with the default coordinate system RUB",
+                    path=path,
+                    number=number,
                 )
             axes = _FRAMES[number - 1] if number else "RUB"
             return 1 if "R" in axes else -1, 1 if "D" in axes else -1, 1 if "F" in axes else -1

@@ -142,11 +142,15 @@ def _body_bytes(header: Header) -> int:
 
 def _header(path: Path, head: bytes, file_size: int) -> Header:
     if not head.startswith(_MAGIC):
-        raise UserError(f"{path}: not an .spz file; its content does not begin with NGSP")
+        raise UserError("{path}: not an .spz file; its content does not begin with NGSP", path=path)
     _, *values, _ = _HEAD.unpack_from(head)
     header = Header(*values)
     if not 1 <= header.version <= 4:
-        raise UserError(f"{path}: version {header.version} of .spz; supported are 1 to 4")
+        raise UserError(
+            "{path}: version {version} of .spz; supported are 1 to 4",
+            path=path,
+            version=header.version,
+        )
     if header.sh_degree > 4 or header.fractional_bits > 31:
         raise _damaged(path)
     check_count(path, header.count, file_size)
@@ -193,4 +197,6 @@ def pack(header: Header, columns: Sequence[bytes]) -> bytes:
 
 
 def _damaged(path: Path) -> UserError:
-    return UserError(f"{path}: a damaged or incomplete .spz file; copy or export it again")
+    return UserError(
+        "{path}: a damaged or incomplete .spz file; copy or export it again", path=path
+    )

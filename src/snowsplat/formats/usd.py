@@ -58,15 +58,18 @@ def _usd(path: Path) -> Iterator[tuple[Any, ...]]:
         UsdVol.ParticleField3DGaussianSplat  # noqa: B018 since OpenUSD 26.03
     except (ImportError, AttributeError):
         raise UserError(
-            f"{path}: USD files need OpenUSD 26.03 or newer; pip install 'snowsplat[usd]', or use "
-            ".glb"
+            "{path}: USD files need OpenUSD 26.03 or newer; pip install 'snowsplat[usd]', or use "
+            ".glb",
+            path=path,
         ) from None
     try:
         yield Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt
     except Tf.ErrorException as error:
         reason = re.sub(r"^.* : '|'$", "", str(error).strip().splitlines()[-1].strip())
         raise UserError(
-            f"{path}: OpenUSD reports: {reason[:200]}; copy or export it again"
+            "{path}: OpenUSD reports: {reason}; copy or export it again",
+            path=path,
+            reason=reason[:200],
         ) from None
 
 
@@ -95,10 +98,12 @@ def read_usd(path: Path | str) -> GaussianArrays:
                     matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
                     parts.append(transformed(_splats(prim), matrix))
         except Damaged as error:
-            raise UserError(f"{path}: {error}; copy or export it again") from None
+            raise UserError(
+                "{path}: {error}; copy or export it again", path=path, error=error
+            ) from None
     if not parts:
         raise UserError(
-            f"{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)"
+            "{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)", path=path
         )
     scene = GaussianArrays.cat(parts)
     found = decoded(path, *packing.flipped(replace(scene, means=scene.world_means())))

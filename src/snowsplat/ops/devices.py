@@ -52,13 +52,13 @@ def resolve_device(
     except RuntimeError:
         device = None
     if device is None or device.type not in ("cpu", "cuda"):
-        raise UserError(f"{source}: unsupported device; use cpu, cuda or cuda:1")
+        raise UserError("{source}: unsupported device; use cpu, cuda or cuda:1", source=source)
     if device.type == "cpu":
         return torch.device("cpu")
     index = _current_index() if device.index is None else device.index
     why = availability.why_unusable(index)
     if why is not None:
-        raise UserError(f"{source}: {why}; {remedy}")
+        raise UserError("{source}: {why}; {remedy}", source=source, why=why, remedy=remedy)
     return torch.device("cuda", index)
 
 

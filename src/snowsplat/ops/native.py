@@ -101,7 +101,9 @@ def launch(name: str, params: Params, *, device: torch.device | None = None) -> 
             )
     launcher = LAUNCHERS.get("cpu" if device is None else device.type)
     if launcher is None:
-        raise UserError(f"there are no kernels for device {device}; use device cpu or cuda")
+        raise UserError(
+            "there are no kernels for device {device}; use device cpu or cuda", device=device
+        )
     return launcher(name, params)
 
 

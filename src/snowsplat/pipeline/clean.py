@@ -78,7 +78,7 @@ def clean(
     """
     scene, target = Path(scene), Path(target)
     if target.exists() and not overwrite:
-        raise UserError(f"{target}: exists; use `overwrite` to replace it")
+        raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
     format_for_writing(target)
     device = (compute or Compute()).apply()
     with observer.waiting("reading"):
@@ -90,7 +90,8 @@ def clean(
         cameras = [view.camera for view in [*photos.train, *photos.test]]
     if not cameras:
         raise UserError(
-            f"{scene}: the cameras are unknown, because it is in no output folder; set `dataset`"
+            "{scene}: the cameras are unknown, because it is in no output folder; set `dataset`",
+            scene=scene,
         )
     gaussians = gaussians.to(device)
     cameras = [camera.to(device) for camera in cameras]

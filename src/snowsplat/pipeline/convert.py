@@ -32,6 +32,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import make_parent
+from snowsplat.util.messages import message
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, made_on
 
@@ -68,11 +69,15 @@ class Edits:
 
     def __post_init__(self) -> None:
         if self.sh_degree is not None and not 0 <= self.sh_degree <= 3:
-            raise SettingError("sh_degree", f"{self.sh_degree} is out of range; use 0 to 3")
+            raise SettingError(
+                "sh_degree", "{sh_degree} is out of range; use 0 to 3", sh_degree=self.sh_degree
+            )
         if not all(map(math.isfinite, (*self.rotate, *self.translate, *(self.crop or ())))):
             raise UserError("`rotate`, `translate` and `crop` need finite numbers")
         if not 0 < self.scale < math.inf:
-            raise SettingError("scale", f"{self.scale} is not a factor; use a number above 0")
+            raise SettingError(
+                "scale", "{scale} is not a factor; use a number above 0", scale=self.scale
+            )
         if self.crop and any(
             low > high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
         ):
@@ -151,17 +156,24 @@ def convert(
     """
     target, edits = Path(target), edits or Edits()
     if target.is_dir():
-        raise UserError(f"{target}: is a folder; use a file name")
+        raise UserError("{target}: is a folder; use a file name", target=target)
     if target.exists() and not overwrite:
-        raise UserError(f"{target}: exists; use `overwrite` to replace it")
+        raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
     format = format_for_writing(target)
     if spz_version is not None and format.name != "SPZ":
-        raise SettingError("spz_version", f"is for .spz files, and {target.name} is {format.name}")
+        raise SettingError(
+            "spz_version",
+            "is for .spz files, and {name} is {name2}",
+            name=target.name,
+            name2=format.name,
+        )
     if spz_version is not None and spz_version not in WRITTEN_VERSIONS:
-        raise SettingError("spz_version", f"{spz_version} cannot be written; use 2, 3 or 4")
+        raise SettingError(
+            "spz_version", "{spz_version} cannot be written; use 2, 3 or 4", spz_version=spz_version
+        )
     if georeferenced and format.name not in ("PLY", "glTF"):
         raise SettingError(
-            "georeferenced", f"{format.name} files have no doubles; write .ply or .glb"
+            "georeferenced", "{name} files have no doubles; write .ply or .glb", name=format.name
         )
     size = file_size(edits.decimate)
     if format.name == LEVELS and size is not None:
@@ -223,9 +235,17 @@ def convert(
         write_placed(target, scene)
     if any(written[0].origin) and format.name != "glTF" and not georeferenced:
         x, y, z = (f"{value:.15g}" for value in written[0].origin)
-        observer.note(f"positions are relative to the origin {x} {y} {z}, {_noted(format, target)}")
+        observer.note(
+            message(
+                "positions are relative to the origin {x} {y} {z}, {noted}",
+                x=x,
+                y=y,
+                z=z,
+                noted=_noted(format, target),
+            )
+        )
     if georeferenced and not any(written[0].origin):
-        observer.note("the scene has no origin; its positions are written as they are")
+        observer.note(message("the scene has no origin; its positions are written as they are"))
     return format
 
 

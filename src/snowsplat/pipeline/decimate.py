@@ -38,7 +38,9 @@ def gaussians_to_keep(decimate: int | str, count: int) -> int:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)%", text)
     if not match or float(match[1]) > 100:
         raise SettingError(
-            "decimate", f"{text!r} is not valid; use a number, 0% to 100%, or a size such as 10MB"
+            "decimate",
+            "{text!r} is not valid; use a number, 0% to 100%, or a size such as 10MB",
+            text=text,
         )
     return round(count * float(match[1]) / 100)
 
@@ -110,7 +112,9 @@ def write_within(
                         break
                     count = int(count * min(0.98, size / actual))
             if not count:
-                raise SettingError("decimate", f"no scene fits into {format_bytes(size)}; use more")
+                raise SettingError(
+                    "decimate", "no scene fits into {size}; use more", size=format_bytes(size)
+                )
             path.replace(temporary)
             write_place(target, read_place(path))
         finally:

@@ -65,9 +65,9 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
 
 def _check_free(out: Path) -> None:
     if out.exists() and not out.is_dir():
-        raise UserError(f"{out}: is a file; use a folder for the output")
+        raise UserError("{out}: is a file; use a folder for the output", out=out)
     if out.is_dir() and not {path.name for path in out.iterdir()} <= {PHOTOS, TRUTH, MADE}:
-        raise UserError(f"{out}: contains other files; use a new or an empty folder")
+        raise UserError("{out}: contains other files; use a new or an empty folder", out=out)
 
 
 def _take_photos(folder: Path, observer: Observer) -> Truth:

@@ -50,7 +50,7 @@ def describe(path: Path | str) -> dict[str, Any]:
     """
     path = Path(path)
     if not path.exists():
-        raise UserError(f"{path}: no such file or folder")
+        raise UserError("{path}: no such file or folder", path=path)
     if path.suffix == ".safetensors":
         return _checkpoint(path)
     path = index_in(path) or path
@@ -61,7 +61,9 @@ def describe(path: Path | str) -> dict[str, Any]:
             format = format_for_reading(path)
         except UserError as error:
             if path.suffix != ".json" and not _is_export(path):  # it may be a dataset
-                unknown = UserError(f"{error}, checkpoints, datasets, photos and videos")
+                unknown = UserError(
+                    "{error}, checkpoints, datasets, photos and videos", error=error
+                )
                 return _photos(path, unknown)
         else:
             return _scene(path, format)
@@ -139,7 +141,9 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = checkpoint_file.read(path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise UserError(
+            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
+        ) from None
     return {
         "kind": "checkpoint",
         "file": str(path),
@@ -166,7 +170,7 @@ def _output(folder: OutputFolder, made: Path | None) -> dict[str, Any]:
             values = read_json(metrics)
             facts["metrics"] = {name: v for name, v in values.items() if name != "views"}
         except (ValueError, AttributeError):
-            raise UserError(f"{metrics}: damaged; it is not JSON") from None
+            raise UserError("{metrics}: damaged; it is not JSON", metrics=metrics) from None
     if facts["scenes"]:
         facts["last_scene"] = describe(made or folder.scene_path(facts["scenes"][-1]))
     return facts

@@ -60,7 +60,11 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
     usable = source.gaussians.usable_rows()
     rows = _rows_of_page(scene, moved, usable, Path(site))
     if len(rows) != changes.count:
-        raise OtherScene(f"the page has {changes.count} Gaussians, the scene has {len(rows)}")
+        raise OtherScene(
+            "the page has {count} Gaussians, the scene has {rows}",
+            count=changes.count,
+            rows=len(rows),
+        )
     removed = np.zeros(len(source.gaussians), bool)
     bits = np.unpackbits(np.frombuffer(changes.bits(), np.uint8), bitorder="little")
     removed[rows] = bits[: len(rows)] == 1
@@ -117,7 +121,7 @@ def undo_edits(edited: Path | str) -> Path:
     edited = Path(edited)
     record = read_record(edited)
     if record is None:
-        raise UserError(f"{edited}: this scene was not edited; nothing to take back")
+        raise UserError("{edited}: this scene was not edited; nothing to take back", edited=edited)
     remove_edited(edited)
     return edited.with_name(Path(record.scene).name)
 
@@ -145,7 +149,7 @@ def _rows_of_page(scene: Path, gaussians: Gaussians, usable: Tensor, site: Path)
         step = np.ptp(expected, axis=0) / 65535
         if (np.abs(shown - expected) <= 0.51 * step + _ROUNDING * np.abs(expected)).all():
             return rows
-    raise OtherScene(f"{site}: the page did not show {scene.name}")
+    raise OtherScene("{site}: the page did not show {name}", site=site, name=scene.name)
 
 
 def _logs(means: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings
 from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
+from snowsplat.util.messages import message
 
 # With poses of a smaller share of the photos, a scene of all of them is not possible.
 _LEAST_SHARE = 0.5
@@ -33,7 +34,13 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     except UserError as error:
         reason = str(error)
     if reason:
-        observer.note(f"{name}: its camera poses are not used, but estimated again: {reason}")
+        observer.note(
+            message(
+                "{name}: its camera poses are not used, but estimated again: {reason}",
+                name=name,
+                reason=reason,
+            )
+        )
         return None
     line = f"{name}: its camera poses are used ({dataset.description})"
     folders = [str(photo.path.parent) for photo in sources.photos]
@@ -43,8 +50,14 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     observer.note(line)
     if without:
         observer.note(
-            f"{name}: {len(without)} of {len(sources.photos)} photos have no pose and are not used "
-            f"(the first is {shown(without[0].path)})"
+            message(
+                "{name}: {without} of {photos} photos have no pose and are not used (the first "
+                "is {path})",
+                name=name,
+                without=len(without),
+                photos=len(sources.photos),
+                path=shown(without[0].path),
+            )
         )
     return dataset
 

@@ -53,6 +53,7 @@ from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import read_json
 from snowsplat.util.settings import Settings, same, setting
@@ -213,7 +214,7 @@ def _check_free(out: Path) -> None:
     remove_temporaries(out, (RECORD,))
     others = any(entry.name != LOCK for entry in out.iterdir())
     if others and not (out / RECORD).is_file():
-        raise UserError(f"{out}: contains other files; use a new or an empty folder")
+        raise UserError("{out}: contains other files; use a new or an empty folder", out=out)
 
 
 @dataclass
@@ -257,8 +258,9 @@ class _Job:
         if before != inputs and not (compared or self.overwrite):
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
-                f"{self.out}: contains a scene made from {what}; use another folder, or set "
-                "`overwrite`"
+                "{out}: contains a scene made from {what}; use another folder, or set `overwrite`",
+                out=self.out,
+                what=what,
             )
         self.stages.about["inputs"] = inputs
 
@@ -272,8 +274,9 @@ class _Job:
         if given is not None and self.options.marker is not None:
             raise SettingError(
                 "marker",
-                f"is for poses that are estimated, and {posed} has its own; make it of the photos "
+                "is for poses that are estimated, and {posed} has its own; make it of the photos "
                 "alone, or scale the scene afterwards: snowsplat convert --scale-to",
+                posed=posed,
             )
         return given
 
@@ -403,7 +406,7 @@ class _Job:
         work: Callable[[], dict[str, Any]],
     ) -> Outcome:
         def on_change(reason: str) -> None:
-            self.observer.note(f"{name}: repeated ({reason})")
+            self.observer.note(message("{name}: repeated ({reason})", name=name, reason=reason))
 
         self.observer.begin(name)
         outcome = self.stages.run(name, settings, outputs, work, on_change)
@@ -493,8 +496,13 @@ class _Job:
         shortest = max(_MIN_SECONDS, _MIN_SHARE * given)
         if left < shortest:
             self.observer.note(
-                f"{duration(given)} is too short: finding the camera poses took "
-                f"{duration(self._elapsed())}; training for {duration(shortest)} anyway"
+                message(
+                    "{given} is too short: finding the camera poses took {elapsed}; training for "
+                    "{shortest} anyway",
+                    given=duration(given),
+                    elapsed=duration(self._elapsed()),
+                    shortest=duration(shortest),
+                )
             )
         return max(left, shortest) / 60.0
 

@@ -74,11 +74,15 @@ class MeshOptions:
         for name, least in (("voxel", 0.0), ("far", 0.0)):
             value = getattr(self, name)
             if value is not None and not least < value < math.inf:
-                raise UserError(f"`{name}` must be a positive number, not {value:g}")
+                raise UserError(
+                    "`{name}` must be a positive number, not {value:g}", name=name, value=value
+                )
         if not 0.0 <= self.parts <= 1.0:
-            raise UserError(f"`parts` must be between 0 and 1, not {self.parts:g}")
+            raise UserError("`parts` must be between 0 and 1, not {parts:g}", parts=self.parts)
         if self.triangles is not None and self.triangles < 4:
-            raise UserError(f"`triangles` must be at least 4, not {self.triangles}")
+            raise UserError(
+                "`triangles` must be at least 4, not {triangles}", triangles=self.triangles
+            )
         if self.triangles is not None and find_spec("fast_simplification") is None:
             raise UserError(
                 "`triangles` needs the package fast-simplification: pip install 'snowsplat[mesh]'"
@@ -162,9 +166,9 @@ def _loaded(
 def _check(target: Path, suffixes: tuple[str, ...], overwrite: bool) -> None:
     mesh_files.check_suffix(target, suffixes)
     if target.exists() and not overwrite:
-        raise UserError(f"{target}: exists; use `overwrite` to replace it")
+        raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
     if target.is_dir():
-        raise UserError(f"{target}: a folder; use the name of a file")
+        raise UserError("{target}: a folder; use the name of a file", target=target)
 
 
 def _written(target: Path, surface: Surface) -> Surface:
@@ -271,16 +275,18 @@ def _voxel(maps: Sequence[DepthMap], options: MeshOptions) -> tuple[float, np.nd
         voxel = _VOXEL_PIXELS * _usual_depth(maps) / _focal(maps)
     elif voxel < _SMALLEST_VOXEL * (pixel := _usual_depth(maps) / _focal(maps)):
         raise UserError(
-            f"`voxel` is smaller than a fifth of a pixel of the photos; use at least "
-            f"{_SMALLEST_VOXEL * pixel:.3g}"
+            "`voxel` is smaller than a fifth of a pixel of the photos; use at least {pixel:.3g}",
+            pixel=_SMALLEST_VOXEL * pixel,
         )
     keys = occupied_blocks(maps, voxel)
     limited = False
     while len(keys) > _MOST_BLOCKS:
         if options.voxel is not None:
             raise UserError(
-                f"{len(keys):,} blocks of voxels of {voxel:g} do not fit into memory; use a larger "
-                "`voxel`, or a smaller `far`"
+                "{keys:,} blocks of voxels of {voxel:g} do not fit into memory; use a larger "
+                "`voxel`, or a smaller `far`",
+                keys=len(keys),
+                voxel=voxel,
             )
         voxel *= 1.05 * math.sqrt(len(keys) / _MOST_BLOCKS)  # blocks are along surfaces
         keys, limited = occupied_blocks(maps, voxel), True

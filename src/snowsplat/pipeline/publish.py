@@ -16,6 +16,7 @@ from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import message
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import SCENE, is_site, write_one_file, write_site
 
@@ -45,7 +46,9 @@ class PublishOptions:
 
     def __post_init__(self) -> None:
         if self.url and not re.fullmatch(r"https?://[^\s\"<>?#]+", self.url):
-            raise SettingError("url", f"{self.url} is no address; use e.g. https://host/garden/")
+            raise SettingError(
+                "url", "{url} is no address; use e.g. https://host/garden/", url=self.url
+            )
 
 
 @dataclass(frozen=True)
@@ -93,13 +96,17 @@ def publish(
     with observer.waiting("reading"):
         source = load_viewable(scene, iteration)
     if not len(source.gaussians):
-        raise UserError(f"{source.file}: contains no Gaussians; there is nothing to see")
+        raise UserError("{file}: contains no Gaussians; there is nothing to see", file=source.file)
 
     url = options.url and options.url.rstrip("/") + "/"
     about = Description(options.title or scene_name(scene), options.licence, made_on(source.file))
     if any(source.gaussians.origin):
         place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
-        observer.note(f"the page does not know the place of the scene, the origin {place}")
+        observer.note(
+            message(
+                "the page does not know the place of the scene, the origin {place}", place=place
+            )
+        )
     folder.mkdir(parents=True, exist_ok=True)
     if options.for_editing:
         # A Gaussian of which only these colours are not finite is left out, too.
@@ -122,9 +129,13 @@ def _write_levels(observer: Observer, folder: Path, gaussians: Gaussians) -> str
 
 def _check_free(folder: Path, overwrite: bool) -> None:
     if not folder.is_dir():
-        raise UserError(f"{folder}: is a file; use a folder for the output")
+        raise UserError("{folder}: is a file; use a folder for the output", folder=folder)
     names = [entry.name for entry in folder.iterdir()]
     if names and not is_site(folder):
-        raise UserError(f"{folder}: contains other files; use a new or an empty folder")
+        raise UserError(
+            "{folder}: contains other files; use a new or an empty folder", folder=folder
+        )
     if names and not overwrite:
-        raise UserError(f"{folder}: already contains a web site; use `overwrite` to replace it")
+        raise UserError(
+            "{folder}: already contains a web site; use `overwrite` to replace it", folder=folder
+        )

@@ -42,6 +42,7 @@ from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 from snowsplat.util.run_lock import one_run
 from snowsplat.util.settings import Settings, setting
@@ -296,7 +297,7 @@ class _Job:
         if budget is not None and plan is not None:
             self.observer.note(budget.described(plan))
         if "sweep" in config.starts:
-            self.observer.note("computing depth maps for the initialisation")
+            self.observer.note(message("computing depth maps for the initialisation"))
         self.photos = stamps_of(dataset, settings.path)
         self.shards.of_first(Setup(settings, memory.plan.config))
         trainer = self._trainer(dataset, memory.plan.config)
@@ -331,7 +332,14 @@ class _Job:
         self.out.write_config(settings, memory.plan.config)
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations
-        self.observer.note(f"resuming from {start.path}, step {start.step} of {iterations}")
+        self.observer.note(
+            message(
+                "resuming from {path}, step {step} of {iterations}",
+                path=start.path,
+                step=start.step,
+                iterations=iterations,
+            )
+        )
         return self._run(settings, meta.recipe, trainer, budget, 1.0, memory)
 
     def _compare_photos(self, dataset: Dataset, path: str, meta: CheckpointMeta) -> None:
@@ -379,12 +387,22 @@ class _Job:
         time_ratio: float,
         memory: MemoryUse,
     ) -> TrainResult:
-        self.observer.note(f"training on {device_name(self.device)}; {memory}")
+        self.observer.note(
+            message(
+                "training on {device_name}; {memory}",
+                device_name=device_name(self.device),
+                memory=memory,
+            )
+        )
         most = _BYTES_IN_FILE * (memory.plan.limit or len(trainer.gaussians))
         if (free := shutil.disk_usage(self.out.path).free) < most:
             what = f"only {format_bytes(free)} are free on the disk"
             self.observer.note(
-                f"{what}, and the scene may need {format_bytes(most)}: free some space"
+                message(
+                    "{what}, and the scene may need {most}: free some space",
+                    what=what,
+                    most=format_bytes(most),
+                )
             )
         pace = None if budget is None else budget.pace(trainer, time_ratio)
         run = TrainingRun(
@@ -414,16 +432,19 @@ class _Job:
             return newest
         if path is None:
             raise UserError(
-                f"{out.path}: contains no complete checkpoint to resume; add the dataset to start "
-                "from step 0"
+                "{path}: contains no complete checkpoint to resume; add the dataset to start "
+                "from step 0",
+                path=out.path,
             )
         if out.scenes() or checkpoint.exists(out.checkpoints):
             what = "a scene" if out.scenes() else "checkpoints"
             raise UserError(
-                f"{out.path}: contains {what} but no complete checkpoint to resume; use "
-                "`overwrite` instead of `resume` to start from step 0"
+                "{path}: contains {what} but no complete checkpoint to resume; use `overwrite` "
+                "instead of `resume` to start from step 0",
+                path=out.path,
+                what=what,
             )
-        self.observer.note(f"{out.path}: no checkpoint yet; starting at step 0")
+        self.observer.note(message("{path}: no checkpoint yet; starting at step 0", path=out.path))
         return None
 
 
@@ -455,7 +476,9 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
     config = config_from_json(meta.training)
     if options.recipe not in (None, meta.recipe):
         raise UserError(
-            f"{start.path}: was made with the recipe {meta.recipe}; resume without `recipe`"
+            "{path}: was made with the recipe {recipe}; resume without `recipe`",
+            path=start.path,
+            recipe=meta.recipe,
         )
     resumed = changed(options.config or config, **options.settings)
     same = replace(resumed, **{name: getattr(config, name) for name in _FREE_ON_RESUME})
@@ -465,16 +488,19 @@ def _resumed_config(options: TrainOptions, start: Checkpoint, meta: CheckpointMe
     # budget has the number of the first plan, and the run may have done more steps.
     if options.iterations is not None and resumed.iterations < start.step:
         raise UserError(
-            f"{start.path}: is from step {start.step}, after `iterations` {resumed.iterations}; "
-            "use a larger number"
+            "{path}: is from step {step}, after `iterations` {iterations}; use a larger number",
+            path=start.path,
+            step=start.step,
+            iterations=resumed.iterations,
         )
     return resumed
 
 
 def _other_settings(start: Checkpoint) -> UserError:
     return UserError(
-        f"{start.path}: was made with other settings; resume without changing the training "
-        "(`iterations`, `test_iterations`, `checkpoint_every` may change)"
+        "{path}: was made with other settings; resume without changing the training "
+        "(`iterations`, `test_iterations`, `checkpoint_every` may change)",
+        path=start.path,
     )
 
 

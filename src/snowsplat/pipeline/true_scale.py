@@ -41,9 +41,13 @@ class KnownDistance:
         except ValueError as error:
             raise SettingError("scale_to", str(error)) from None
         if not all(self.between):
-            raise SettingError("scale_to", f"between what? add `between` A B, each {_EXAMPLE}")
+            raise SettingError(
+                "scale_to", "between what? add `between` A B, each {example}", example=_EXAMPLE
+            )
         if self.between[0] == self.between[1]:
-            raise SettingError("between", f"{self.between[0]} twice; use two different places")
+            raise SettingError(
+                "between", "{between} twice; use two different places", between=self.between[0]
+            )
 
     def metres_per_unit(self, scene: Path) -> float:
         """The true length of a unit of the world of ``scene``, a file.
@@ -92,8 +96,10 @@ def _photo(name: str, photos: dict[str, np.ndarray]) -> np.ndarray:
     if not photos:
         raise SettingError(
             "between",
-            f"{quoted(name)} is no point, and the photos of this file are not known; use "
-            f"{_EXAMPLE} of an output folder",
+            "{name} is no point, and the photos of this file are not known; use {example} of an "
+            "output folder",
+            name=quoted(name),
+            example=_EXAMPLE,
         )
     wanted = str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix else name
     found = photos.get(name, photos.get(wanted))
@@ -101,8 +107,11 @@ def _photo(name: str, photos: dict[str, np.ndarray]) -> np.ndarray:
         first = quoted(next(iter(photos)))
         raise SettingError(
             "between",
-            f"{quoted(name)} is neither a point nor one of {len(photos)} photos ({first} …); use "
-            f"{_EXAMPLE}",
+            "{name} is neither a point nor one of {photos} photos ({first} …); use {example}",
+            name=quoted(name),
+            photos=len(photos),
+            first=first,
+            example=_EXAMPLE,
         )
     return found
 

@@ -59,12 +59,16 @@ class VideoSize:
         match = re.fullmatch(r"(\d{1,6})(?:[xX×](\d{1,6}))?", text)
         if match is None:
             raise SettingError(
-                "size", f"{text!r} is not a size; use e.g. 1280x720, or a width, 1280"
+                "size", "{text!r} is not a size; use e.g. 1280x720, or a width, 1280", text=text
             )
         width, height = int(match[1]), int(match[2]) if match[2] else None
         if not all(_SMALLEST <= side <= _LARGEST for side in (width, height) if side is not None):
             raise SettingError(
-                "size", f"{text} is out of range; use {_SMALLEST} to {_LARGEST} pixels"
+                "size",
+                "{text} is out of range; use {smallest} to {largest} pixels",
+                text=text,
+                smallest=_SMALLEST,
+                largest=_LARGEST,
             )
         return cls(width, height)
 
@@ -88,8 +92,9 @@ def panorama_width(size: str | None) -> int:
     if width % 4 or wanted.height not in (None, width // 2):
         raise SettingError(
             "size",
-            f"{size} is no size of a 360° picture, which is twice as wide as high with a width "
+            "{size} is no size of a 360° picture, which is twice as wide as high with a width "
             "that is a multiple of 4; use e.g. 3840",
+            size=size,
         )
     return width
 
@@ -138,12 +143,17 @@ class VideoOptions:
     def __post_init__(self) -> None:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
             if not 0 < value < float("inf"):
-                raise SettingError(name, f"{value:g} is not positive; use a number above 0")
+                raise SettingError(
+                    name, "{value:g} is not positive; use a number above 0", value=value
+                )
         if self.seconds * self.fps > _MAX_FRAMES:
             raise SettingError(
                 "seconds",
-                f"{self.seconds:g} with `fps` {self.fps:g} is more than {_MAX_FRAMES:,} frames; "
-                "make the video shorter",
+                "{seconds:g} with `fps` {fps:g} is more than {max_frames:,} frames; make the "
+                "video shorter",
+                seconds=self.seconds,
+                fps=self.fps,
+                max_frames=_MAX_FRAMES,
             )
         if self.ease and self.path in CAMERA_PATHS:
             raise SettingError("ease", "is for a path through the cameras of a file; leave it out")
@@ -193,7 +203,7 @@ def render_video(
     """
     options = options or VideoOptions()
     if target is not None and Path(target).suffix.lower() != ".mp4":
-        raise UserError(f"{target}: the name of a video must end in .mp4")
+        raise UserError("{target}: the name of a video must end in .mp4", target=target)
     device = (compute or Compute()).apply()
     source = _load(Path(scene), iteration, options.name)
     gaussians = source.gaussians.to(device)
@@ -294,8 +304,9 @@ def cameras_along(
     else:
         raise SettingError(
             "path",
-            f"{path} needs the cameras of a training run; use its output folder, or ellipse or a "
+            "{path} needs the cameras of a training run; use its output folder, or ellipse or a "
             "file of cameras",
+            path=path,
         )
     width, height = size.for_camera(cameras[0])
     return [trajectory.resized(camera, width, height) for camera in cameras]

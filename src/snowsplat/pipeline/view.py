@@ -16,6 +16,7 @@ from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.viewer.http.served_file import Served
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import PAGE, is_site, site_files
@@ -76,7 +77,11 @@ def viewed_scene(
         def levels(gaussians: Gaussians) -> Path:
             target = Path(folder) / INDEX
             write_levels(target, gaussians, observer)
-            observer.note(f"to keep them: snowsplat convert {path} FOLDER/{INDEX}")
+            observer.note(
+                message(
+                    "to keep them: snowsplat convert {path} FOLDER/{index}", path=path, index=INDEX
+                )
+            )
             return target
 
         with observer.waiting("preparing"):
@@ -93,4 +98,4 @@ def _levels_in(path: Path) -> Path | None:
 
 def _check(file: Path, gaussians: Gaussians) -> None:
     if not len(gaussians):
-        raise UserError(f"{file}: contains no Gaussians; there is nothing to see")
+        raise UserError("{file}: contains no Gaussians; there is nothing to see", file=file)

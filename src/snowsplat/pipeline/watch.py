@@ -25,6 +25,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import from_json, parse_json
 from snowsplat.viewer.live.viewer import Scene
 
@@ -62,7 +63,7 @@ def watch(
     if not of_folder and compute in (None, Compute()):
         try:
             if _attached(folder.path, page, observer):
-                observer.note("the training has ended; its result follows")
+                observer.note(message("the training has ended; its result follows"))
         except KeyboardInterrupt:
             return
     data, background = load_dataset_of(folder, dataset, resolution)
@@ -93,14 +94,14 @@ def _attached(output: Path, page: LivePage, observer: Observer) -> bool:
         except OSError:  # it has ended, or runs on another computer
             return False
         with connection.makefile("rb") as replies:
-            observer.note("the training opens its page after the present step")
+            observer.note(message("the training opens its page after the present step"))
             line = replies.readline()
             if not line:
                 return True
             reply = from_json(PageReply, parse_json(line))
             if reply.error:
                 raise UserError(reply.error)
-            observer.note("closing the page does not end the training")
+            observer.note(message("closing the page does not end the training"))
             observer.page_opened(reply)
             replies.readline()
     return True
@@ -176,4 +177,4 @@ class NewestScene:
             antialiased = saved.meta.get("training", {}).get("antialias", False)
             return Gaussians(**own, antialiased=bool(antialiased), origin=self._origin)
         except (AttributeError, TypeError, ValueError):
-            raise UserError(f"{path}: not a checkpoint of a training run") from None
+            raise UserError("{path}: not a checkpoint of a training run", path=path) from None

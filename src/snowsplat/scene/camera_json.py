@@ -67,11 +67,11 @@ def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:
     try:
         entries = read_json(path)
     except FileNotFoundError:
-        raise UserError(f"{path}: no such file; use a camera list (JSON)") from None
+        raise UserError("{path}: no such file; use a camera list (JSON)", path=path) from None
     except (ValueError, OSError):
-        raise UserError(f"{path}: cannot be read as JSON; use a camera list") from None
+        raise UserError("{path}: cannot be read as JSON; use a camera list", path=path) from None
     if not isinstance(entries, list) or not entries:
-        raise UserError(f"{path}: not a camera list; expected the format of cameras.json")
+        raise UserError("{path}: not a camera list; expected the format of cameras.json", path=path)
     names, cameras = [], []
     for i, entry in enumerate(entries):
         try:
@@ -79,8 +79,10 @@ def read_cameras(path: Path) -> tuple[list[str], list[Camera]]:
             names.append(str(entry.get("img_name", i)))
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError):
             raise UserError(
-                f"{path}: camera {i} is damaged; it needs width, height, fx, fy, position and "
-                "rotation, in the format of cameras.json"
+                "{path}: camera {i} is damaged; it needs width, height, fx, fy, position and "
+                "rotation, in the format of cameras.json",
+                path=path,
+                i=i,
             ) from None
     return names, cameras
 
@@ -96,7 +98,9 @@ def read_speeds(path: Path) -> list[float]:
     for i, speed in enumerate(speeds):
         is_number = isinstance(speed, int | float) and not isinstance(speed, bool)
         if not (is_number and 1e-6 < speed < 1e6):
-            raise UserError(f"{path}: camera {i}: its speed is not between 1e-6 and 1e6; use 1")
+            raise UserError(
+                "{path}: camera {i}: its speed is not between 1e-6 and 1e6; use 1", path=path, i=i
+            )
     return speeds
 
 

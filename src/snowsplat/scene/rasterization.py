@@ -158,7 +158,9 @@ def rasterization(
         zip(poses, intrinsics, strict=True)
     ):
         if skew != 0:
-            raise UserError(f"rasterization: Ks has the skew {skew:g}; undistort the photos")
+            raise UserError(
+                "rasterization: Ks has the skew {skew:g}; undistort the photos", skew=skew
+            )
         view = View(
             *(pose[:3], width, height, fx, fy, cx, cy),
             sh_degree=0 if sh_degree is None else sh_degree,
@@ -216,20 +218,27 @@ def _refuse_unsupported(
             raise TypeError(f"rasterization: there is no argument {name}")
         only, remedy = _FIXED[name]
         if value is not only and value != only:
-            raise UserError(f"rasterization: {name} is not supported; {remedy}")
+            raise UserError(
+                "rasterization: {name} is not supported; {remedy}", name=name, remedy=remedy
+            )
     if render_mode not in _RENDER_MODES:
         what = f"render_mode={render_mode!r} is not supported; use {', '.join(_RENDER_MODES)}"
-        raise UserError(f"rasterization: {what}")
+        raise UserError("rasterization: {what}", what=what)
     if rasterize_mode not in _EPS2D:
         what = f"rasterize_mode={rasterize_mode!r} is not supported; use {' or '.join(_EPS2D)}"
-        raise UserError(f"rasterization: {what}")
+        raise UserError("rasterization: {what}", what=what)
     if eps2d != _EPS2D[rasterize_mode]:
         raise UserError(
-            f"rasterization: eps2d={eps2d:g} is not supported with rasterize_mode="
-            f"{rasterize_mode!r}; use eps2d={_EPS2D[rasterize_mode]:g}"
+            "rasterization: eps2d={eps2d:g} is not supported with "
+            "rasterize_mode={rasterize_mode!r}; use eps2d={eps2d2:g}",
+            eps2d=eps2d,
+            rasterize_mode=rasterize_mode,
+            eps2d2=_EPS2D[rasterize_mode],
         )
     if sh_degree is not None and not 0 <= sh_degree <= 3:
-        raise UserError(f"rasterization: sh_degree={sh_degree} is not supported; use 0 to 3")
+        raise UserError(
+            "rasterization: sh_degree={sh_degree} is not supported; use 0 to 3", sh_degree=sh_degree
+        )
 
 
 def _items(tensor: Tensor, dims: int) -> list[Tensor]:

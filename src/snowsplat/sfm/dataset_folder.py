@@ -47,6 +47,7 @@ from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_folder, remove_temporaries
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
@@ -157,7 +158,9 @@ def _run(
             settings,
             [folder / output for output in outputs],
             lambda: work(report),
-            lambda reason: watcher.note(f"{name}: repeated ({reason})"),
+            lambda reason: watcher.note(
+                message("{name}: repeated ({reason})", name=name, reason=reason)
+            ),
         )
         watcher.end(name, outcomes[name])
         if outcomes[name].again:
@@ -283,8 +286,9 @@ def _check_free(
         stages = Stages(record, STAGES)
         if not in_place and _were_in_place(stages.about, folder):
             raise UserError(
-                f"{folder / 'input'}: contains the original photos of this dataset, not copies; "
-                "use another folder"
+                "{folder}: contains the original photos of this dataset, not copies; use another "
+                "folder",
+                folder=folder / "input",
             )
         before = stages.about.get("inputs")
         same = before == [str(path.absolute()) for path in sources.inputs]
@@ -293,8 +297,10 @@ def _check_free(
         if not same and not overwrite:
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
-                f"{folder}: contains a dataset made from {what}; use another folder, or set "
-                "`overwrite`"
+                "{folder}: contains a dataset made from {what}; use another folder, or set "
+                "`overwrite`",
+                folder=folder,
+                what=what,
             )
         return
     allowed = {LOCK, ".new"}  # .new: left by a run that was killed in its first stage
@@ -303,8 +309,10 @@ def _check_free(
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
     if others:
         raise UserError(
-            f"{folder}: contains other files ({', '.join(others[:3])}"
-            f"{', …' if len(others) > 3 else ''}); use a new or an empty folder"
+            "{folder}: contains other files ({others}{what}); use a new or an empty folder",
+            folder=folder,
+            others=", ".join(others[:3]),
+            what=", …" if len(others) > 3 else "",
         )
 
 
@@ -344,7 +352,8 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
                 _remove(folder / name)
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
-                f"{folder}: the disk is full; free some space, then run the same command again"
+                "{folder}: the disk is full; free some space, then run the same command again",
+                folder=folder,
             ) from None
         raise
 
@@ -387,5 +396,7 @@ def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
         if not all(inside(folder / "input", photo.name) for photo in photos):
             raise ValueError("a photo outside of input/")
     except ValueError:
-        raise UserError(f"{folder / RECORD}: damaged; delete it to start again") from None
+        raise UserError(
+            "{record}: damaged; delete it to start again", record=folder / RECORD
+        ) from None
     return photos

@@ -138,8 +138,8 @@ def undistort(
     count = Counter(name for job in jobs for name, _ in job.views)
     for name in (name for name, times in count.items() if times > 1):
         raise UserError(
-            f"{dataset / 'images' / name}: is the name of a photo and of a part of one; "
-            "rename this photo"
+            "{name}: is the name of a photo and of a part of one; rename this photo",
+            name=dataset / "images" / name,
         )
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
@@ -186,8 +186,10 @@ def _views_of(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensVi
         view = pinhole_view(lens)
     except ValueError as error:
         raise UserError(
-            f"lens distortion: implausible estimate ({found}): {error}; take more photos from "
-            "different positions, or set another camera_model"
+            "lens distortion: implausible estimate ({found}): {error}; take more photos from "
+            "different positions, or set another camera_model",
+            found=found,
+            error=error,
         ) from None
     if view.cropped:
         logger.warning(
@@ -293,14 +295,23 @@ def _open_photo(path: Path, job: _Job) -> Image.Image:
     try:
         image = open_image(path, list(_SAVING))
     except FileNotFoundError:
-        raise UserError(f"{path}: missing; restore it, or run sfm again") from None
+        raise UserError("{path}: missing; restore it, or run sfm again", path=path) from None
     except Exception as error:  # Pillow may raise any exception for a damaged file
-        raise UserError(f"{path}: cannot be read ({reason_of(error)}); replace it") from None
+        raise UserError(
+            "{path}: cannot be read ({reason_of}); replace it",
+            path=path,
+            reason_of=reason_of(error),
+        ) from None
     if image.size != job.camera_size:
         image.close()
         raise UserError(
-            f"{path}: size is {image.width}x{image.height}, but its pose was estimated at "
-            f"{job.camera_size[0]}x{job.camera_size[1]}; restore the image, or run sfm again"
+            "{path}: size is {width}x{height}, but its pose was estimated at "
+            "{camera_size}x{camera_size2}; restore the image, or run sfm again",
+            path=path,
+            width=image.width,
+            height=image.height,
+            camera_size=job.camera_size[0],
+            camera_size2=job.camera_size[1],
         )
     return image
 
@@ -310,7 +321,11 @@ def _decode(opened: Image.Image, path: Path) -> Image.Image:
     try:
         return plain_pixels(opened, path)
     except Exception as error:  # as in `_open_photo`
-        raise UserError(f"{path}: cannot be decoded ({reason_of(error)}); replace it") from None
+        raise UserError(
+            "{path}: cannot be decoded ({reason_of}); replace it",
+            path=path,
+            reason_of=reason_of(error),
+        ) from None
 
 
 def _reduced(image: Image.Image, divisor: int) -> Image.Image:

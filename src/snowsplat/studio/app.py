@@ -204,7 +204,9 @@ class _Studio:
         path = str(wanted.get("path") or "").strip()
         inputs = [Path(os.path.expanduser(path))] if path else []
         if inputs and not inputs[0].is_absolute():
-            raise UserError(f"{printable(path)}: write the whole path, such as /home/me/photos")
+            raise UserError(
+                "{path}: write the whole path, such as /home/me/photos", path=printable(path)
+            )
         names = [path.name if _is_folder(path) else path.stem for path in inputs]
         title = str(wanted.get("title") or "".join(names))
         return {"name": self._library.new(title, inputs).name}
@@ -257,7 +259,9 @@ class _Studio:
         if scene.found:
             scene.inputs()  # says why not
         if scene.job.inputs:
-            raise UserError(f"the scene is made from {scene.job.inputs[0]}; add the photos there")
+            raise UserError(
+                "the scene is made from {inputs}; add the photos there", inputs=scene.job.inputs[0]
+            )
         data = await request.body()
         async with self._locks[scene.name, "upload"]:
             self._library.find(scene.name)  # it may have been removed meanwhile
@@ -271,13 +275,16 @@ class _Studio:
         wanted = await _object(request)
         quality, minutes = wanted.get("quality"), wanted.get("minutes")
         if quality is not None and quality not in _QUALITIES:
-            raise UserError(f"quality: choose from {', '.join(_QUALITIES)}")
+            raise UserError("quality: choose from {qualities}", qualities=", ".join(_QUALITIES))
         if minutes is not None and not (
             isinstance(minutes, int | float)
             and math.isfinite(minutes)
             and 0 < minutes <= _LONGEST_MINUTES
         ):
-            raise UserError(f"minutes: use a number above 0, at most {_LONGEST_MINUTES}")
+            raise UserError(
+                "minutes: use a number above 0, at most {longest_minutes}",
+                longest_minutes=_LONGEST_MINUTES,
+            )
         scene.inputs()
         if self._locks[scene.name, "edit"].locked():
             raise UserError("the scene is being changed or exported; start again in a moment")
@@ -365,7 +372,7 @@ class _Studio:
         try:
             changes = from_json(PageEdit, await _object(request))
         except ValueError as error:
-            raise UserError(f"this cannot be stored: {error}") from None
+            raise UserError("this cannot be stored: {error}", error=error) from None
         async with self._locks[scene.name, "edit"]:
             await _film_has_read(scene)
             write_json(scene.edits, asdict(changes))
@@ -519,7 +526,7 @@ async def _planned(request: Request) -> PageFilm:
     try:
         return from_json(PageFilm, await _object(request))
     except ValueError as error:
-        raise UserError(f"no such film is possible: {error}") from None
+        raise UserError("no such film is possible: {error}", error=error) from None
 
 
 async def _object(request: Request) -> dict[str, Any]:
@@ -541,7 +548,7 @@ def _whole(text: str | None) -> int:
 def _kind(request: Request) -> str:
     kind = str(request.path_params["kind"])
     if kind not in FORMATS:
-        raise UnknownScene(f"the formats are {', '.join(FORMATS)}")
+        raise UnknownScene("the formats are {formats}", formats=", ".join(FORMATS))
     return kind
 
 
@@ -563,7 +570,9 @@ def _listing(path: Path) -> dict[str, Any]:
         entries = sorted(path.iterdir(), key=lambda entry: entry.name.casefold())
     except (OSError, ValueError) as error:
         raise UserError(
-            f"{printable(str(path))}: {getattr(error, 'strerror', None) or 'no such folder'}"
+            "{path}: {getattr}",
+            path=printable(str(path)),
+            getattr=getattr(error, "strerror", None) or "no such folder",
         ) from None
     shown = [entry for entry in entries if not entry.name.startswith(".")]
     folders = [entry.name for entry in shown if _is_folder(entry)]
@@ -626,7 +635,7 @@ def _small(path: Path) -> bytes:
             small.convert("RGB").save(file, "JPEG", quality=80)
             return file.getvalue()
     except (OSError, ValueError, SyntaxError):
-        raise UserError(f"{printable(path.name)}: cannot be shown") from None
+        raise UserError("{name}: cannot be shown", name=printable(path.name)) from None
 
 
 def own_address() -> str | None:

@@ -120,7 +120,7 @@ def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
             edit(file, scene.whole if has_levels else scene.site, changes)
         except OtherScene as error:
             show_scene(scene)
-            raise UserError(f"{error}. Open the page anew, then edit it") from None
+            raise UserError("{error}. Open the page anew, then edit it", error=error) from None
     return show_scene(scene)
 
 

@@ -29,7 +29,7 @@ def start(scene: Scene, task: str = "make") -> None:
     """
     if is_running(scene, task):
         what = "this scene" if task == "make" else "a film of this scene"
-        raise UserError(f"{what} is being made already")
+        raise UserError("{what} is being made already", what=what)
     with open(scene.log(task), "wb") as log:
         _started[scene.lock(task)] = subprocess.Popen(
             [*_WORKER, task, str(scene.folder)],
@@ -71,7 +71,7 @@ def stop(scene: Scene, task: str = "make") -> None:
         os.kill(other.process, signal.SIGTERM)
     else:
         where = other.host or "another computer"
-        raise UserError(f"this scene is being made on {where}; stop it there")
+        raise UserError("this scene is being made on {where}; stop it there", where=where)
 
 
 def work(*words: str | Path) -> dict[str, Any]:
@@ -84,7 +84,9 @@ def work(*words: str | Path) -> dict[str, Any]:
     answer = _last_line(done.stdout.decode("utf-8", "replace").splitlines())
     if answer is None:
         lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
-        raise UserError(f"an unexpected fault: {lines[-1] if lines else 'the process was killed'}")
+        raise UserError(
+            "an unexpected fault: {lines}", lines=lines[-1] if lines else "the process was killed"
+        )
     if "error" in answer:
         raise UserError(answer["error"])
     return answer

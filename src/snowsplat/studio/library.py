@@ -118,7 +118,7 @@ class Scene:
         try:
             return from_json(Job, read_json(file))
         except (OSError, ValueError, KeyError, TypeError):
-            raise UserError(f"{file}: damaged; make the scene again") from None
+            raise UserError("{file}: damaged; make the scene again", file=file) from None
 
     def change(self, **changes: Any) -> Job:
         """Store changed fields of the job."""
@@ -154,7 +154,7 @@ class Scene:
         Raises: UserError: nothing was uploaded, or the command line has made the scene.
         """
         if self.found:
-            raise UserError(f"{self.folder}: made in a terminal; continue it there")
+            raise UserError("{folder}: made in a terminal; continue it there", folder=self.folder)
         given = self.job.inputs
         if given:
             return [Path(path) for path in given]
@@ -204,7 +204,8 @@ class Scene:
         """
         if self.found or self.folder.is_symlink():
             raise UserError(
-                f"{self.folder}: made in a terminal; it may have other files, so remove it there"
+                "{folder}: made in a terminal; it may have other files, so remove it there",
+                folder=self.folder,
             )
         # The job is last: until then, the scene is listed and can be removed again.
         for folder in (self.made, self.site, self.whole, self.exports):
@@ -239,7 +240,7 @@ class Library:
         """Raises UnknownScene: there is none, or this is no name."""
         folder = next((each for each in self.folder.iterdir() if each.name == name), None)
         if folder is None or not _is_scene(folder):
-            raise UnknownScene(f"{printable(name)}: there is no such scene")
+            raise UnknownScene("{name}: there is no such scene", name=printable(name))
         return Scene(folder)
 
     def new(self, title: str, inputs: list[Path]) -> Scene:
@@ -249,7 +250,7 @@ class Library:
                 os.stat(path)
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or "no such file or folder"
-                raise UserError(f"{printable(str(path))[:200]}: {why}") from None
+                raise UserError("{path}: {why}", path=printable(str(path))[:200], why=why) from None
         title = safe_title(title)
         name = safe_name(title)
         number = 1

@@ -94,7 +94,7 @@ def write_part(scene: Scene, file: Upload, data: bytes) -> int:
     """
     path, size = file.path, file.size
     if file.modified > _LATEST:
-        raise UserError(f"{path}: its time is after the year 9999")
+        raise UserError("{path}: its time is after the year 9999", path=path)
     target = scene.photos / safe_path(path)
     for other in _numbered(target):
         if not other.exists():
@@ -105,7 +105,7 @@ def write_part(scene: Scene, file: Upload, data: bytes) -> int:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError:
-        raise UserError(f"{path}: a part of its folder is a file; rename it") from None
+        raise UserError("{path}: a part of its folder is a file; rename it", path=path) from None
     part = target.with_name(f"{target.name}.{size}-{file.modified}{PART}")
     before = part.stat().st_size if part.is_file() else 0
     end = file.received + len(data)
@@ -116,8 +116,10 @@ def write_part(scene: Scene, file: Upload, data: bytes) -> int:
     free = shutil.disk_usage(target.parent).free
     if size - before + _RESERVE > free:
         raise NoSpace(
-            f"{path}: {format_bytes(size - before)} do not fit on the disk, which has "
-            f"{format_bytes(free)} left; free some space"
+            "{path}: {before} do not fit on the disk, which has {free} left; free some space",
+            path=path,
+            before=format_bytes(size - before),
+            free=format_bytes(free),
         )
     with open(part, "ab") as opened:
         opened.write(data)

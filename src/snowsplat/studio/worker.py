@@ -54,6 +54,7 @@ from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import write_text
 from snowsplat.util.interrupts import ended_by_signals
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import locked
 from snowsplat.util.safe_json import printable
 from snowsplat.util.stages import Outcome
@@ -153,7 +154,7 @@ class _Recorder(Observer):
         try:
             write_text(self._scene.map, draw(self._scene.made))
         except (UserError, OSError) as error:  # the job goes on without it
-            self.note(f"there is no map of the cameras: {error}")
+            self.note(message("there is no map of the cameras: {error}", error=error))
 
 
 def run_job(scene: Scene, task: str) -> int:

@@ -107,7 +107,9 @@ def video_writer(
     except av.FFmpegError as error:
         reason = error.strerror or str(error)
         raise UserError(
-            f"{path}: the video cannot be written ({reason}); check the free disk space"
+            "{path}: the video cannot be written ({reason}); check the free disk space",
+            path=path,
+            reason=reason,
         ) from None
 
 

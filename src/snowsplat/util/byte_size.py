@@ -16,7 +16,7 @@ def parse_bytes(text: str) -> int:
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]?)(i?)b?\s*", text.lower())
     if match is None or (match[3] and not match[2]) or float(match[1]) <= 0:
-        raise SettingError("memory", f"{text!r} is not a size; use e.g. 4GB or 800MB")
+        raise SettingError("memory", "{text!r} is not a size; use e.g. 4GB or 800MB", text=text)
     unit = _UNITS[match[2]]
     if match[3]:
         unit = 1024 ** (list(_UNITS).index(match[2]))

@@ -1,21 +1,41 @@
 """The errors that a user can fix, in one line."""
 
+from __future__ import annotations
+
+from typing import Any
+
+from snowsplat.util.messages import Message, as_message, message
+
 
 class UserError(Exception):
     """An error with a one-line message: what is wrong, and what to do.
 
+        raise UserError("{path}: is a file; use a folder", path=path)
+
     The command line prints the message and exits with status 2. Settings inside the message are in
     backquotes, "use `overwrite` to replace it"; the command line prints their flags instead.
+
+    Attributes:
+        message: the key and its values, see `Message`.
     """
 
+    def __init__(self, key: str | Message, /, **values: Any) -> None:
+        self.message = message(key, **values) if isinstance(key, str) else key
+        super().__init__(self.message)
 
-def message_of(error: OSError, cause: str | None = None) -> str:
+    def __str__(self) -> str:
+        return str(self.message)
+
+
+def message_of(error: OSError, cause: str | None = None) -> Message:
     """An error of the system in one line: the file, and what is wrong.
 
     ``cause``: what is named in place of the file.
     """
-    where = f"{cause or error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}"
+    what = as_message(error.strerror or error)
+    if not error.filename:
+        return what
+    return message("{file}: {error}", file=cause or error.filename, error=what)
 
 
 class SettingError(UserError):
@@ -27,7 +47,8 @@ class SettingError(UserError):
         problem: the rest of the message.
     """
 
-    def __init__(self, setting: str, problem: str) -> None:
-        super().__init__(f"{setting}: {problem}")
+    def __init__(self, setting: str, problem: str | Message, /, **values: Any) -> None:
         self.setting = setting
-        self.problem = problem
+        self.problem = message(problem, **values) if isinstance(problem, str) else problem
+        super().__init__(message("{setting}: {problem}", setting=setting, problem=self.problem))
+        self.args = (setting, self.problem)  # by which pickle makes the error again

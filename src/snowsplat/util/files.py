@@ -109,7 +109,9 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise UserError(
+            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
+        ) from None
 
 
 @contextlib.contextmanager
@@ -128,7 +130,9 @@ def make_parent(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
-        raise UserError(f"{path}: a part of its folder is a file; use another folder") from None
+        raise UserError(
+            "{path}: a part of its folder is a file; use another folder", path=path
+        ) from None
 
 
 def is_temporary(path: Path, names: Collection[str]) -> bool:

@@ -55,14 +55,17 @@ def _open(isa: str) -> ctypes.CDLL:
     path = _path(isa)
     if not path.exists():
         raise UserError(
-            f"the native library {path.name} is missing; in a checkout `make native` builds it, "
-            "elsewhere `pip install .` does"
+            "the native library {name} is missing; in a checkout `make native` builds it, "
+            "elsewhere `pip install .` does",
+            name=path.name,
         )
     try:
         return ctypes.CDLL(str(path))
     except OSError as error:
         raise UserError(
-            f"the native library {path} cannot be loaded ({error}); rebuild it"
+            "the native library {path} cannot be loaded ({error}); rebuild it",
+            path=path,
+            error=error,
         ) from error
 
 
@@ -80,12 +83,16 @@ def _choose() -> str:
         return available_isas()[-1]
     if forced not in ISAS:
         raise UserError(
-            f"SNOWSPLAT_ISA={forced!r} is not an instruction set; use one of {', '.join(ISAS)}"
+            "SNOWSPLAT_ISA={forced!r} is not an instruction set; use one of {isas}",
+            forced=forced,
+            isas=", ".join(ISAS),
         )
     if forced not in available_isas():
         raise UserError(
-            f"SNOWSPLAT_ISA={forced} is not supported here; this machine and this build have "
-            f"{', '.join(available_isas())}"
+            "SNOWSPLAT_ISA={forced} is not supported here; this machine and this build have "
+            "{available_isas}",
+            forced=forced,
+            available_isas=", ".join(available_isas()),
         )
     return forced
 
@@ -122,8 +129,10 @@ def check_layouts(entries: Mapping[str, type[Params]]) -> None:
 def outdated(isa: str, name: str) -> UserError:
     """The error for a library that does not match the Python files."""
     return UserError(
-        f"the native library for {isa} does not match the Python files ({name}); "
-        "rebuild it: `make native` in a checkout, `pip install .` elsewhere"
+        "the native library for {isa} does not match the Python files ({name}); rebuild it: "
+        "`make native` in a checkout, `pip install .` elsewhere",
+        isa=isa,
+        name=name,
     )
 
 
@@ -133,7 +142,7 @@ def set_num_threads(threads: int) -> None:
     Raises UserError if the number is less than 1, and as `library`.
     """
     if threads < 1:
-        raise UserError(f"the number of threads must be 1 or more, not {threads}")
+        raise UserError("the number of threads must be 1 or more, not {threads}", threads=threads)
     library()[1].set_num_threads(ctypes.c_int64(threads))
 
 
@@ -143,5 +152,7 @@ def default_threads() -> int:
     if not asked:
         return processor_count()
     if not asked.isdecimal() or int(asked) < 1:
-        raise UserError(f"SNOWSPLAT_THREADS={asked!r} is not a number of threads; use 1 or more")
+        raise UserError(
+            "SNOWSPLAT_THREADS={asked!r} is not a number of threads; use 1 or more", asked=asked
+        )
     return int(asked)

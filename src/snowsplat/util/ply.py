@@ -107,14 +107,19 @@ class PlyTable:
                 values = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
         except ValueError:
             raise UserError(
-                f"{self.path}: a row of the PLY file is not {len(self.columns)} numbers"
+                "{path}: a row of the PLY file is not {columns} numbers",
+                path=self.path,
+                columns=len(self.columns),
             ) from None
         if len(values) < count:
             raise _truncated(self.path)
         if values.shape[1] != len(self.columns):
             raise UserError(
-                f"{self.path}: the PLY file has {values.shape[1]} numbers per row, but its header "
-                f"declares {len(self.columns)}"
+                "{path}: the PLY file has {shape} numbers per row, but its header declares "
+                "{columns}",
+                path=self.path,
+                shape=values.shape[1],
+                columns=len(self.columns),
             )
         rows = np.empty(count, dtype)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -125,12 +130,16 @@ class PlyTable:
     def _line(self, file: BinaryIO, limit: int) -> bytes:
         line = file.readline(limit)
         if len(line) == limit:
-            raise UserError(f"{self.path}: a row of the PLY file is too long; export it again")
+            raise UserError(
+                "{path}: a row of the PLY file is too long; export it again", path=self.path
+            )
         return line
 
 
 def _truncated(path: Path) -> UserError:
-    return UserError(f"{path}: the PLY file ends before its last row; copy or export it again")
+    return UserError(
+        "{path}: the PLY file ends before its last row; copy or export it again", path=path
+    )
 
 
 def _open(path: Path, data: bytes | None) -> BinaryIO:
@@ -156,20 +165,29 @@ def open_table(path: Path | str, element: str = "vertex", data: bytes | None = N
     names = [e.name for e in elements]
     if names.count(element) != 1:
         raise UserError(
-            f"{path}: the PLY file has {names.count(element)} '{element}' elements, not one"
+            "{path}: the PLY file has {count} '{element}' elements, not one",
+            path=path,
+            count=names.count(element),
+            element=element,
         )
     position = names.index(element)
     before, wanted = elements[:position], elements[position]
     if wanted.has_list:
-        raise UserError(f"{path}: the PLY file has a list property in its '{element}' element")
+        raise UserError(
+            "{path}: the PLY file has a list property in its '{element}' element",
+            path=path,
+            element=element,
+        )
     if format == "ascii":
         # A number and its separator have at least two bytes. The last separator may be missing.
         needed = sum(e.count for e in before) + 2 * wanted.count * len(wanted.properties) - 1
     else:
         if any(e.has_list and e.count for e in before):
             raise UserError(
-                f"{path}: the PLY file has a list element before '{element}'; "
-                f"save it again with '{element}' first"
+                "{path}: the PLY file has a list element before '{element}'; save it again with "
+                "'{element}' first",
+                path=path,
+                element=element,
             )
         needed = sum(e.count * e.row_bytes for e in [*before, wanted])
     if wanted.count and needed > size - data_start:
@@ -182,7 +200,7 @@ def open_table(path: Path | str, element: str = "vertex", data: bytes | None = N
 def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:
     """The words of each header line. The file position is then after the line ``end_header``."""
     if file.readline(16).rstrip(b"\r\n") != b"ply":
-        raise UserError(f"{path}: not a PLY file (its first line must be 'ply')")
+        raise UserError("{path}: not a PLY file (its first line must be 'ply')", path=path)
     lines: list[list[str]] = []
     while file.tell() < _HEADER_LIMIT:
         line = file.readline(4096)
@@ -193,7 +211,7 @@ def _header_lines(path: Path, file: BinaryIO) -> list[list[str]]:
             return lines
         if words:
             lines.append(words)
-    raise UserError(f"{path}: the PLY header has no end; the file is damaged")
+    raise UserError("{path}: the PLY header has no end; the file is damaged", path=path)
 
 
 def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Element]]:
@@ -219,13 +237,19 @@ def _parse_header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Elemen
                 elements[-1].has_list = True
             case ["property", kind, name] if elements and kind in _SCALARS:
                 if name in elements[-1].properties:
-                    raise UserError(f"{path}: the PLY header declares the property '{name}' twice")
+                    raise UserError(
+                        "{path}: the PLY header declares the property '{name}' twice",
+                        path=path,
+                        name=name,
+                    )
                 elements[-1].properties[name] = _SCALARS[kind]
             case _:
                 shown = " ".join(words)[:60]
-                raise UserError(f"{path}: the PLY header has an invalid line: {shown!r}")
+                raise UserError(
+                    "{path}: the PLY header has an invalid line: {shown!r}", path=path, shown=shown
+                )
     if format is None:
-        raise UserError(f"{path}: the PLY header has no format line")
+        raise UserError("{path}: the PLY header has no format line", path=path)
     return format, elements
 
 

@@ -81,7 +81,7 @@ def one_run(folder: Path, wait: float = _WAIT_SECONDS) -> Iterator[None]:
     """
     while True:
         if folder.exists() and not folder.is_dir():
-            raise UserError(f"{folder}: is a file; use a folder")
+            raise UserError("{folder}: is a file; use a folder", folder=folder)
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -165,7 +165,7 @@ def _acquired(file: Path, what: str, wait: float) -> int:
 
 def _in_use(what: str, file: Path) -> InUse:
     advice = "wait until it ends, stop it, or use another folder"
-    return InUse(f"{what} {holder(file)}; {advice}")
+    return InUse("{what} {holder}; {advice}", what=what, holder=holder(file), advice=advice)
 
 
 def _try(file: Path) -> tuple[int, bool] | None:

@@ -137,7 +137,9 @@ def checked(name: str, value: Any, hint: Any, declared: Setting = _UNDECLARED) -
     if problem is None:
         return value
     advice = "" if "; " in problem else f"; use {allowed(hint, declared)}"
-    raise SettingError(name, f"{shown(value)} {problem}{advice}")
+    raise SettingError(
+        name, "{value} {problem}{advice}", value=shown(value), problem=problem, advice=advice
+    )
 
 
 def shown(value: Any) -> str:

@@ -67,7 +67,9 @@ class Stages:
                 content.pop("snowsplat")
                 self.about = content
             except (ValueError, KeyError, TypeError, AttributeError):
-                raise UserError(f"{file}: damaged; delete it to start from the beginning") from None
+                raise UserError(
+                    "{file}: damaged; delete it to start from the beginning", file=file
+                ) from None
 
     def run(
         self,

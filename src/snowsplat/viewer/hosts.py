@@ -108,8 +108,9 @@ def _valid(allowed: str) -> str:
     if not name:
         raise SettingError(
             "allow_host",
-            f"{allowed!r} is not a host name; use that of the address in the browser, without "
+            "{allowed!r} is not a host name; use that of the address in the browser, without "
             "https:// and path",
+            allowed=allowed,
         )
     return name
 

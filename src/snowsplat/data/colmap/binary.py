@@ -108,8 +108,10 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         camera_id, number, width, height = cursor.take(_CAMERA_HEAD)
         if not 0 <= number < len(CAMERA_MODELS):
             raise UserError(
-                f"{path}: unknown camera model {number}; undistort the images with the program "
-                "that made it, or copy the file again if it is damaged"
+                "{path}: unknown camera model {number}; undistort the images with the program "
+                "that made it, or copy the file again if it is damaged",
+                path=path,
+                number=number,
             )
         model, count = CAMERA_MODELS[number]
         params = cursor.take(struct.Struct(f"<{count}d"))

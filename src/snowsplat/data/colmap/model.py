@@ -57,7 +57,9 @@ def read_model(folder: Path) -> ColmapModel:
     """
     is_text = model_is_text(folder)
     if is_text is None:
-        raise UserError(f"{folder}: no COLMAP model here (cameras and images, .bin or .txt)")
+        raise UserError(
+            "{folder}: no COLMAP model here (cameras and images, .bin or .txt)", folder=folder
+        )
     files, suffix = _FILES[is_text]
     cameras = files.read_cameras(folder / f"cameras{suffix}")
     images = files.read_images(folder / f"images{suffix}")

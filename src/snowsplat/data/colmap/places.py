@@ -59,7 +59,11 @@ def find_models_below(root: Path, images: str) -> list[Path]:
         len(parts) == 1 and all(p.name.isdecimal() for p in workspaces)
     ):
         names = ", ".join(quoted(p.relative_to(root).as_posix()) for p in workspaces[:3])
-        raise UserError(f"{root}: has several datasets ({names}, …); use one of these folders")
+        raise UserError(
+            "{root}: has several datasets ({names}, …); use one of these folders",
+            root=root,
+            names=names,
+        )
     return _largest_first(models)
 
 

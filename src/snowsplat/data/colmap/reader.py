@@ -50,7 +50,7 @@ def read_colmap(
         _warn_of_other_models(root, models)
     model = read_model(folder)
     if not model.images:
-        raise UserError(f"{folder}: the COLMAP model has no images; run COLMAP again")
+        raise UserError("{folder}: the COLMAP model has no images; run COLMAP again", folder=folder)
     posed, names = _images_on_disk(workspace_of(folder, root, images), images, model)
     points = points_with_tracks(model, names)
     ply = folder / "points3D.ply"
@@ -125,13 +125,22 @@ def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
     if not folder.is_dir():
         found = sorted(p.name for p in root.iterdir() if p.is_dir())
         existing = f" (existing folders: {', '.join(found)})" if found else ""
-        return SettingError("images", f"no such folder: {folder}; use the right one{existing}")
+        return SettingError(
+            "images",
+            "no such folder: {folder}; use the right one{existing}",
+            folder=folder,
+            existing=existing,
+        )
     names = photos_below(folder)
     instead = f"; it has {len(names)} others, e.g. {quoted(names[0])}" if names else ""
     return SettingError(
         "images",
-        f"{folder} has none of the {len(model.images)} images of the model (the first is {first})"
-        f"{instead}; use the right folder",
+        "{folder} has none of the {images} images of the model (the first is {first}){instead}; "
+        "use the right folder",
+        folder=folder,
+        images=len(model.images),
+        first=first,
+        instead=instead,
     )
 
 
@@ -143,20 +152,28 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
     colmap = model.cameras.get(image.camera_id)
     if colmap is None:
         raise UserError(
-            f"{model.folder}: image {image.name[:80]} has camera {image.camera_id}, which the "
-            "model does not contain; copy the model again"
+            "{folder}: image {name} has camera {camera_id}, which the model does not contain; "
+            "copy the model again",
+            folder=model.folder,
+            name=image.name[:80],
+            camera_id=image.camera_id,
         )
     fx, fy, cx, cy, _ = intrinsics(lens_of(colmap))
     numbers = (fx, fy, cx, cy, *colmap.params)
     if min(fx, fy) <= 0 or not all(abs(number) < 1e9 for number in numbers):
         raise UserError(
-            f"{model.folder}: the intrinsics of a camera are damaged ({colmap.model} "
-            f"{' '.join(map(str, colmap.params))}); copy the model again"
+            "{folder}: the intrinsics of a camera are damaged ({model} {str}); copy the model "
+            "again",
+            folder=model.folder,
+            model=colmap.model,
+            str=" ".join(map(str, colmap.params)),
         )
     quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
     if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
         raise UserError(
-            f"{model.folder}: the pose of image {image.name[:80]} is damaged; copy the model again"
+            "{folder}: the pose of image {name} is damaged; copy the model again",
+            folder=model.folder,
+            name=image.name[:80],
         )
     rotation = rotation_from_quat(quat)
     # COLMAP and its scripts compute R and t = −R C from a quaternion as it is, without dividing by

@@ -92,8 +92,10 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             raise damaged(path, f"not a camera: line {shown(line[:60])!r}") from None
         if model not in counts:
             raise UserError(
-                f"{path}: unknown camera model {shown(model[:40])!r}; undistort the images with "
-                "the program that made it"
+                "{path}: unknown camera model {model!r}; undistort the images with the program "
+                "that made it",
+                path=path,
+                model=shown(model[:40]),
             )
         if len(params) != counts[model]:
             raise damaged(path, f"{len(params)} parameters for camera model {model[:40]}")

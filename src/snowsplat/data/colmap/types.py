@@ -96,13 +96,22 @@ def lens_of(camera: ColmapCamera) -> LensModel:
 
 def damaged(path: Path, problem: str) -> UserError:
     """The error for a file that does not follow the format."""
-    return UserError(f"{path}: damaged: {problem}; copy the file again or run COLMAP again")
+    return UserError(
+        "{path}: damaged: {problem}; copy the file again or run COLMAP again",
+        path=path,
+        problem=problem,
+    )
 
 
 def check_count(path: Path, kind: str, count: int) -> None:
     """Raise `UserError` if a file has too many cameras or images."""
     if count > _MAX_RECORDS:
-        raise UserError(f"{path}: more than {_MAX_RECORDS:,} {kind}, which is not supported")
+        raise UserError(
+            "{path}: more than {max_records:,} {kind}, which is not supported",
+            path=path,
+            max_records=_MAX_RECORDS,
+            kind=kind,
+        )
 
 
 def checked_camera(path: Path, model: str, width: int, height: int, params: tuple) -> ColmapCamera:

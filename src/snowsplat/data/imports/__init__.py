@@ -154,13 +154,20 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
         if not found.missing:
             none = f"none of its {found.total} photos is aligned" if found.total else "no photos"
             raise UserError(
-                f"{cameras}: {none}; align them in {program}, "
-                "or estimate the poses: snowsplat sfm PHOTOS -o DATASET"
+                "{cameras}: {none}; align them in {program}, or estimate the poses: snowsplat "
+                "sfm PHOTOS -o DATASET",
+                cameras=cameras,
+                none=none,
+                program=program,
             )
         raise UserError(
-            f"{cameras}: none of its {len(found.missing)} photos (the first is "
-            f"{quoted(found.missing[0])}) is in {folder.root}; copy them to "
-            f"{folder.root / 'images'}"
+            "{cameras}: none of its {missing} photos (the first is {missing2}) is in {root}; "
+            "copy them to {root2}",
+            cameras=cameras,
+            missing=len(found.missing),
+            missing2=quoted(found.missing[0]),
+            root=folder.root,
+            root2=folder.root / "images",
         )
     aligned = len(found.missing) + len(found.shots)
     warn_of_missing(cameras, found.missing, aligned, "photos")

@@ -90,8 +90,10 @@ def _lens(where: str, camera: dict[str, Any], version: tuple[float, ...]) -> Len
         kind = str(camera.get("distortionType", kind)).lower()
     if kind not in _COUNTS:
         raise UserError(
-            f"{where}: the camera model {quoted(kind)} is not supported; export the scene as a "
-            "COLMAP model (the node ExportColmap of Meshroom)"
+            "{where}: the camera model {kind} is not supported; export the scene as a COLMAP "
+            "model (the node ExportColmap of Meshroom)",
+            where=where,
+            kind=quoted(kind),
         )
     width, height = number(where, camera, "width"), number(where, camera, "height")
     if "pxFocalLength" in camera:

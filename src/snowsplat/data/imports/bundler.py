@@ -71,6 +71,8 @@ def _names(path: Path, root: Path, count: int) -> list[str]:
         if len(names) == count and all("." in name[-6:] for name in names):
             return names
     raise UserError(
-        f"{path}: no list of its {count} photos beside it (list.txt, or .lst of RealityScan); add "
-        "the list that was exported with it"
+        "{path}: no list of its {count} photos beside it (list.txt, or .lst of RealityScan); add "
+        "the list that was exported with it",
+        path=path,
+        count=count,
     )

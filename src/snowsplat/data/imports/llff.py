@@ -38,8 +38,12 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     files = photos.sorted_files()
     if len(files) != len(rows):
         raise UserError(
-            f"{path}: has {len(rows)} poses, but there are {len(files)} photos in "
-            f"{photos.root}; use exactly the photos that the poses were estimated from"
+            "{path}: has {rows} poses, but there are {files} photos in {root}; use exactly the "
+            "photos that the poses were estimated from",
+            path=path,
+            rows=len(rows),
+            files=len(files),
+            root=photos.root,
         )
     found = Reconstruction(total=len(rows))
     for index, (file, row) in enumerate(zip(files, rows, strict=True)):

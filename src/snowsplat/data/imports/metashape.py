@@ -181,8 +181,10 @@ def _lens(where: str, sensor: Element) -> LensModel:
     size = size if own is None else own
     if kind not in _KINDS or size is None:
         raise UserError(
-            f"{where}: the camera type {quoted(kind)} is not supported; export undistorted photos "
-            "and a COLMAP model from Metashape"
+            "{where}: the camera type {kind} is not supported; export undistorted photos and a "
+            "COLMAP model from Metashape",
+            where=where,
+            kind=quoted(kind),
         )
     width, height = _size(where, size)
     values = {element.tag: element.text for element in calibration if element.text}

@@ -108,8 +108,10 @@ def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, LensModel]:
 def _lens(where: str, kind: str, data: dict[str, Any]) -> LensModel:
     if kind not in _DISTORTION:
         raise UserError(
-            f"{where}: the camera model {quoted(kind)} is not supported; export the scene with "
-            "openMVG_main_openMVG2Colmap"
+            "{where}: the camera model {kind} is not supported; export the scene with "
+            "openMVG_main_openMVG2Colmap",
+            where=where,
+            kind=quoted(kind),
         )
     # Some versions nest the fields of the base class.
     while isinstance(data.get("value0"), dict):

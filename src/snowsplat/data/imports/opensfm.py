@@ -106,8 +106,10 @@ def _lens(where: str, camera: dict[str, Any]) -> LensModel:
         return equirectangular(where, width, height)
     if kind not in _PERSPECTIVE + _FISHEYE:
         raise UserError(
-            f"{where}: the camera model {quoted(kind)} is not supported; run opensfm "
-            "export_colmap, or opensfm undistort"
+            "{where}: the camera model {kind} is not supported; run opensfm export_colmap, or "
+            "opensfm undistort",
+            where=where,
+            kind=quoted(kind),
         )
 
     def value(key: str, default: float | None = 0.0) -> float:

@@ -46,8 +46,10 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     columns = _columns(lines[first])
     if not set(columns) >= _NEEDED:
         raise UserError(
-            f"{path}: has no column {sorted(_NEEDED - set(columns))[0]}; export the alignment as "
-            "Internal/External camera parameters"
+            "{path}: has no column {set}; export the alignment as Internal/External camera "
+            "parameters",
+            path=path,
+            set=sorted(_NEEDED - set(columns))[0],
         )
     found = Reconstruction()
     division = True
@@ -110,6 +112,7 @@ def _warn(path: Path, found: Reconstruction, division: bool) -> None:
     degrees = (np.abs(centres[:, :2]) <= (180.0, 90.0)).all() and across < 0.1
     if degrees and across < 0.01 * up:
         raise UserError(
-            f"{path}: the positions are longitude and latitude; export the cameras in the "
-            "coordinate system Local Euclidean"
+            "{path}: the positions are longitude and latitude; export the cameras in the "
+            "coordinate system Local Euclidean",
+            path=path,
         )

@@ -36,7 +36,9 @@ class PhotoFolder:
         self.root = root
         self._preferred = images
         if images != "images" and not (root / images).is_dir():
-            raise SettingError("images", f"no such folder: {root / images}; use the right one")
+            raise SettingError(
+                "images", "no such folder: {images}; use the right one", images=root / images
+            )
         self._only = images != "images"
         self._by_name: dict[str, list[str]] | None = None
 
@@ -78,8 +80,12 @@ class PhotoFolder:
         found = sorted(found, key=common, reverse=True)
         if common(found[0]) == common(found[1]):
             raise UserError(
-                f"{self.root}: has several photos named {quoted(PurePosixPath(name).name)} "
-                f"({found[0]}, {found[1]}); keep only the right ones in its folder images"
+                "{root}: has several photos named {name} ({found}, {found2}); keep only the "
+                "right ones in its folder images",
+                root=self.root,
+                name=quoted(PurePosixPath(name).name),
+                found=found[0],
+                found2=found[1],
             )
         return found[0]
 

@@ -61,8 +61,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras. Depth maps of .r3d files are not readable."""
     if path.suffix.lower() == _PACKED:
         raise UserError(
-            f"{path}: is packed; unpack it as a zip archive, or export EXR + RGB from Record3D, "
-            "and use the folder"
+            "{path}: is packed; unpack it as a zip archive, or export EXR + RGB from Record3D, "
+            "and use the folder",
+            path=path,
         )
     values = table(path, load_json(path))
     poses = values.get("poses")
@@ -116,8 +117,12 @@ def _frames(path: Path, images: Path, count: int) -> dict[int, Path]:
         return numbered
     if len(files) != count:
         raise UserError(
-            f"{path}: has {count} poses, but there are {len(files)} photos in {images}, which are "
-            "not named 0.jpg, 1.jpg …; use the photos as Record3D has named them"
+            "{path}: has {count} poses, but there are {files} photos in {images}, which are not "
+            "named 0.jpg, 1.jpg …; use the photos as Record3D has named them",
+            path=path,
+            count=count,
+            files=len(files),
+            images=images,
         )
     return dict(enumerate(files))
 

@@ -29,7 +29,7 @@ _MOST_SIDE = 1_000_000
 
 def damaged(where: object, problem: str) -> UserError:
     """The error for a file that does not follow its format."""
-    return UserError(f"{where}: {problem}; export the file again")
+    return UserError("{where}: {problem}; export the file again", where=where, problem=problem)
 
 
 def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
@@ -44,7 +44,9 @@ def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
             return read_json(path, ratio)
     except ValueError as error:  # not JSON, or not even text
         raise UserError(
-            f"{path}: not a complete JSON file ({str(error)[:80]}); copy it again"
+            "{path}: not a complete JSON file ({error}); copy it again",
+            path=path,
+            error=str(error)[:80],
         ) from None
 
 
@@ -185,5 +187,5 @@ def from_opengl(where: object, world_from_cam: np.ndarray) -> np.ndarray:
 def _load_bytes(path: Path) -> bytes:
     with reading(path):
         if path.stat().st_size > _MOST_BYTES:
-            raise UserError(f"{path}: larger than 1 GiB, which is not supported")
+            raise UserError("{path}: larger than 1 GiB, which is not supported", path=path)
         return path.read_bytes()

@@ -13,6 +13,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 
 @dataclass
@@ -73,6 +74,17 @@ class Globe(Reports):
             )
         size = format_bytes(result.page.stat().st_size)
         self.report = result
-        print(f"{result.page}: {result.gaussians:,} Gaussians, {size}")
-        print(f"to see it: open {result.page} in a browser; to share it: send this file")
+        print(
+            message(
+                "{page}: {gaussians:,} Gaussians, {size}",
+                page=result.page,
+                gaussians=result.gaussians,
+                size=size,
+            )
+        )
+        print(
+            message(
+                "to see it: open {page} in a browser; to share it: send this file", page=result.page
+            )
+        )
         return 0

@@ -52,7 +52,7 @@ class GlobeOptions:
             problem = f"{len(self.name)} letters are too many; use at most {_LONGEST_NAME}"
             raise SettingError("name", problem)
         if not _FPS[0] <= self.fps <= _FPS[1]:
-            raise SettingError("fps", f"{self.fps:g} is out of range; use 1 to 120")
+            raise SettingError("fps", "{fps:g} is out of range; use 1 to 120", fps=self.fps)
         VideoSize.parse(self.size)
 
     @property
@@ -106,9 +106,9 @@ def make_globe(
     default = scene / "globe.html" if scene.is_dir() else beside
     target = default if page is None else Path(page)
     if target.suffix.lower() != ".html":
-        raise UserError(f"{target}: the name of the page must end in .html")
+        raise UserError("{target}: the name of the page must end in .html", target=target)
     if video is not None and Path(video).suffix.lower() != ".mp4":
-        raise UserError(f"{video}: the name of a video must end in .mp4")
+        raise UserError("{video}: the name of a video must end in .mp4", video=video)
     Compute("cpu", threads).apply()
     with observer.waiting("reading"):
         source = load_viewable(scene, iteration)

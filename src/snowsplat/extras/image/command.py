@@ -14,6 +14,7 @@ from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 _COMPACT = ".gimg"
 
@@ -91,23 +92,44 @@ class Image(Reports):
             "bits_per_pixel": result.bits_per_pixel,
         }
         print(
-            f"{result.output}: {end.gaussians:,} Gaussians, PSNR {end.psnr:.2f} dB, "
-            f"SSIM {end.ssim:.4f}, {end.step:,} steps in {duration(end.seconds)}"
+            message(
+                "{output}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB, SSIM {ssim:.4f}, "
+                "{step:,} steps in {seconds}",
+                output=result.output,
+                gaussians=end.gaussians,
+                psnr=end.psnr,
+                ssim=end.ssim,
+                step=end.step,
+                seconds=duration(end.seconds),
+            )
         )
         print(
-            f"{result.output / 'image.gimg'}: {format_bytes(result.file_bytes)}, "
-            f"{result.bits_per_pixel:.2f} bits per pixel, PSNR {result.file_psnr:.2f} dB"
+            message(
+                "{output}: {file_bytes}, {bits_per_pixel:.2f} bits per pixel, PSNR "
+                "{file_psnr:.2f} dB",
+                output=result.output / "image.gimg",
+                file_bytes=format_bytes(result.file_bytes),
+                bits_per_pixel=result.bits_per_pixel,
+                file_psnr=result.file_psnr,
+            )
         )
-        print(f"to see it: open {result.output / 'report.html'} in a browser")
+        print(
+            message("to see it: open {output} in a browser", output=result.output / "report.html")
+        )
         return 0
 
     def _decode(self, compact: Path, target: Path) -> int:
         if target.suffix.lower() != ".png":
             raise UserError(
-                f"{target}: the image of a compact file is written as PNG; use -o FILE.png"
+                "{target}: the image of a compact file is written as PNG; use -o FILE.png",
+                target=target,
             )
         from snowsplat.extras.image.fit_image import decode_image
 
         width, height = decode_image(compact, target, self.size)
-        print(f"{target}: {width} × {height} pixels")
+        print(
+            message(
+                "{target}: {width} × {height} pixels", target=target, width=width, height=height
+            )
+        )
         return 0

@@ -69,11 +69,15 @@ def read_compact(path: Path) -> ImageGaussians:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+        raise UserError(
+            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror
+        ) from None
     try:
         return decode(data)
     except ValueError as error:
-        raise UserError(f"{path}: {error}; write it again with snowsplat image") from None
+        raise UserError(
+            "{path}: {error}; write it again with snowsplat image", path=path, error=error
+        ) from None
 
 
 def encode(gaussians: ImageGaussians) -> bytes:

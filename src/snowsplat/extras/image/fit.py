@@ -72,7 +72,7 @@ class FitOptions:
             problem = f"{self.gaussians} is out of range; use 1 to {MOST_GAUSSIANS}"
             raise SettingError("gaussians", problem)
         if self.steps < 1:
-            raise SettingError("steps", f"{self.steps} is too small; use at least 1")
+            raise SettingError("steps", "{steps} is too small; use at least 1", steps=self.steps)
 
 
 class Fitter:

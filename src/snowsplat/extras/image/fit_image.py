@@ -94,9 +94,11 @@ def fit_image(
     options, photo, output = options or FitOptions(), Path(photo), Path(output)
     _check_size(size)
     if output.exists() and not output.is_dir():
-        raise UserError(f"{output}: is a file; use a folder for the output")
+        raise UserError("{output}: is a file; use a folder for the output", output=output)
     if (output / "metrics.json").exists() and not overwrite:
-        raise UserError(f"{output}: contains an earlier fit; use `overwrite` to replace it")
+        raise UserError(
+            "{output}: contains an earlier fit; use `overwrite` to replace it", output=output
+        )
     target = load_photo(photo, size)
     Compute("cpu", threads).apply()
     output.mkdir(parents=True, exist_ok=True)
@@ -165,7 +167,13 @@ def decode_image(
 def _check_size(size: int) -> None:
     least, most = _SIDES
     if not least <= size <= most:
-        raise SettingError("size", f"{size} is out of range; use {least} to {most} pixels")
+        raise SettingError(
+            "size",
+            "{size} is out of range; use {least} to {most} pixels",
+            size=size,
+            least=least,
+            most=most,
+        )
 
 
 def load_photo(photo: Path, size: int) -> Tensor:

@@ -14,6 +14,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.reports import JsonFlag, Reports
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 
 @dataclass
@@ -113,21 +114,51 @@ class Lift(Reports):
         if result.alignment is not None:
             fit = result.alignment
             print(
-                f"depth aligned to {fit.points:,} points: median error {100 * fit.error:.1f}%"
-                " of the disparity"
+                message(
+                    "depth aligned to {points:,} points: median error {error:.1f}% of the "
+                    "disparity",
+                    points=fit.points,
+                    error=100 * fit.error,
+                )
             )
         pixels, where = result.focal
         hint = "; set it with --focal" if where == "assumed" else ""
-        print(f"focal length: {pixels:.0f} pixels, {where}{hint}")
-        print(f"depth ({source.values_are}): {result.depths[0]:.3g} to {result.depths[1]:.3g}")
         print(
-            f"{result.scene}: {result.gaussians:,} Gaussians, PSNR {result.psnr:.2f} dB at the "
-            f"pose of the photo, {duration(result.seconds)}"
+            message(
+                "focal length: {pixels:.0f} pixels, {where}{hint}",
+                pixels=pixels,
+                where=where,
+                hint=hint,
+            )
+        )
+        print(
+            message(
+                "depth ({values_are}): {depths:.3g} to {depths2:.3g}",
+                values_are=source.values_are,
+                depths=result.depths[0],
+                depths2=result.depths[1],
+            )
+        )
+        print(
+            message(
+                "{scene}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB at the pose of the photo, "
+                "{seconds}",
+                scene=result.scene,
+                gaussians=result.gaussians,
+                psnr=result.psnr,
+                seconds=duration(result.seconds),
+            )
         )
         if result.evaluation is not None and result.evaluation.views:
             evaluation = result.evaluation
-            print(f"held-out photos of {evaluation.size}: PSNR {evaluation.psnr:.2f} dB")
+            print(
+                message(
+                    "held-out photos of {size}: PSNR {psnr:.2f} dB",
+                    size=evaluation.size,
+                    psnr=evaluation.psnr,
+                )
+            )
         if result.swing is not None:
-            print(f"{result.swing}: the video")
+            print(message("{swing}: the video", swing=result.swing))
         print(see_and_share(self.output))
         return 0

@@ -36,18 +36,21 @@ def estimate_depth(model: Path, photo: Tensor) -> np.ndarray:
         values = _run_transformers(model, photo)
     elif not model.is_file():
         raise UserError(
-            f"{model}: no such model; give an ONNX file or a folder of transformers. snowsplat "
-            "does not download models"
+            "{model}: no such model; give an ONNX file or a folder of transformers. snowsplat "
+            "does not download models",
+            model=model,
         )
     elif model.suffix.lower() == ".onnx":
         values = _run_onnx(model, photo)
     else:
-        raise UserError(f"{model}: unknown kind of model; use a .onnx file or a folder")
+        raise UserError("{model}: unknown kind of model; use a .onnx file or a folder", model=model)
     values = np.squeeze(np.asarray(values, np.float32))
     if values.ndim != 2:
         raise UserError(
-            f"{model}: its output has the shape {values.shape}; use a model that predicts one "
-            "value per pixel"
+            "{model}: its output has the shape {shape}; use a model that predicts one value per "
+            "pixel",
+            model=model,
+            shape=values.shape,
         )
     return values
 
@@ -57,7 +60,8 @@ def _run_onnx(model: Path, photo: Tensor) -> Any:
         import onnxruntime
     except ImportError:
         raise UserError(
-            f"{model}: running an ONNX model needs a package; run pip install onnxruntime"
+            "{model}: running an ONNX model needs a package; run pip install onnxruntime",
+            model=model,
         ) from None
     onnxruntime.set_default_logger_severity(3)  # errors only; they are raised as well
     try:
@@ -90,7 +94,7 @@ def _run_transformers(model: Path, photo: Tensor) -> Any:
         from transformers import AutoImageProcessor, AutoModelForDepthEstimation
     except ImportError:
         what = "this model needs a package; run pip install transformers"
-        raise UserError(f"{model}: {what}") from None
+        raise UserError("{model}: {what}", model=model, what=what) from None
     try:
         # Only files of this folder are read, and no code in it is executed.
         processor = AutoImageProcessor.from_pretrained(model, local_files_only=True)
@@ -107,4 +111,6 @@ def _run_transformers(model: Path, photo: Tensor) -> Any:
 
 def _failed(model: Path, error: Exception) -> UserError:
     reason = " ".join(str(error).split())[:160] or type(error).__name__
-    return UserError(f"{model}: the model cannot be used ({reason}); use another file")
+    return UserError(
+        "{model}: the model cannot be used ({reason}); use another file", model=model, reason=reason
+    )

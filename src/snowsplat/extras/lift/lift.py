@@ -39,10 +39,14 @@ class LiftOptions:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.edge < math.inf:
-            raise SettingError("edge", f"{self.edge:g} is not a positive share; use e.g. 0.05")
+            raise SettingError(
+                "edge", "{edge:g} is not a positive share; use e.g. 0.05", edge=self.edge
+            )
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise SettingError(
-                "max_gaussians", f"{self.max_gaussians} is too small; use at least 1"
+                "max_gaussians",
+                "{max_gaussians} is too small; use at least 1",
+                max_gaussians=self.max_gaussians,
             )
 
 

@@ -84,8 +84,13 @@ class DepthSource:
             aspect = width / height * camera.height / camera.width
             if abs(aspect - 1) > _ASPECT_TOLERANCE:
                 raise UserError(
-                    f"{self.map}: has {width}x{height} pixels, but the upright photo has "
-                    f"{camera.width}x{camera.height}; use a depth map of the whole photo"
+                    "{map}: has {width}x{height} pixels, but the upright photo has "
+                    "{width2}x{height2}; use a depth map of the whole photo",
+                    map=self.map,
+                    width=width,
+                    height=height,
+                    width2=camera.width,
+                    height2=camera.height,
                 )
         else:
             assert self.model is not None
@@ -173,16 +178,24 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     """
     least, most = _SIDES
     if not least <= size <= most:
-        raise SettingError("size", f"{size} is out of range; use {least} to {most} pixels")
+        raise SettingError(
+            "size",
+            "{size} is out of range; use {least} to {most} pixels",
+            size=size,
+            least=least,
+            most=most,
+        )
     if focal is not None and not 0.0 < focal < math.inf:
-        raise SettingError("focal", f"{focal:g} is not a focal length; use one in pixels")
+        raise SettingError(
+            "focal", "{focal:g} is not a focal length; use one in pixels", focal=focal
+        )
     if not path.is_file():
-        raise UserError(f"{path}: no such photo")
+        raise UserError("{path}: no such photo", path=path)
     try:
         header = read_header(path)
         image = decode(path, header, size)
     except Unusable as error:
-        raise UserError(f"{path}: {error}; use another photo") from None
+        raise UserError("{path}: {error}; use another photo", path=path, error=error) from None
     if image.mode == "RGBA":
         white = Image.new("RGBA", image.size, (255, 255, 255, 255))
         image = Image.alpha_composite(white, image)

@@ -63,7 +63,10 @@ def refine_photo(
     posed = settings.load()
     view = _view_of(posed, Path(photo))
     if posed.points is None:
-        raise UserError(f"{dataset}: has no points, which the depth is aligned to; use lift alone")
+        raise UserError(
+            "{dataset}: has no points, which the depth is aligned to; use lift alone",
+            dataset=dataset,
+        )
     sizes = sorted(view.camera.width * view.camera.height for view in posed.train)
     config = recipe("default", iterations=iterations, init="points")
     config = config.capped(sizes[len(sizes) // 2], len(sizes))  # as in the training
@@ -103,7 +106,12 @@ def _view_of(dataset: Dataset, photo: Path) -> View:
     held_out = any(Path(view.name).name == photo.name for view in dataset.test)
     problem = "is held out for testing" if held_out else "is not a photo of the dataset"
     names = ", ".join(view.name for view in dataset.train[:3])
-    raise UserError(f"{photo}: {problem}; use one of its training photos, for example {names}")
+    raise UserError(
+        "{photo}: {problem}; use one of its training photos, for example {names}",
+        photo=photo,
+        problem=problem,
+        names=names,
+    )
 
 
 def _with_unseen_points(

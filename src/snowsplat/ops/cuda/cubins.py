@@ -60,8 +60,10 @@ def _compiled_here(file: str, capability: Capability, cuda_major: int) -> bytes:
     except nvrtc.NotFound:
         package = "nvidia-cuda-nvrtc" + ("-cu12" if newest < 13 else "")
         raise UserError(
-            f"no kernels are built for a GPU of compute capability {shown}, and NVRTC, which could "
-            f"compile them, is missing: pip install {package}"
+            "no kernels are built for a GPU of compute capability {shown}, and NVRTC, which "
+            "could compile them, is missing: pip install {package}",
+            shown=shown,
+            package=package,
         ) from None
     number = 10 * capability[0] + capability[1]
     if number in compiler.architectures:
@@ -69,7 +71,11 @@ def _compiled_here(file: str, capability: Capability, cuda_major: int) -> bytes:
     else:  # a GPU newer than this compiler: PTX, which the driver compiles
         older = [known for known in compiler.architectures if known < number]
         if not older:
-            raise UserError(f"NVRTC {compiler.version} does not support compute capability {shown}")
+            raise UserError(
+                "NVRTC {version} does not support compute capability {shown}",
+                version=compiler.version,
+                shown=shown,
+            )
         target = f"compute_{max(older)}"
     source = nvrtc.path_of(file)
     path = _cache_path(file, target, _key(compiler.version, target, source))

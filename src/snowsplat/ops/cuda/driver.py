@@ -87,7 +87,7 @@ class _Gpu:
     def __init__(self, index: int) -> None:
         why = why_unusable(index)
         if why is not None:
-            raise UserError(f"cuda:{index}: {why}")
+            raise UserError("cuda:{index}: {why}", index=index, why=why)
         self.cuda = _bindings()
         self._index = index
         self._capability = torch.cuda.get_device_capability(index)
@@ -134,7 +134,9 @@ class _Gpu:
         if error not in (0, _NOT_FOUND):
             self.fail(error, name)
         if error or int.from_bytes(found, sys.byteorder) != layout_of(kernel.params).hash:
-            raise UserError(f"cuda:{self._index}: {name}: {_OUTDATED}")
+            raise UserError(
+                "cuda:{index}: {name}: {outdated}", index=self._index, name=name, outdated=_OUTDATED
+            )
 
     def _first_function(self, file: str, name: str) -> tuple[int, Any]:
         error, function = 0, None
@@ -172,4 +174,11 @@ class _Gpu:
             remedy = "close other programs that use the GPU, or make the scene smaller"
         else:
             remedy = "update the NVIDIA driver, or use device cpu"
-        raise UserError(f"cuda:{self._index}: {name}{': ' if name else ''}{text}; {remedy}")
+        raise UserError(
+            "cuda:{index}: {name}{what}{text}; {remedy}",
+            index=self._index,
+            name=name,
+            what=": " if name else "",
+            text=text,
+            remedy=remedy,
+        )

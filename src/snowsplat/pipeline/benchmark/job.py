@@ -90,11 +90,15 @@ class SceneResult:
         try:
             result = from_json(SceneResult, read_json(job.result))
         except ValueError as error:
-            raise UserError(f"{job.result}: is damaged ({error}); remove it") from None
+            raise UserError(
+                "{result}: is damaged ({error}); remove it", result=job.result, error=error
+            ) from None
         if {**asdict(result.job), "dataset": ""} != {**asdict(job), "dataset": ""}:
             raise UserError(
-                f"{job.result}: was made with other settings; use another output folder, or remove "
-                f"{job.output}"
+                "{result}: was made with other settings; use another output folder, or remove "
+                "{output}",
+                result=job.result,
+                output=job.output,
             )
         return result
 
@@ -124,7 +128,11 @@ def run(job: Job, device: str | None, threads: int | None) -> None:
     if code == TAKEN:
         raise InUse(last)
     if code != 0:
-        raise UserError(f"{job.scene}: {last.removeprefix('snowsplat: ')}")
+        raise UserError(
+            "{scene}: {removeprefix}",
+            scene=job.scene,
+            removeprefix=last.removeprefix("snowsplat: "),
+        )
 
 
 def work(job: Job, device: str | None, threads: int | None) -> None:

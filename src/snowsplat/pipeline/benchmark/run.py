@@ -55,7 +55,12 @@ class BenchmarkOptions(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.suite is not None and self.suite not in SUITES:
-            raise SettingError("suite", f"{self.suite} is unknown; use {', '.join(SUITES)}")
+            raise SettingError(
+                "suite",
+                "{suite} is unknown; use {suites}",
+                suite=self.suite,
+                suites=", ".join(SUITES),
+            )
         recipe(self.recipe, **self.settings)  # raises an error if a setting is invalid
 
 
@@ -117,14 +122,16 @@ def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
         return (path / "sparse").is_dir() or bool(find_transforms(path))
 
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder")
+        raise UserError("{folder}: no such folder", folder=folder)
     found = {path.name: path for path in sorted(folder.iterdir()) if is_dataset(path)}
     missing = [name for name in only if name not in found]
     if missing:
-        raise UserError(f"{folder}: contains no dataset {missing[0]}")
+        raise UserError(
+            "{folder}: contains no dataset {missing}", folder=folder, missing=missing[0]
+        )
     if not found:
         hint = "; it is a dataset itself, use the folder above" if is_dataset(folder) else ""
-        raise UserError(f"{folder}: contains no folders of datasets{hint}")
+        raise UserError("{folder}: contains no folders of datasets{hint}", folder=folder, hint=hint)
     return [found[name] for name in only] or list(found.values())
 
 

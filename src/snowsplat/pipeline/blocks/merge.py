@@ -57,8 +57,10 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
     plan = Plan.read(folder)
     if output is not None and Path(output).suffix.lower() != ".ply":
         raise UserError(
-            f"{output}: blocks are merged into a PLY file; use snowsplat convert {folder} "
-            f"{output} afterwards"
+            "{output}: blocks are merged into a PLY file; use snowsplat convert {folder} "
+            "{output} afterwards",
+            output=output,
+            folder=folder,
         )
     steps: set[int] = set()
     files = []
@@ -66,7 +68,10 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
         out = scene_folder(folder, block)
         if not is_finished(out):
             raise UserError(
-                f"{block.name}: not trained; run snowsplat blocks train {folder} `block` {number}"
+                "{name}: not trained; run snowsplat blocks train {folder} `block` {number}",
+                name=block.name,
+                folder=folder,
+                number=number,
             )
         steps.add(out.scenes()[-1])
         files.append(out.scene_path(out.scenes()[-1]))
@@ -79,7 +84,9 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
         rest = max(rest, own.sh_rest.shape[1])
         antialiased |= own.antialiased  # all blocks have the same settings
     if not sum(counts):
-        raise UserError(f"{folder}: no Gaussian is in the cell of its block; train more steps")
+        raise UserError(
+            "{folder}: no Gaussian is in the cell of its block; train more steps", folder=folder
+        )
     scene = OutputFolder(folder).scene_path(max(steps))
     scene.parent.mkdir(parents=True, exist_ok=True)
     own_rows = (part()[1] for part in parts)

@@ -82,15 +82,23 @@ class Plan:
         """
         file = folder / PLAN
         if not file.is_file():
-            raise UserError(f"{folder}: contains no {PLAN}; run snowsplat blocks plan first")
+            raise UserError(
+                "{folder}: contains no {plan}; run snowsplat blocks plan first",
+                folder=folder,
+                plan=PLAN,
+            )
         try:
             content = read_json(file)
             content.pop("snowsplat")
             plan = from_json(Plan, content)
         except (ValueError, KeyError, AttributeError, TypeError):
-            raise UserError(f"{file}: damaged; run snowsplat blocks plan in a new folder") from None
+            raise UserError(
+                "{file}: damaged; run snowsplat blocks plan in a new folder", file=file
+            ) from None
         if not plan.blocks:
-            raise UserError(f"{file}: the plan is unfinished; run snowsplat blocks plan again")
+            raise UserError(
+                "{file}: the plan is unfinished; run snowsplat blocks plan again", file=file
+            )
         return plan
 
     def write(self, folder: Path) -> None:
@@ -168,7 +176,10 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
     check_cameras(whole, settings.path, trusted=True)
     if options.blocks > len(whole.train):
         raise SettingError(
-            "blocks", f"{options.blocks} is too large; there are {len(whole.train)} training photos"
+            "blocks",
+            "{blocks} is too large; there are {train} training photos",
+            blocks=options.blocks,
+            train=len(whole.train),
         )
     posed = [image for image, _, _ in files.images]
     if any(image.divided > 1 for image in posed):
@@ -215,4 +226,8 @@ def _check_free(folder: Path) -> None:
         if read_json(folder / PLAN)["blocks"] == []:
             return
     what = "a plan" if (folder / PLAN).is_file() else "other files"
-    raise UserError(f"{folder}: already contains {what}; use a new folder, or remove it")
+    raise UserError(
+        "{folder}: already contains {what}; use a new folder, or remove it",
+        folder=folder,
+        what=what,
+    )

@@ -34,7 +34,9 @@ def is_finished(out: OutputFolder) -> bool:
     try:
         iterations = int(read_json(out.path / "config.json")["training"]["iterations"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{out.path / 'config.json'}: damaged; remove {out.path}") from None
+        raise UserError(
+            "{path}: damaged; remove {path2}", path=out.path / "config.json", path2=out.path
+        ) from None
     return scenes[-1] >= iterations
 
 
@@ -70,7 +72,12 @@ def train_blocks(
     plan = Plan.read(folder)
     for number in only:
         if not 1 <= number <= len(plan.blocks):
-            raise SettingError("block", f"{number} does not exist; use 1 to {len(plan.blocks)}")
+            raise SettingError(
+                "block",
+                "{number} does not exist; use 1 to {blocks}",
+                number=number,
+                blocks=len(plan.blocks),
+            )
     results, elsewhere = [], list[InUse]()
     for number, block in enumerate(plan.blocks, 1):
         if only and number not in only:

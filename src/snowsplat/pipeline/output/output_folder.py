@@ -160,18 +160,21 @@ class OutputFolder:
         if not self.path.exists():
             return
         if not self.path.is_dir():
-            raise UserError(f"{self.path}: is a file; use a folder for the output")
+            raise UserError("{path}: is a file; use a folder for the output", path=self.path)
         others = (
             entry
             for entry in self.path.iterdir()
             if entry.name != LOCK and not is_temporary(entry, _FILES)
         )
         if any(others) and not self.is_output_folder():
-            raise UserError(f"{self.path}: contains other files; use a new or an empty folder")
+            raise UserError(
+                "{path}: contains other files; use a new or an empty folder", path=self.path
+            )
         if self.is_output_folder() and not resume and not overwrite:
             raise UserError(
-                f"{self.path}: already contains a training run; use `resume` to continue it, "
-                "`overwrite` to replace it, or use another folder"
+                "{path}: already contains a training run; use `resume` to continue it, "
+                "`overwrite` to replace it, or use another folder",
+                path=self.path,
             )
 
     def clear(self) -> None:
@@ -259,7 +262,7 @@ class OutputFolder:
             photos = read_json(file)["photos"]
             return {str(name): [float(ev) for ev in channels] for name, channels in photos.items()}
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise UserError(f"{file}: damaged; train again") from None
+            raise UserError("{file}: damaged; train again", file=file) from None
 
     def discard(self) -> None:
         """Remove what `begin` wrote, if there is neither a scene nor a checkpoint."""
@@ -293,7 +296,7 @@ class OutputFolder:
         what = "contains no scene (no point_cloud/iteration_N in it)"
         if any(self.checkpoints.glob("step_*.safetensors")):
             what = "contains no scene yet, but checkpoints; show it with watch, or continue it"
-        return UserError(f"{self.path}: {what}")
+        return UserError("{path}: {what}", path=self.path, what=what)
 
     def write_scene(self, iteration: int, gaussians: Gaussians) -> Path:
         """Save the scene; returns the file."""
@@ -319,7 +322,7 @@ class OutputFolder:
         if chosen not in scenes:
             there = ", ".join(map(str, scenes))
             what = f"contains no scene of iteration {chosen}; there are {there}"
-            raise UserError(f"{self.path}: {what}")
+            raise UserError("{path}: {what}", path=self.path, what=what)
         return chosen, read_gaussians(self.scene_path(chosen))
 
     def write_metrics(
@@ -379,11 +382,12 @@ class OutputFolder:
                 white = bool(values.get("white_background"))
             else:
                 raise UserError(
-                    f"{self.path}: not the output folder of a training run (no config.json)"
+                    "{path}: not the output folder of a training run (no config.json)",
+                    path=self.path,
                 )
         except (KeyError, TypeError, ValueError, SyntaxError, OverflowError):
             where = ours if ours.is_file() else theirs
-            raise UserError(f"{where}: damaged; it does not name the dataset") from None
+            raise UserError("{where}: damaged; it does not name the dataset", where=where) from None
         return self.located(dataset), (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
 
     def located(self, dataset: DatasetSettings) -> DatasetSettings:

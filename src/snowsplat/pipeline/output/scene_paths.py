@@ -26,7 +26,9 @@ def existing_folder(path: Path) -> OutputFolder:
     """The same as `training_folder`. Raises: UserError: ``path`` is not a folder."""
     if not path.is_dir():
         what = "is a file" if path.is_file() else "no such folder"
-        raise UserError(f"{path}: {what}; give the output folder of a training run")
+        raise UserError(
+            "{path}: {what}; give the output folder of a training run", path=path, what=what
+        )
     return training_folder(path)
 
 

@@ -79,7 +79,9 @@ def load_trained(
     file = index_in(Path(output)) or Path(output)
     if file.is_file():
         if dataset is None:
-            raise UserError(f"{file}: a scene file does not name its photos; set `dataset`")
+            raise UserError(
+                "{file}: a scene file does not name its photos; set `dataset`", file=file
+            )
         settings = DatasetSettings(str(dataset), resolution=resolution or -1, hold_out=8)
         folder, background = OutputFolder(file.with_name(f"{file.stem}_views")), (0.0, 0.0, 0.0)
         data, found, gaussians = settings.load(), 0, read_gaussians(file)
@@ -158,7 +160,7 @@ def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableSce
     """
     path = Path(path)
     if not path.exists():
-        raise UserError(f"{path}: no such file or folder")
+        raise UserError("{path}: no such file or folder", path=path)
     path = index_in(path) or path
     if iteration is None and path.is_dir():
         path = file_of_make(path) or path

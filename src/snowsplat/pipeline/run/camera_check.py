@@ -31,7 +31,11 @@ def check_cameras(dataset: Dataset, path: str, *, trusted: bool = False) -> tupl
     findings = judge(dataset)
     for finding in findings:
         if finding.impossible and not trusted:
-            raise UserError(f"{path}: {finding.text} (or set `trust_cameras` if you are sure)")
+            raise UserError(
+                "{path}: {text} (or set `trust_cameras` if you are sure)",
+                path=path,
+                text=finding.text,
+            )
     for finding in findings:
         logger.warning("warning: %s: %s", path, finding.text)
     return tuple(finding.text for finding in findings)

@@ -42,7 +42,9 @@ class CheckpointMeta:
             if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
                 raise ValueError("invalid time budget")
         except ValueError as error:
-            raise UserError(f"{start.path}: not a checkpoint of a training run ({error})") from None
+            raise UserError(
+                "{path}: not a checkpoint of a training run ({error})", path=start.path, error=error
+            ) from None
         return meta
 
     def as_json(self) -> dict[str, Any]:

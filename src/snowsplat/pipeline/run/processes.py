@@ -160,7 +160,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     Raises: UserError: fewer than 1 process.
     """
     if processes < 1:
-        raise UserError(f"{processes} processes are too few; use 1 or more")
+        raise UserError("{processes} processes are too few; use 1 or more", processes=processes)
     command = [sys.executable, "-m", "snowsplat", *arguments]
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))

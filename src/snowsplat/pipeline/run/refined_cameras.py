@@ -62,8 +62,11 @@ def with_refined(output: Path, dataset: Dataset) -> Dataset:
     def refined(view: View) -> View:
         if view.name not in images:
             raise UserError(
-                f"{folder}: has no camera for {view.name}; use the dataset of the training, or "
-                f"remove {output / FOLDER} to use the cameras of the dataset"
+                "{folder}: has no camera for {name}; use the dataset of the training, or remove "
+                "{folder2} to use the cameras of the dataset",
+                folder=folder,
+                name=view.name,
+                folder2=output / FOLDER,
             )
         camera = posed_camera(model, images[view.name]).seen_from(dataset.origin)
         camera = camera.scaled(view.camera.width, view.camera.height)

@@ -111,7 +111,11 @@ class TrainingRun:
                 ) from None
         except Diverged as error:
             self.out.discard()
-            raise UserError(f"{error}; {self._last_checkpoint_as_text()}") from None
+            raise UserError(
+                "{error}; {last_checkpoint_as_text}",
+                error=error,
+                last_checkpoint_as_text=self._last_checkpoint_as_text(),
+            ) from None
         except BaseException:
             self.out.discard()
             raise

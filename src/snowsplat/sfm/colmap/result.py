@@ -107,4 +107,4 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
 
 
 def _cannot_skip(reason: str) -> UserError:
-    return SettingError("skip_matching", f"{reason}; run without this setting")
+    return SettingError("skip_matching", "{reason}; run without this setting", reason=reason)

@@ -136,15 +136,23 @@ def _check(options: GatherOptions) -> None:
     if options.fps is not None and options.frames is not None:
         raise SettingError("fps", "cannot be combined with frames; set only one of them")
     if options.fps is not None and not (options.fps > 0 and math.isfinite(options.fps)):
-        raise SettingError("fps", f"{options.fps:g} is not a positive number; use e.g. 2")
+        raise SettingError("fps", "{fps:g} is not a positive number; use e.g. 2", fps=options.fps)
     if options.frames is not None and options.frames < _MIN_PHOTOS:
         raise SettingError(
-            "frames", f"{options.frames} is too few; use {_MIN_PHOTOS} or more, e.g. 60"
+            "frames",
+            "{frames} is too few; use {min_photos} or more, e.g. 60",
+            frames=options.frames,
+            min_photos=_MIN_PHOTOS,
         )
     if options.photos is not None and options.photos < 1:
-        raise SettingError("photos", f"{options.photos} is too few; use 1 or more")
+        raise SettingError("photos", "{photos} is too few; use 1 or more", photos=options.photos)
     if options.size is not None and options.size < _MIN_SIZE:
-        raise SettingError("size", f"{options.size} is too small; use {_MIN_SIZE} or more")
+        raise SettingError(
+            "size",
+            "{size} is too small; use {min_size} or more",
+            size=options.size,
+            min_size=_MIN_SIZE,
+        )
 
 
 def _with_panoramas(photos: list[Photo]) -> list[Photo]:
@@ -173,8 +181,10 @@ def _shows_all_around(clip: Clip, options: GatherOptions) -> bool:
         problem = f"has frames of {clip.width}x{clip.height} pixels"
     if problem:
         raise UserError(
-            f"{shown(clip.path)}: is a 360° video that {problem}; export it with one "
-            "equirectangular picture of all directions, which is twice as wide as high"
+            "{path}: is a 360° video that {problem}; export it with one equirectangular picture "
+            "of all directions, which is twice as wide as high",
+            path=shown(clip.path),
+            problem=problem,
         )
     return around
 
@@ -188,8 +198,9 @@ def _refuse_changes(
     others += [plan.source.path for plan in planned if plan.name != plan.source.name]
     for path in [*changed, *others]:
         raise UserError(
-            f"{shown(path)}: must be converted, rotated or resized, but files in input/ are never "
-            "changed; make a dataset in a new folder instead"
+            "{path}: must be converted, rotated or resized, but files in input/ are never "
+            "changed; make a dataset in a new folder instead",
+            path=shown(path),
         )
 
 
@@ -256,8 +267,10 @@ def _check_disk_space(
     free = shutil.disk_usage(dataset).free
     if needed > free:
         raise UserError(
-            f"disk: about {needed / 1e6:,.0f} MB are needed and {free / 1e6:,.0f} MB are free; "
-            "free some space, or set a smaller size, e.g. 1600"
+            "disk: about {needed:,.0f} MB are needed and {free:,.0f} MB are free; free some "
+            "space, or set a smaller size, e.g. 1600",
+            needed=needed / 1000000.0,
+            free=free / 1000000.0,
         )
 
 
@@ -271,34 +284,48 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
         left_out = "".join(f"; {source} {why}" for source, why in skipped[:3])
         left_out += f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
         return UserError(
-            f"photos: {_count(usable)}; use at least {_MIN_PHOTOS}, preferably 20 or more, "
-            f"from different places around the scene{left_out}"
+            "photos: {count}; use at least {min_photos}, preferably 20 or more, from different "
+            "places around the scene{left_out}",
+            count=_count(usable),
+            min_photos=_MIN_PHOTOS,
+            left_out=left_out,
         )
     if reason == SAME_VIEW:
         video = skipped[0][0].partition(" at ")[0]
         return UserError(
-            f"{video}: the camera does not move ({who} show the same view), but depth needs "
-            "motion; film while walking around the scene"
+            "{video}: the camera does not move ({who} show the same view), but depth needs "
+            "motion; film while walking around the scene",
+            video=video,
+            who=who,
         )
     if reason == STITCHED:
         return UserError(
-            f"photos: {who} are stitched panoramas, which no lens has taken; use the single "
-            "photos, or panoramas of all directions (equirectangular, twice as wide as high)"
+            "photos: {who} are stitched panoramas, which no lens has taken; use the single "
+            "photos, or panoramas of all directions (equirectangular, twice as wide as high)",
+            who=who,
         )
     if reason in (BLACK, WHITE, FLAT):
         what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]
         return UserError(
-            f"photos: {who} are completely {what}; check the lens cap, the light and the files"
+            "photos: {who} are completely {what}; check the lens cap, the light and the files",
+            who=who,
+            what=what,
         )
     if reason == BLURRED:
         return UserError(
-            f"photos: {who} are too blurred to be matched; hold the camera still for each photo, "
-            "in good light and in focus"
+            "photos: {who} are too blurred to be matched; hold the camera still for each photo, "
+            "in good light and in focus",
+            who=who,
         )
     first = next(source for source, why in skipped if why == reason)
     return UserError(
-        f"photos: {_count(usable)}; {who} cannot be used, e.g. {first}, which {reason}; use at "
-        f"least {_MIN_PHOTOS}, preferably 20 or more"
+        "photos: {count}; {who} cannot be used, e.g. {first}, which {reason}; use at least "
+        "{min_photos}, preferably 20 or more",
+        count=_count(usable),
+        who=who,
+        first=first,
+        reason=reason,
+        min_photos=_MIN_PHOTOS,
     )
 
 

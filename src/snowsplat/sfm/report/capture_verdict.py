@@ -15,6 +15,7 @@ import numpy as np
 from snowsplat.evaluation.verdict import Grade, Reason, Verdict
 from snowsplat.sfm.ingest.search.sources import RECORDS
 from snowsplat.sfm.report.coverage import Coverage
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import read_json
 
 #: With fewer photos, no photo is left to check the poses and to hold out.
@@ -129,10 +130,10 @@ def _distances(coverage: Coverage) -> list[Reason]:
 def _count(coverage: Coverage, count: int) -> list[Reason]:
     advice = "take 30 to 100 photos of an object or a room, and more of a larger place"
     if count < _TOO_FEW:
-        return [Reason("poor", f"{count} photos are too few", advice)]
+        return [Reason("poor", message("{count} photos are too few", count=count), advice)]
     # A few photos are enough for one side of a scene.
     if count < _FEW and not (_looks_one_way(coverage) and _median(coverage.step) <= _SMALL_STEP):
-        return [Reason("usable", f"{count} photos are few", advice)]
+        return [Reason("usable", message("{count} photos are few", count=count), advice)]
     return []
 
 
@@ -169,7 +170,15 @@ def _bad_photos(problems: Mapping[str, str], count: int) -> list[Reason]:
     most = max(dict.fromkeys(kinds), key=kinds.count)
     what, _, advice = most.partition("; ")
     number = kinds.count(most)
-    return [Reason("usable", f"{number} of {count} photos: each {what}", advice)]
+    return [
+        Reason(
+            "usable",
+            message(
+                "{number} of {count} photos: each {what}", number=number, count=count, what=what
+            ),
+            advice,
+        )
+    ]
 
 
 def _one_side(coverage: Coverage) -> list[Reason]:

@@ -201,4 +201,6 @@ def _too_little(budget: int, least: int, present: int, files_too_large: bool) ->
         # its full size.
         smaller = "smaller image files" if files_too_large else "a lower resolution"
         problem = f"for photos of this size, which {needed}; use more, or {smaller}"
-    return SettingError("memory", f"{format_bytes(budget)} is too little {problem}")
+    return SettingError(
+        "memory", "{budget} is too little {problem}", budget=format_bytes(budget), problem=problem
+    )

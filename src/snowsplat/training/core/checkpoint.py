@@ -88,7 +88,9 @@ def load(path: Path | str) -> Checkpoint:
     try:
         return _read(path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise UserError(
+            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
+        ) from None
 
 
 def latest(folder: Path | str) -> Checkpoint | None:
@@ -102,7 +104,9 @@ def latest(folder: Path | str) -> Checkpoint | None:
         except UserError as error:
             warnings.warn(f"{error}; using the previous one", stacklevel=2)
         except OSError as error:
-            raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+            raise UserError(
+                "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
+            ) from None
     return None
 
 

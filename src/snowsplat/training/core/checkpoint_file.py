@@ -85,8 +85,11 @@ def read(path: Path) -> CheckpointFile:
             header = parse_json(text)
             if header["version"] != VERSION:
                 raise UserError(
-                    f"{path}: checkpoint of version {header['version']}, this program reads "
-                    f"version {VERSION}; resume with the snowsplat that wrote it"
+                    "{path}: checkpoint of version {header}, this program reads version "
+                    "{version}; resume with the snowsplat that wrote it",
+                    path=path,
+                    header=header["version"],
+                    version=VERSION,
                 )
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         intact = header["crc32"] == {name: _crc32(array) for name, array in arrays.items()}
@@ -105,13 +108,16 @@ def read(path: Path) -> CheckpointFile:
         ValueError,
         OverflowError,
     ):
-        raise UserError(f"{path}: not a checkpoint, or damaged; use another one") from None
+        raise UserError(
+            "{path}: not a checkpoint, or damaged; use another one", path=path
+        ) from None
     if not intact:
-        raise UserError(f"{path}: damaged, checksums do not match; use another one")
+        raise UserError("{path}: damaged, checksums do not match; use another one", path=path)
     if found := _rows_not_finite(arrays):
         raise UserError(
-            f"{path}: non-finite values in {listed(found)}; "
-            "remove it and resume from an earlier one"
+            "{path}: non-finite values in {listed}; remove it and resume from an earlier one",
+            path=path,
+            listed=listed(found),
         )
     return content
 

@@ -44,7 +44,12 @@ def rows_not_finite(tensors: Mapping[str, Tensor]) -> dict[str, int]:
 def check_finite(what: str, tensors: Mapping[str, Tensor], advice: str) -> None:
     """Raises UserError ``"<what>: non-finite values in …; <advice>"`` unless all are finite."""
     if found := rows_not_finite(tensors):
-        raise UserError(f"{what}: non-finite values in {listed(found)}; {advice}")
+        raise UserError(
+            "{what}: non-finite values in {listed}; {advice}",
+            what=what,
+            listed=listed(found),
+            advice=advice,
+        )
 
 
 def check_state(
@@ -91,7 +96,12 @@ def check_state(
 def check_parameters(step: int, gaussians: Gaussians) -> None:
     """Raises Diverged unless all parameters are finite at ``step``."""
     if found := rows_not_finite(gaussians.parameters()):
-        raise Diverged(f"step {step}: non-finite Gaussians, {listed(found)}; {_FINITE_INIT}")
+        raise Diverged(
+            "step {step}: non-finite Gaussians, {listed}; {finite_init}",
+            step=step,
+            listed=listed(found),
+            finite_init=_FINITE_INIT,
+        )
 
 
 def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussians) -> None:
@@ -107,7 +117,10 @@ def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussia
     rows = zip(gaussians.parameters(), nonfinite_rows, strict=True)
     found = {name: int(count) for name, count in rows if count}
     raise Diverged(
-        f"step {step}: non-finite gradient or update in {listed(found)}, skipped; {_LOWER_RATES}"
+        "step {step}: non-finite gradient or update in {listed}, skipped; {lower_rates}",
+        step=step,
+        listed=listed(found),
+        lower_rates=_LOWER_RATES,
     )
 
 
@@ -130,7 +143,13 @@ def check_loss(
         cause = "from a non-finite camera; correct its pose or remove that photo"
     else:
         cause = f"training has diverged; {_LOWER_RATES}"
-    raise Diverged(f"step {step}, photo {view.name}: the loss is {loss}, {cause}")
+    raise Diverged(
+        "step {step}, photo {name}: the loss is {loss}, {cause}",
+        step=step,
+        name=view.name,
+        loss=loss,
+        cause=cause,
+    )
 
 
 def listed(counts: Mapping[str, int]) -> str:

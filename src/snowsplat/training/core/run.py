@@ -313,7 +313,9 @@ def _with_valid_names(parts: Sequence[Part]) -> list[Part]:
     """The parts. Raises UserError: the names of two parts are the same, or a name is reserved."""
     names = [part.name for part in parts]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise UserError(f"two parts have the name {min(twice)!r}; set `name` of one of them")
+        raise UserError(
+            "two parts have the name {twice!r}; set `name` of one of them", twice=min(twice)
+        )
     if bad := [name for name in names if name in RESERVED or "." in name or not name]:
-        raise UserError(f"a part cannot have the name {bad[0]!r}; set another `name`")
+        raise UserError("a part cannot have the name {bad!r}; set another `name`", bad=bad[0])
     return list(parts)

@@ -101,7 +101,8 @@ def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
             random.set_state(tensors[f"random.{name}"])
         except RuntimeError:  # torch rejects an invalid state
             raise UserError(
-                f"the checkpoint: random state {name!r} is damaged; resume from an earlier one"
+                "the checkpoint: random state {name!r} is damaged; resume from an earlier one",
+                name=name,
             ) from None
     run.step = int(tensors["step"])
     run.within_step = False
@@ -110,8 +111,11 @@ def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
             part.load(of(f"{part.name}."))
         except (KeyError, RuntimeError, ValueError) as error:
             raise UserError(
-                f"the checkpoint: the state of the part {part.name!r} cannot be loaded "
-                f"({type(error).__name__}: {error}); use the part that wrote it"
+                "the checkpoint: the state of the part {name!r} cannot be loaded ({name__}: "
+                "{error}); use the part that wrote it",
+                name=part.name,
+                name__=type(error).__name__,
+                error=error,
             ) from error
     run.queue.continue_with(tensors["order"].tolist(), run.step)
 
@@ -122,20 +126,28 @@ def _check_own(present: set[str], saved: set[str]) -> None:
         what, _, key = name.partition(".")
         if what == "without":
             raise UserError(
-                f"the checkpoint: was made without the part {key!r}; leave it out again: parts=[…]"
+                "the checkpoint: was made without the part {name!r}; leave it out again: parts=[…]",
+                name=key,
             )
         how = "parts=[…]" if what == "part" else "loss=…"
         raise UserError(
-            f"the checkpoint: was made with the {what} {key!r}, which is not part of the package; "
-            f"pass it again: {how}"
+            "the checkpoint: was made with the {what} {name!r}, which is not part of the "
+            "package; pass it again: {how}",
+            what=what,
+            name=key,
+            how=how,
         )
     for name in sorted(present - saved):
         what, _, key = name.partition(".")
         if what == "without":
             raise UserError(
-                f"the checkpoint: was made with the part {key!r} of the package; use it again: "
-                "parts_of(config)"
+                "the checkpoint: was made with the part {name!r} of the package; use it again: "
+                "parts_of(config)",
+                name=key,
             )
         raise UserError(
-            f"the checkpoint: was made without the {what} {key!r}; resume without it, or start anew"
+            "the checkpoint: was made without the {what} {name!r}; resume without it, or start "
+            "anew",
+            what=what,
+            name=key,
         )

@@ -31,6 +31,7 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth import aligned_depth_map, contradicts
 from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
@@ -96,11 +97,21 @@ class DepthSupervision(Part):
             unused = given - len(self._maps)
             reason = f"; {unused} contradict the points or show too few of them" if unused else ""
             reason = f"; {damaged}" if damaged else reason
-            run.note(f"depth maps: {len(self._maps)} of {len(views)} photos{reason}")
+            run.note(
+                message(
+                    "depth maps: {maps} of {views} photos{reason}",
+                    maps=len(self._maps),
+                    views=len(views),
+                    reason=reason,
+                )
+            )
         elif not any(view.normals for view in views):
             run.note(
-                "depth maps: no photo has one, so depth_weight has no effect; add them as "
-                "depths/IMG.png for the photo IMG.jpg, or normals/IMG.png (PNG, TIFF, NPY or EXR)"
+                message(
+                    "depth maps: no photo has one, so depth_weight has no effect; add them as "
+                    "depths/IMG.png for the photo IMG.jpg, or normals/IMG.png (PNG, TIFF, NPY or "
+                    "EXR)"
+                )
             )
 
     def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
@@ -145,7 +156,12 @@ class DepthSupervision(Part):
         if wrong:
             self.used[wrong] = False
             names = first_names([run.dataset.train[index].name for index in wrong], 5)
-            run.note(f"depth maps that contradict the photos are not used any more: {names}")
+            run.note(
+                message(
+                    "depth maps that contradict the photos are not used any more: {names}",
+                    names=names,
+                )
+            )
 
     def state(self) -> dict[str, Tensor]:
         """See `Part`."""

@@ -38,6 +38,7 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
@@ -98,7 +99,14 @@ class NormalSupervision(Part):
         self.idle = not self._maps
         if given:
             reason = f"; {damaged}" if damaged else ""
-            run.note(f"normal maps: {len(self._maps)} of {len(views)} photos{reason}")
+            run.note(
+                message(
+                    "normal maps: {maps} of {views} photos{reason}",
+                    maps=len(self._maps),
+                    views=len(views),
+                    reason=reason,
+                )
+            )
 
     def between(self, run: Run) -> None:
         """Compare the maps with the scene, once."""
@@ -129,7 +137,13 @@ class NormalSupervision(Part):
             self.used[wrong] = False
             names = first_names([views[index].name for index in wrong], 5)
             frame = "" if self.used.any() else "; normals must be in the frame of the camera"
-            run.note(f"normal maps that contradict the photos are not used: {names}{frame}")
+            run.note(
+                message(
+                    "normal maps that contradict the photos are not used: {names}{frame}",
+                    names=names,
+                    frame=frame,
+                )
+            )
 
     def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
         """See the module. Each rendering has at most as many pixels as the map."""

@@ -12,6 +12,7 @@ import torch
 from snowsplat.data.dataset import Points
 from snowsplat.training.parts.found_sky import Sky, find_sky, most_sky_points
 from snowsplat.training.parts.part import REMOVED, Part
+from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 
 if TYPE_CHECKING:
@@ -55,7 +56,12 @@ class SkyPart(Part):
             found = find_sky(run.dataset, run.photos, self.distance)
         if found is not None:
             share = 100 * found.share
-            run.note(f"the photos show the sky ({share:.0f}% of them): the training starts with it")
+            run.note(
+                message(
+                    "the photos show the sky ({share:.0f}% of them): the training starts with it",
+                    share=share,
+                )
+            )
             self.sky = found.to(run.device)
 
     def points(self, run: Run, points: Points) -> Points:

@@ -46,6 +46,7 @@ from snowsplat.training.parts.view_residuals import (
     residuals_elsewhere,
 )
 from snowsplat.training.settings.config import AutoOnOff
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.training.core.batch import BatchView
@@ -184,8 +185,13 @@ class Transients(Part):
         if shares:
             mean = 100.0 * sum(shares) / len(shares)
             self._run.note(
-                f"something moves in {len(shares)} of {photos} photos: masked there, {mean:.1f}% "
-                "of their pixels; see the report"
+                message(
+                    "something moves in {shares} of {photos} photos: masked there, {mean:.1f}% "
+                    "of their pixels; see the report",
+                    shares=len(shares),
+                    photos=photos,
+                    mean=mean,
+                )
             )
 
     def state(self) -> dict[str, Tensor]:

@@ -15,6 +15,7 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.training.starts.point_colors import point_pixels
+from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 
 #: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
@@ -146,7 +147,12 @@ def _sharpness(held_out: Evaluation) -> list[Reason]:
     ssim = float(np.median([view.ssim for view in held_out.views]))
     if ssim >= _SHARP:
         return []
-    return [Reason("usable", f"fine detail is blurred in held-out photos (SSIM {ssim:.2f})")]
+    return [
+        Reason(
+            "usable",
+            message("fine detail is blurred in held-out photos (SSIM {ssim:.2f})", ssim=ssim),
+        )
+    ]
 
 
 def _left_out(names: Sequence[str], count: int) -> list[Reason]:
@@ -165,8 +171,12 @@ def _exposures(spread: float) -> list[Reason]:
     return [
         Reason(
             "good",
-            f"the exposures of the photos differ by {spread:.1f} EV, which the training corrects",
-            "fix the exposure and the white balance of the camera",
+            message(
+                "the exposures of the photos differ by {spread:.1f} EV, which the training "
+                "corrects",
+                spread=spread,
+            ),
+            message("fix the exposure and the white balance of the camera"),
         )
     ]
 

@@ -283,8 +283,9 @@ class TrainConfig(Settings):
         if share and not limited and (self.sky or self.starts != ("points",)):
             raise SettingError(
                 "initial_points",
-                f"{self.initial_points:g} is a share of the limit of Gaussians; set max_gaussians "
-                "as well",
+                "{initial_points:g} is a share of the limit of Gaussians; set max_gaussians as "
+                "well",
+                initial_points=self.initial_points,
             )
 
     @property

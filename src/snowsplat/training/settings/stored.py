@@ -37,8 +37,9 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
     name = values.pop(_DENSITY_NAME)
     if not isinstance(name, str) or name not in DENSITY_CONTROLS:
         raise UserError(
-            f"the configuration: the density control {quoted(name)} is not registered; call "
-            "snowsplat.training.settings.register_density with its class before resuming"
+            "the configuration: the density control {name} is not registered; call "
+            "snowsplat.training.settings.register_density with its class before resuming",
+            name=quoted(name),
         )
     kinds: dict[str, type] = {
         "density": DENSITY_CONTROLS[name],
@@ -58,11 +59,15 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
 def _known(kind: type, values: Any, strict: bool) -> Any:
     """An object of the class ``kind``, from the values that it knows."""
     if not isinstance(values, dict):
-        raise UserError(f"the configuration: {quoted(values)} is not valid; start again")
+        raise UserError(
+            "the configuration: {values} is not valid; start again", values=quoted(values)
+        )
     names = {each.name for each in fields(kind) if each.init}
     for unknown in sorted(values.keys() - names):
         if strict:
-            raise UserError(f"{quoted(unknown)} is unknown to this version; remove it")
+            raise UserError(
+                "{unknown} is unknown to this version; remove it", unknown=quoted(unknown)
+            )
         logger.warning("the configuration: %s is unknown to this version; ignored", quoted(unknown))
     known = {name: value for name, value in values.items() if name in names}
     try:
@@ -70,6 +75,8 @@ def _known(kind: type, values: Any, strict: bool) -> Any:
             return kind(**known)
         return from_json(kind, known)
     except SettingError as error:
-        raise UserError(f"the configuration: {error}") from None
+        raise UserError("the configuration: {error}", error=error) from None
     except (TypeError, ValueError) as error:
-        raise UserError(f"the configuration: {error}; start the training again") from None
+        raise UserError(
+            "the configuration: {error}; start the training again", error=error
+        ) from None

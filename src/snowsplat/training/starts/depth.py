@@ -66,8 +66,9 @@ def depth_points(
     unused = sum(view.depth is not None for view in chosen.views) - sum(map(bool, maps))
     if not any(maps):
         raise UserError(
-            f"{dataset.description}: no depth map agrees with the points; check that the maps "
-            "belong to these photos, or choose another start than depth with `init`"
+            "{description}: no depth map agrees with the points; check that the maps belong to "
+            "these photos, or choose another start than depth with `init`",
+            description=dataset.description,
         )
     if unused:
         logger.warning("%d depth maps do not agree with the points; not used", unused)

@@ -52,8 +52,13 @@ def check_aspect(file: Path, shape: tuple[int, ...], view: View) -> None:
     height, width = shape[:2]
     if abs(width * photo.height / (height * photo.width) - 1.0) > _ASPECT_TOLERANCE:
         raise UserError(
-            f"{file}: has {width}x{height} pixels, but its photo has {photo.width}x{photo.height}; "
-            "use a map of the whole photo"
+            "{file}: has {width}x{height} pixels, but its photo has {width2}x{height2}; use a "
+            "map of the whole photo",
+            file=file,
+            width=width,
+            height=height,
+            width2=photo.width,
+            height2=photo.height,
         )
 
 

@@ -28,7 +28,12 @@ def listen(host: str, port: int | None) -> socket.socket:
             return _listen(host, candidate)
         except _InUse:
             continue
-    raise SettingError("port", f"{DEFAULT_PORT} to {last} are in use; choose another")
+    raise SettingError(
+        "port",
+        "{default_port} to {last} are in use; choose another",
+        default_port=DEFAULT_PORT,
+        last=last,
+    )
 
 
 class _InUse(SettingError):
@@ -37,14 +42,14 @@ class _InUse(SettingError):
 
 def _listen(host: str, port: int) -> socket.socket:
     if not 0 <= port < 65536:
-        raise SettingError("port", f"{port} is out of range; use 0 to 65535")
+        raise SettingError("port", "{port} is out of range; use 0 to 65535", port=port)
     try:
         found = socket.getaddrinfo(
             host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )
     except (OSError, UnicodeError):
         raise SettingError(
-            "host", f"{host} is not a name or address of this machine; use e.g. 127.0.0.1"
+            "host", "{host} is not a name or address of this machine; use e.g. 127.0.0.1", host=host
         ) from None
     # A name with addresses of both kinds, such as localhost: browsers try both.
     family, kind, protocol, _, where = min(found, key=lambda each: each[0] != socket.AF_INET)
@@ -58,13 +63,18 @@ def _listen(host: str, port: int) -> socket.socket:
         listener.close()
         if isinstance(error, PermissionError):
             raise SettingError(
-                "port", f"no permission to use {port}; choose one above 1023"
+                "port", "no permission to use {port}; choose one above 1023", port=port
             ) from None
         if error.errno == errno.EADDRINUSE:
             raise _InUse(
-                "port", f"{port} is in use; choose another, or omit it: then a free one is used"
+                "port",
+                "{port} is in use; choose another, or omit it: then a free one is used",
+                port=port,
             ) from None
         raise SettingError(
-            "host", f"cannot listen at {host} ({error.strerror}); use e.g. 127.0.0.1"
+            "host",
+            "cannot listen at {host} ({strerror}); use e.g. 127.0.0.1",
+            host=host,
+            strerror=error.strerror,
         ) from None
     return listener

@@ -54,12 +54,14 @@ def write_html(path: Path | str, scene: ReadyScene, about: Description | None = 
     about = about or Description(path.stem)
     count = len(scene.gaussians)
     if not count:
-        raise UserError(f"{path}: the scene has no Gaussians; a page needs at least one")
+        raise UserError("{path}: the scene has no Gaussians; a page needs at least one", path=path)
     content = sog_bytes(path, GaussianArrays.from_gaussians(scene.gaussians))
     if len(content) > _LARGEST:
         raise UserError(
-            f"{path}: {count:,} Gaussians are too many for one page; "
-            "decimate them, or drop SH degrees"
+            "{path}: {count:,} Gaussians are too many for one page; decimate them, or drop SH "
+            "degrees",
+            path=path,
+            count=count,
         )
     pictures = f"data:image/webp;base64,{_base64(scene.stops.pictures)}"
     bootstrap = scene.bootstrap(about, pictures) | {"contentFilename": "scene.sog"}

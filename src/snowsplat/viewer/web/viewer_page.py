@@ -43,7 +43,8 @@ def asset(name: str) -> str:
         return (_FOLDER / name).read_text(encoding="utf-8")
     except OSError:
         raise UserError(
-            f"{_FOLDER / name}: the viewer's page is missing; in a checkout, run make native"
+            "{name}: the viewer's page is missing; in a checkout, run make native",
+            name=_FOLDER / name,
         ) from None
 
 

@@ -131,14 +131,18 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
     paired = {i for pair in evidence.pairs for i in (pair.first, pair.second)}
     if usable < 3:
         return UserError(
-            f"photos: only {usable} of {count} show enough detail, and the others are too dark, "
-            "blurred or plain; take sharp, well-lit photos of objects with texture"
+            "photos: only {usable} of {count} show enough detail, and the others are too dark, "
+            "blurred or plain; take sharp, well-lit photos of objects with texture",
+            usable=usable,
+            count=count,
         )
     if len(paired) < 3:
         matching = f"only {len(paired)} of them match" if paired else "no two of them match"
         return UserError(
-            f"photos: the {count} photos do not overlap ({matching}); take photos "
-            "of one scene, so that each shows more than half of what the previous one shows"
+            "photos: the {count} photos do not overlap ({matching}); take photos of one scene, "
+            "so that each shows more than half of what the previous one shows",
+            count=count,
+            matching=matching,
         )
     if evidence.still:
         return UserError(
@@ -153,11 +157,13 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
         )
     if doubts:
         return UserError(
-            f"photos: no possible camera poses were found for the {count} photos: "
-            f"{', '.join(doubts)}; take more photos, with smaller steps between them, or set "
-            "another camera_model"
+            "photos: no possible camera poses were found for the {count} photos: {doubts}; take "
+            "more photos, with smaller steps between them, or set another camera_model",
+            count=count,
+            doubts=", ".join(doubts),
         )
     return UserError(
-        f"photos: no camera poses were found for the {count} photos, because their matches are "
-        "too few or inconsistent; take more photos, with smaller steps between them"
+        "photos: no camera poses were found for the {count} photos, because their matches are "
+        "too few or inconsistent; take more photos, with smaller steps between them",
+        count=count,
     )

@@ -73,7 +73,8 @@ def estimate_poses(
     """
     if len(photos) < 3:
         raise UserError(
-            f"photos: {len(photos)} are not enough; take at least 3, preferably 30 or more"
+            "photos: {photos} are not enough; take at least 3, preferably 30 or more",
+            photos=len(photos),
         )
     if options.camera_model not in ("auto", *CAMERA_MODELS):
         raise SettingError(
@@ -103,8 +104,10 @@ def estimate_poses(
         if crash.code < 0:
             advice = "use fewer or smaller photos, or a lower effort"
         raise UserError(
-            f"pose estimation: failed twice: {crash.reason}; {advice} "
-            f"(last line of the log: {_last_line(log)})"
+            "pose estimation: failed twice: {reason}; {advice} (last line of the log: {last_line})",
+            reason=crash.reason,
+            advice=advice,
+            last_line=_last_line(log),
         ) from None
     note = f"first attempt: {first.reason}; repeated with smaller photos and one thread"
     return dataclasses.replace(result, attempts=[note, *result.attempts])

@@ -37,15 +37,22 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
             image.load()
     except Exception as error:  # Pillow may raise any exception for a damaged file
         raise UserError(
-            f"{shown(path)}: the mask cannot be decoded ({reason_of(error)}); replace or remove it"
+            "{path}: the mask cannot be decoded ({reason_of}); replace or remove it",
+            path=shown(path),
+            reason_of=reason_of(error),
         ) from None
     stored, upright = (photo.width, photo.height), photo.size(None)
     if not has_orientation and has_shape(image.size, stored):
         image = made_upright(image, photo.exif.orientation)
     elif not has_shape(image.size, upright):
         raise UserError(
-            f"{shown(path)}: the mask is {image.width}x{image.height}, but its photo is "
-            f"{upright[0]}x{upright[1]}; make a mask of this shape"
+            "{path}: the mask is {width}x{height}, but its photo is {upright}x{upright2}; make a "
+            "mask of this shape",
+            path=shown(path),
+            width=image.width,
+            height=image.height,
+            upright=upright[0],
+            upright2=upright[1],
         )
     return shrunk(mask_levels(image) >= 128, size)
 

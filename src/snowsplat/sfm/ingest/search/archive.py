@@ -70,7 +70,9 @@ def unpack(path: Path) -> Path:
     with _opened(path) as archive:
         entries = _checked(archive, path)
         if not entries:
-            raise UserError(f"{shown(path)}: has no files; copy it again, or use another file")
+            raise UserError(
+                "{path}: has no files; copy it again, or use another file", path=shown(path)
+            )
         for folder in (path.with_suffix(""), path.with_name(f"{path.stem}_unpacked")):
             if _has_all(folder, entries):
                 return folder
@@ -78,7 +80,9 @@ def unpack(path: Path) -> Path:
                 _extract_all(archive, entries, folder)
                 return folder
         raise UserError(
-            f"{shown(path)}: cannot be unpacked, because {shown(folder)} has other files; remove it"
+            "{path}: cannot be unpacked, because {folder} has other files; remove it",
+            path=shown(path),
+            folder=shown(folder),
         )
 
 
@@ -87,7 +91,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """A zip file. Raises UserError if it cannot be read, here or in the block."""
     try:
         if _directory_bytes(path) > _LONGEST_DIRECTORY:
-            raise UserError(f"{shown(path)}: has too many files; unpack it first")
+            raise UserError("{path}: has too many files; unpack it first", path=shown(path))
         with zipfile.ZipFile(path) as archive:
             yield archive
     except UserError:
@@ -96,7 +100,9 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
         system = error.strerror if isinstance(error, OSError) else None
         reason = system or " ".join(str(error).split())[:80] or "it is damaged"
         raise UserError(
-            f"{shown(path)}: cannot be unpacked ({reason}); copy it again, or unpack it to a folder"
+            "{path}: cannot be unpacked ({reason}); copy it again, or unpack it to a folder",
+            path=shown(path),
+            reason=reason,
         ) from None
 
 
@@ -122,13 +128,17 @@ def _checked(archive: zipfile.ZipFile, path: Path) -> list[tuple[str, zipfile.Zi
         name = info.filename.replace("\\", "/")  # some programs for Windows write it
         pure = PurePosixPath(name)
         if pure.is_absolute() or ".." in pure.parts or ":" in name.partition("/")[0]:
-            raise UserError(f"{shown(path)}: has a file outside of its folder: {shown(name)[:80]}")
+            raise UserError(
+                "{path}: has a file outside of its folder: {name}",
+                path=shown(path),
+                name=shown(name)[:80],
+            )
         kind = stat.S_IFMT(info.external_attr >> 16)
         hidden = any(part.startswith(".") or part == "__MACOSX" for part in pure.parts)
         if name.endswith("/") or hidden or not pure.parts or kind not in (0, stat.S_IFREG):
             continue  # a folder, or a link
         if info.flag_bits & 1:
-            raise UserError(f"{shown(path)}: has a password; unpack it first")
+            raise UserError("{path}: has a password; unpack it first", path=shown(path))
         number = 1
         while str(pure).casefold() in entries:
             number += 1
@@ -137,8 +147,11 @@ def _checked(archive: zipfile.ZipFile, path: Path) -> list[tuple[str, zipfile.Zi
     size = sum(info.file_size for _, info in entries.values())
     if len(entries) > _MOST_FILES or size > max(_ALWAYS_ALLOWED, _MOST_RATIO * path.stat().st_size):
         raise UserError(
-            f"{shown(path)}: would become {len(entries):,} files of {size / 1e9:,.1f} GB; if that "
-            "is right, unpack it first"
+            "{path}: would become {entries:,} files of {size:,.1f} GB; if that is right, unpack "
+            "it first",
+            path=shown(path),
+            entries=len(entries),
+            size=size / 1000000000.0,
         )
     return list(entries.values())
 
@@ -158,8 +171,11 @@ def _extract_all(
     size = sum(info.file_size for _, info in entries)
     if size > (free := shutil.disk_usage(folder.parent).free):
         raise UserError(
-            f"disk: about {size / 1e6:,.0f} MB are needed to unpack {shown(folder.name)}.zip and "
-            f"{free / 1e6:,.0f} MB are free; free some space"
+            "disk: about {size:,.0f} MB are needed to unpack {name}.zip and {free:,.0f} MB are "
+            "free; free some space",
+            size=size / 1000000.0,
+            name=shown(folder.name),
+            free=free / 1000000.0,
         )
     with new_folder(folder.with_name(f".{folder.name}.{os.getpid()}.tmp")) as temporary:
         for name, info in entries:

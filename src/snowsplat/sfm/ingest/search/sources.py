@@ -137,7 +137,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
 
     for path in inputs:
         if not path.exists():
-            raise UserError(f"{shown(path)}: no such file or folder")
+            raise UserError("{path}: no such file or folder", path=shown(path))
         if is_zip(path):
             path = _unpacked(path)
         if not path.is_dir():
@@ -317,9 +317,11 @@ def _unpacked(path: Path) -> Path:
     """The folder of a zip file of photos or videos. Raises UserError if it has none."""
     names = [PurePosixPath(name) for name in files_in(path)]
     if any(name.name in ("means_l.webp", "lod-meta.json") for name in names):
-        raise UserError(f"{shown(path)}: is a scene, and no photos; see it with: snowsplat view")
+        raise UserError(
+            "{path}: is a scene, and no photos; see it with: snowsplat view", path=shown(path)
+        )
     if not any(name.suffix.lower() in PHOTO_SUFFIXES | VIDEO_SUFFIXES for name in names):
-        raise UserError(f"{shown(path)}: is a zip file without photos and videos")
+        raise UserError("{path}: is a zip file without photos and videos", path=shown(path))
     return unpack(path)
 
 
@@ -332,25 +334,37 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
         with open(path, "rb") as file:
             head = file.read(32)
     except OSError as error:
-        raise UserError(f"{shown(path)}: cannot be read ({error.strerror})") from None
+        raise UserError(
+            "{path}: cannot be read ({strerror})", path=shown(path), strerror=error.strerror
+        ) from None
     suffix = path.suffix.lower()
     if suffix in _UNREAD_SUFFIXES:  # many are TIFF files with a small preview
         form = _format_name(path.name)
         raise UserError(
-            f"{shown(path)}: is a {form} photo, which cannot be read; save it as JPEG or PNG first"
+            "{path}: is a {form} photo, which cannot be read; save it as JPEG or PNG first",
+            path=shown(path),
+            form=form,
         )
     if _is_photo(head):
         return "photo"
     if archive := other_archive(path):
-        raise UserError(f"{shown(path)}: is a {archive} archive; unpack it first")
+        raise UserError(
+            "{path}: is a {archive} archive; unpack it first", path=shown(path), archive=archive
+        )
     no_video = why_no_video(path)
     if no_video is None:
         return "video"
     if suffix in PHOTO_SUFFIXES:
-        raise UserError(f"{shown(path)}: not a photo, despite its extension; use another file")
+        raise UserError(
+            "{path}: not a photo, despite its extension; use another file", path=shown(path)
+        )
     if suffix in VIDEO_SUFFIXES or no_video == ONLY_SOUND:
-        raise UserError(f"{shown(path)}: {no_video}; copy it again, or use another file")
-    raise UserError(f"{shown(path)}: neither a photo nor a video; use another file")
+        raise UserError(
+            "{path}: {no_video}; copy it again, or use another file",
+            path=shown(path),
+            no_video=no_video,
+        )
+    raise UserError("{path}: neither a photo nor a video; use another file", path=shown(path))
 
 
 def _is_photo(head: bytes) -> bool:
@@ -369,10 +383,11 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
         broken: list[str] = []
         files = files_below(path, _masks_and_outputs, broken)
         if reason := _unread_photos(files, []) or _broken_links(broken):
-            return UserError(f"{names}: {reason}")
+            return UserError("{names}: {reason}", names=names, reason=reason)
     return UserError(
-        f"{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
-        "that contains them"
+        "{names}: no photos (JPEG, PNG, WebP, TIFF, HEIC) and no videos found; use the folder "
+        "that contains them",
+        names=names,
     )
 
 

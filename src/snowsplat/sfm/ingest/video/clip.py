@@ -148,7 +148,9 @@ def read_clip(path: Path) -> Clip:
         with open_video(path) as container:
             first = next(decoded_frames(container), None)
     except NoVideoError as error:
-        raise UserError(f"{shown(path)}: {error}; use a video or photos") from None
+        raise UserError(
+            "{path}: {error}; use a video or photos", path=shown(path), error=error
+        ) from None
     except (av.FFmpegError, OSError, ValueError) as error:
         raise undecodable(path, error) from None
     if first is None or not times:
@@ -277,7 +279,10 @@ def undecodable(path: Path, error: Exception | None) -> UserError:
     """The error to raise if no frame of a video can be decoded."""
     reason = f" ({getattr(error, 'strerror', None) or error})" if error else ""
     return UserError(
-        f"{shown(path)}: no frame of this video can be decoded{reason}; if it is truncated or "
-        f"damaged, copy it again; if it has more than {_MAX_PIXELS // 1_000_000} million pixels "
-        "or an unknown codec, convert it to mp4 (H.264)"
+        "{path}: no frame of this video can be decoded{reason}; if it is truncated or damaged, "
+        "copy it again; if it has more than {max_pixels} million pixels or an unknown codec, "
+        "convert it to mp4 (H.264)",
+        path=shown(path),
+        reason=reason,
+        max_pixels=_MAX_PIXELS // 1000000,
     )
