@@ -21,7 +21,7 @@ from workloads import Workload
 
 from snowsplat import ops
 from snowsplat.data import Dataset, Points, View
-from snowsplat.data.decode import ImageSource, LoadedImage
+from snowsplat.data.photos.decode import ImageSource, LoadedImage
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import Execute, launch_by
 from snowsplat.ops.native import LAUNCHERS

@@ -28,7 +28,7 @@ from workloads import SIZES, workload
 
 from snowsplat import ops
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.pipeline.run import processes
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import project

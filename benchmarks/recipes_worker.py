@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat import Dataset, Trainer, UserError, load_dataset, ops, recipe
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.render import project, render
 from snowsplat.training.core.background import FIXED_BACKGROUNDS
 from snowsplat.training.settings.stored import config_to_json

@@ -25,7 +25,7 @@ import torch
 from workloads import SIZES, workload
 
 from snowsplat.data import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.viewer.live.session import RenderRequest
 from snowsplat.viewer.live.viewer import NetworkViewer

@@ -28,7 +28,7 @@ from workloads import SIZES, workload
 
 from snowsplat import Trainer, load_dataset, ops, recipe
 from snowsplat.data import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.process import single_threaded
 from snowsplat.viewer.live.curves import SampledPsnr

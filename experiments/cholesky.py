@@ -27,8 +27,8 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data.dataset import Dataset
-from snowsplat.data.image_loader import ImageLoader
 from snowsplat.data.load import load_dataset
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.ops.reference import LOW_PASS
 from snowsplat.ops.splats import Splats2D
 from snowsplat.pipeline.observer import SILENT

@@ -34,8 +34,8 @@ from poses import Poses
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.image_loader import ImageLoader
 from snowsplat.data.load import load_dataset
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import invert_rigid

@@ -16,7 +16,7 @@ from PIL import Image
 
 from snowsplat.cli.main import main
 from snowsplat.data import load_dataset
-from snowsplat.data.placement import read_placement
+from snowsplat.data.frame.placement import read_placement
 from snowsplat.sfm.gps import location_of
 
 from ..sfm.colmap import scenes

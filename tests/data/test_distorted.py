@@ -15,10 +15,10 @@ from PIL import Image
 from snowsplat.data import ImageLoader, load_dataset
 from snowsplat.data.colmap import ColmapCamera, ColmapImage, read_model, write_model
 from snowsplat.data.colmap.types import CAMERA_MODELS
-from snowsplat.data.decode import load_image, load_thumbnail
-from snowsplat.data.depth_file import to_z
 from snowsplat.data.judge.verdict import judge
 from snowsplat.data.lens.project import LensModel, intrinsics, project
+from snowsplat.data.maps.depth_file import to_z
+from snowsplat.data.photos.decode import load_image, load_thumbnail
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.util.errors import UserError
 

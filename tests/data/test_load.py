@@ -11,8 +11,8 @@ from PIL import Image
 
 from snowsplat import data
 from snowsplat.data import ImageLoader, Points, load_dataset, read_files
-from snowsplat.data.bounds import scene_bounds
 from snowsplat.data.dataset import safe_name, scene_extent
+from snowsplat.data.frame.bounds import scene_bounds
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import SettingError, UserError
 

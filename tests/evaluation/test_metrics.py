@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics, compare, evaluate_views, psnr
 from snowsplat.ops import reference
 from snowsplat.scene.camera import Camera

@@ -28,13 +28,13 @@ from PIL import Image
 from pillow_heif import register_heif_opener
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colour_profile import to_srgb
-from snowsplat.data.decode import ImageSource, load_image, load_mask
-from snowsplat.data.decode import read_header as read_image_header
-from snowsplat.data.files.mask_look import doubt_about_files
-from snowsplat.data.files.mask_pixels import looks_like_mask
-from snowsplat.data.imports import find_export, read_export
+from snowsplat.data.maps.mask_look import doubt_about_files
+from snowsplat.data.maps.mask_pixels import looks_like_mask
+from snowsplat.data.photos.colour_profile import to_srgb
+from snowsplat.data.photos.decode import ImageSource, load_image, load_mask
+from snowsplat.data.photos.decode import read_header as read_image_header
 from snowsplat.data.points_ply import read_points, write_points
+from snowsplat.data.readers import find_export, read_export
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
 from snowsplat.formats.lod import INDEX, LEVELS
@@ -59,8 +59,8 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
 
-from ..data import colour_profiles
-from ..data.imports import exports
+from ..data.photos import colour_profiles
+from ..data.readers import exports
 from ..formats.test_ksplat import ksplat, section
 from ..sfm.pictures import exif, pan, photo, write_video
 from ..usd import USD

@@ -22,7 +22,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from snowsplat.data import load_dataset
-from snowsplat.data.decode import ImageSource, load_image, read_header
+from snowsplat.data.photos.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack

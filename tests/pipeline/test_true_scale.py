@@ -12,7 +12,7 @@ import torch
 
 from snowsplat import Trainer, recipe
 from snowsplat.data import load_dataset
-from snowsplat.data.placement import PLACEMENT, Placement
+from snowsplat.data.frame.placement import PLACEMENT, Placement
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.describe import describe

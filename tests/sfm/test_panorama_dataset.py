@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import load_dataset
-from snowsplat.data.decode import load_image
+from snowsplat.data.photos.decode import load_image
 from snowsplat.scene.geometry import Similarity
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.progress import silent

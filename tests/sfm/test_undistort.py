@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import load_dataset
-from snowsplat.data.decode import load_image, load_mask
+from snowsplat.data.photos.decode import load_image, load_mask
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient import orientation

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from snowsplat import TrainConfig, Trainer
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, transform_points
 

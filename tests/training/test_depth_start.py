@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.decode import ImageSource
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.decode import ImageSource
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.starts import depth_points
 from snowsplat.training.starts.init import initial_gaussians

@@ -17,8 +17,8 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.data import load_dataset
 from snowsplat.data.dataset import Dataset
-from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.train import TrainOptions, train

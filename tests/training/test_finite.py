@@ -12,7 +12,7 @@ import torch
 
 from snowsplat.data import Dataset
 from snowsplat.data.dataset import Points
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.finite import Diverged, check_loss, rows_not_finite

@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.decode import ImageSource
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from snowsplat import ops
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.training.core.losses import view_loss
 
 BLACK = torch.zeros(3)

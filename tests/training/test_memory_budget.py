@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from snowsplat.data import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
-from snowsplat.data.image_loader import DECODERS
+from snowsplat.data.photos.decode import ImageSource
+from snowsplat.data.photos.image_loader import DECODERS
 from snowsplat.scene.camera import Camera
 from snowsplat.training.budgets.memory_budget import (
     CPU,

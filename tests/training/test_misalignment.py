@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.training.parts.misalignment import misalignment, shift_between

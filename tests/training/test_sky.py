@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.decode import ImageSource
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, rotation_from_quat
 from snowsplat.training.core.trainer import Trainer

@@ -13,8 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.decode import ImageSource
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, transform_points
 from snowsplat.training.settings import TrainConfig, changed

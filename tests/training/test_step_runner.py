@@ -13,7 +13,7 @@ import torch
 from tests.gaussians import gaussians_in_box
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import ImageSource, LoadedImage
+from snowsplat.data.photos.decode import ImageSource, LoadedImage
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.training.core.finite import Diverged

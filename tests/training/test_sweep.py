@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource, load_views
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.decode import ImageSource, load_views
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.pipeline.confirmed_depth import confirm_by_photos
 from snowsplat.pipeline.mesh import _photos
 from snowsplat.scene.camera import Camera
@@ -172,7 +172,7 @@ def test_photos_that_are_larger_than_their_maps_are_decoded_once(
         decoded.append(sources[0][0].path)
         return load_views(sources, background)
 
-    monkeypatch.setattr("snowsplat.data.image_loader.load_views", load)
+    monkeypatch.setattr("snowsplat.data.photos.image_loader.load_views", load)
     monkeypatch.setattr("snowsplat.pipeline.confirmed_depth.LONGER_SIDE", 24)
     weight = torch.full((18, 24), 255, dtype=torch.uint8)
     small = [camera.scaled(24, 18) for camera in CAMERAS]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from snowsplat import ops
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.ops import reference
 from snowsplat.scene.camera import Camera

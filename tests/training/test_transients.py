@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from snowsplat import Dataset, Gaussians, TrainConfig, Trainer, load_dataset, ops, recipe
-from snowsplat.data.decode import LoadedImage, load_image
+from snowsplat.data.photos.decode import LoadedImage, load_image
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

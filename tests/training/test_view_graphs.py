@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data import Dataset
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.batch import BatchView
 from snowsplat.training.core.run import Run

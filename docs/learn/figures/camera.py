@@ -53,7 +53,7 @@ def top_view() -> None:
 
     photo = Drawing(320, 260, x=(0, 1), y=(0, 1), margins=(0, 10, 0, 12))
     (view,) = (v for v in [*data.train, *data.test] if v.name == scene.VIEW)
-    from snowsplat.data.image_loader import ImageLoader
+    from snowsplat.data.photos.image_loader import ImageLoader
 
     image = ImageLoader([view]).get(view, 1).rgb
     photo.picture(np.asarray(image), (0, 0), (1, 1))

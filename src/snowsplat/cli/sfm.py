@@ -81,7 +81,7 @@ class Sfm(Reports):
 
     def run(self) -> int:
         inputs, folder = self._inputs_and_folder()
-        from snowsplat.data.placement import placement_of
+        from snowsplat.data.frame.placement import placement_of
         from snowsplat.evaluation.verdict import Verdict
         from snowsplat.sfm.dataset_folder import make_dataset
 

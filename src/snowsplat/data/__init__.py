@@ -10,9 +10,9 @@ from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
     from snowsplat.data.dataset import Dataset, Points, View, scene_extent
-    from snowsplat.data.decode import ImageSource, LoadedImage
-    from snowsplat.data.image_loader import ImageLoader
     from snowsplat.data.load import DatasetFiles, load_dataset, read_files
+    from snowsplat.data.photos.decode import ImageSource, LoadedImage
+    from snowsplat.data.photos.image_loader import ImageLoader
 
 __all__ = [
     "Dataset",
@@ -30,9 +30,9 @@ __all__ = [
 _MODULES = {
     "Dataset": "dataset",
     "DatasetFiles": "load",
-    "ImageLoader": "image_loader",
-    "ImageSource": "decode",
-    "LoadedImage": "decode",
+    "ImageLoader": "photos.image_loader",
+    "ImageSource": "photos.decode",
+    "LoadedImage": "photos.decode",
     "Points": "dataset",
     "View": "dataset",
     "load_dataset": "load",

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snowsplat.data.bounds import EXTENT_FACTOR, scene_bounds
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.frame.bounds import EXTENT_FACTOR, scene_bounds
 from snowsplat.data.lens.project import LensModel
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.util.errors import UserError

@@ -12,19 +12,25 @@ import torch
 
 from snowsplat.data.colmap import find_models, find_models_below, read_colmap
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
-from snowsplat.data.decode import IMAGE_SUFFIXES, Header, ImageSource, load_thumbnail, read_header
 from snowsplat.data.files.masks import with_masks
-from snowsplat.data.files.photos import photos_below
-from snowsplat.data.imports import Export, find_export, read_export
-from snowsplat.data.imports.projects import advice
+from snowsplat.data.files.photo_files import photos_below
+from snowsplat.data.frame.move_to_origin import moved_to_origin
+from snowsplat.data.frame.near import near_of
+from snowsplat.data.frame.placement import read_placement
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
-from snowsplat.data.map_file import MAP_SUFFIXES
-from snowsplat.data.near import near_of
-from snowsplat.data.place import moved_to_origin
-from snowsplat.data.placement import read_placement
-from snowsplat.data.transforms_json import find_transforms, read_transforms
+from snowsplat.data.maps.map_file import MAP_SUFFIXES
+from snowsplat.data.photos.decode import (
+    IMAGE_SUFFIXES,
+    Header,
+    ImageSource,
+    load_thumbnail,
+    read_header,
+)
+from snowsplat.data.readers import Export, find_export, read_export
+from snowsplat.data.readers.projects import advice
+from snowsplat.data.readers.transforms_json import find_transforms, read_transforms
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import Origin
@@ -62,7 +68,7 @@ def load_dataset(
     Args:
         path: a folder with a COLMAP model (``sparse/0`` …, binary or text) and images; a folder
             with ``transforms.json`` or ``transforms_train.json``; or such a JSON file; or the
-            export of another program, see `snowsplat.data.imports`. The folder may contain depth
+            export of another program, see `snowsplat.data.readers`. The folder may contain depth
             and normal maps of the images, ``depths/IMG.png`` and ``normals/IMG.png`` (or TIFF, NPY,
             EXR).
         images: name of the folder of images.

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_aligned
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.scene.gaussians import Gaussians

@@ -210,7 +210,7 @@ def _zip(path: Path) -> dict[str, Any]:
 
 
 def _is_export(path: Path) -> bool:
-    from snowsplat.data.imports import find_export  # torch
+    from snowsplat.data.readers import find_export  # torch
 
     return find_export(path) is not None
 

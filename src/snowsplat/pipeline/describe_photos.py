@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from snowsplat.data.files.mask_look import doubt_about_files
+from snowsplat.data.maps.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, steps_of

@@ -28,7 +28,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from snowsplat.data.placement import PLACEMENT
+from snowsplat.data.frame.placement import PLACEMENT
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather

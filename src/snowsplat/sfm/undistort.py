@@ -25,14 +25,14 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.data.colour_profile import plain_pixels
-from snowsplat.data.decode import resize_area
-from snowsplat.data.image_file import open_image, reason_of
-from snowsplat.data.image_loader import available_memory
 from snowsplat.data.lens.coverage import shown
 from snowsplat.data.lens.project import LensModel
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, lens_views, pinhole_view
+from snowsplat.data.photos.colour_profile import plain_pixels
+from snowsplat.data.photos.decode import resize_area
+from snowsplat.data.photos.image_file import open_image, reason_of
+from snowsplat.data.photos.image_loader import available_memory
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path

@@ -1,8 +1,10 @@
-"""Marks an mp4 file as a 360° video, so that players show it as a sphere.
+"""Metadata of 360° videos and photos, by which programs show them as a sphere.
 
-Both versions of Google's specification are written, because players read one or the other: a box
-``uuid`` with XML in the track, and the boxes ``st3d`` and ``sv3d`` beside the description of the
-codec. https://github.com/google/spatial-media/tree/master/docs
+Of a video, both versions of Google's specification are written, because players read one or the
+other: a box ``uuid`` with XML in the track, and the boxes ``st3d`` and ``sv3d`` beside the
+description of the codec. https://github.com/google/spatial-media/tree/master/docs
+
+Photos have GPano in XMP. https://developers.google.com/streetview/spherical-metadata
 """
 
 from __future__ import annotations
@@ -20,11 +22,27 @@ xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">\
 <GSpherical:StitchingSoftware>snowsplat</GSpherical:StitchingSoftware>\
 <GSpherical:ProjectionType>equirectangular</GSpherical:ProjectionType>\
 </rdf:SphericalVideo>"""
+_GPANO = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"
+   GPano:ProjectionType="equirectangular" GPano:UsePanoramaViewer="True"
+   GPano:FullPanoWidthPixels="{width}" GPano:FullPanoHeightPixels="{height}"
+   GPano:CroppedAreaImageWidthPixels="{width}" GPano:CroppedAreaImageHeightPixels="{height}"
+   GPano:CroppedAreaLeftPixels="0" GPano:CroppedAreaTopPixels="0"/>
+ </rdf:RDF>
+</x:xmpmeta>
+<?xpacket end="w"?>"""
 # The boxes on the way to the description of the codec, and the bytes before their first child.
 _CONTAINERS = {b"moov": 8, b"trak": 8, b"mdia": 8, b"minf": 8, b"stbl": 8, b"stsd": 16}
 _ENTRIES = (b"avc1", b"mp4v", b"hvc1", b"hev1")
 
 _OFFSETS = {b"stco": 4, b"co64": 8}  # bytes of a position in the file
+
+
+def panorama_xmp(width: int, height: int) -> bytes:
+    """The XMP packet of an equirectangular panorama of all directions; its size in pixels."""
+    return _GPANO.format(width=width, height=height).encode()
 
 
 def mark_as_spherical(path: Path) -> None:

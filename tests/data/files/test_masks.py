@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.data.files.mask_pixels import looks_like_mask, mask_levels
 from snowsplat.data.files.masks import find_masks
+from snowsplat.data.maps.mask_pixels import looks_like_mask, mask_levels
 
 
 def photo(path, seed=0):

@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 
 from snowsplat.data.dataset import Points, View
-from snowsplat.data.decode import ImageSource
 from snowsplat.data.judge.mask_check import mask_findings
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
 
 WIDTH, HEIGHT = 90, 60

@@ -14,9 +14,9 @@ import torch
 from snowsplat.data.colmap import posed_camera, read_model
 from snowsplat.data.colmap.tracks import points_with_tracks
 from snowsplat.data.dataset import Points, Tracks, View
-from snowsplat.data.decode import ImageSource
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.judge.track_evidence import track_fit
+from snowsplat.data.photos.decode import ImageSource
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from snowsplat.data.depth_alignment import align
+from snowsplat.data.maps.depth_alignment import align
 from snowsplat.scene.geometry import transform_points
 from snowsplat.util.errors import UserError
 

@@ -104,12 +104,12 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         '+ image.name.encode(errors="surrogateescape")',
     ): "UTF-8 is the default",
     (
-        "data/decode.py",
+        "data/photos/decode.py",
         "colours = (colours + (1 - alpha) * behind).clip(0, 255)",
         "colours = (colours + (1 - alpha) * behind).clip(None, 255)",
     ): "the sum of values that are not negative is not negative",
     (
-        "data/image_file.py",
+        "data/photos/image_file.py",
         "header = start + file.read(_LONGEST_HEADER)",
         "header = start + file.read(None)",
     ): "more is read than is needed",
@@ -169,12 +169,12 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "LOOKAHEAD = 17",
     ): "how far ahead photos are decoded; their order is the same",
     (
-        "data/transforms_json.py",
+        "data/readers/transforms_json.py",
         '_Split = Literal["train", "test"]',
         '_Split = Literal["XXtrainXX", "test"]',
     ): "it is used in annotations only",
     (
-        "data/image_loader.py",
+        "data/photos/image_loader.py",
         'self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="snowsplat-images")',
         'self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="XXsnowsplat-imagesXX")',
     ): "names of threads are shown by debuggers only",
@@ -239,28 +239,28 @@ EQUIVALENTS: dict[tuple[str, str, str], str] = {
         "last = torch.tensor([left + w + 0.5, top + h - 0.5]).to(means2d)",
     ): "a larger rectangle adds splats whose alpha is 0 in all pixels",
     (
-        "data/transforms_json.py",
+        "data/readers/transforms_json.py",
         "u, _, vt = np.linalg.svd(axes / scale if scale > 1e-9 else np.zeros((3, 3)))",
         "u, _, vt = np.linalg.svd(axes / scale if scale > 9.375000000000001e-10 "
         "else np.zeros((3, 3)))",
     ): "a matrix with a scale of at most 1e-9 is rejected either way",
     (
-        "data/bounds.py",
+        "data/frame/bounds.py",
         "across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]",
         "across = torch.eye(3, dtype=None) - axes[:, :, None] * axes[:, None, :]",
     ): "0 and 1 are exact in float32, and the difference is float64",
     (
-        "data/bounds.py",
+        "data/frame/bounds.py",
         "if float(direction.norm()) > 0.5:",
         "if float(direction.norm()) >= 0.5:",
     ): "rounding decides at equality",
     (
-        "data/image_file.py",
+        "data/photos/image_file.py",
         'if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", ())):',
         'if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", )):',
     ): "images of all accepted formats have tiles",
     (
-        "data/decode.py",
+        "data/photos/decode.py",
         "colours = (colours + (1 - alpha) * behind).clip(0, 255)",
         "colours = (colours + (1 - alpha) * behind).clip(0, 256)",
     ): "the sum is at most 255, up to rounding",

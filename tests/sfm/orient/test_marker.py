@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.placement import Placement
+from snowsplat.data.frame.placement import Placement
 from snowsplat.scene.geometry import look_at
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient import orientation

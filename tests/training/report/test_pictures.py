@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians

@@ -11,7 +11,7 @@ from PIL import Image
 
 from snowsplat.data import load_dataset
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import ImageSource
+from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.budgets import time_plan as planning

@@ -17,7 +17,7 @@ from snowsplat.data.colmap.places import workspace_of
 from snowsplat.data.colmap.tracks import points_with_tracks
 from snowsplat.data.colmap.types import ColmapImage, ColmapModel, lens_of
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
-from snowsplat.data.files.photos import find_photos, photos_below, warn_of_missing
+from snowsplat.data.files.photo_files import find_photos, photos_below, warn_of_missing
 from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.lens.project import intrinsics
 from snowsplat.data.points_ply import read_points as read_points_ply

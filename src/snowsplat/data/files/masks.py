@@ -22,7 +22,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.dataset import PosedImage
-from snowsplat.data.decode import is_photo
 from snowsplat.data.files.listing import (
     PHOTO_FOLDERS,
     files_below,
@@ -30,7 +29,8 @@ from snowsplat.data.files.listing import (
     folder_kind,
     original_of,
 )
-from snowsplat.data.files.mask_pixels import looks_like_mask
+from snowsplat.data.maps.mask_pixels import looks_like_mask
+from snowsplat.data.photos.decode import is_photo
 
 logger = logging.getLogger(__name__)
 

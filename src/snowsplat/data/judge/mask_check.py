@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from snowsplat.data.dataset import Points, View
-from snowsplat.data.decode import ImageSource, load_mask
-from snowsplat.data.files.mask_look import INVERT, doubt_about_masks, look_of
-from snowsplat.data.image_file import scaled_size
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.rig import Rig
+from snowsplat.data.maps.mask_look import INVERT, doubt_about_masks, look_of
+from snowsplat.data.photos.decode import ImageSource, load_mask
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 

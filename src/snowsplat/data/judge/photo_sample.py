@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import load_thumbnail
 from snowsplat.data.judge.rig import Rig
+from snowsplat.data.photos.decode import load_thumbnail
 from snowsplat.util.errors import UserError
 
 # Pixels of the longer side: enough for matches, and for the colours of points.

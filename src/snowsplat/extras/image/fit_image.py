@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from snowsplat.data.decode import ImageSource, load_image, read_header
+from snowsplat.data.photos.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.metrics import compare
 from snowsplat.extras.image.compact_file import read_compact, write_compact
 from snowsplat.extras.image.fit import FitOptions, Fitter

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.depth_alignment import Alignment
-from snowsplat.data.depth_file import DepthKind, read_depth_file, to_z
+from snowsplat.data.maps.depth_alignment import Alignment
+from snowsplat.data.maps.depth_file import DepthKind, read_depth_file, to_z
 from snowsplat.evaluation.metrics import Evaluation, compare
 from snowsplat.extras.lift.depth_model import estimate_depth
 from snowsplat.extras.lift.edges import resize_depth

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from snowsplat.data import Dataset, ImageLoader, Points, View
-from snowsplat.data.depth_alignment import align
+from snowsplat.data.maps.depth_alignment import align
 from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, finish
 from snowsplat.pipeline.compute import Compute

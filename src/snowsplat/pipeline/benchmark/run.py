@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from snowsplat.data.transforms_json import find_transforms
+from snowsplat.data.readers.transforms_json import find_transforms
 from snowsplat.evaluation.lpips import Lpips, is_packaged
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.panorama import panorama_xmp
+from snowsplat.trajectory.spherical_metadata import panorama_xmp
 from snowsplat.util.files import atomic_path
 
 # Anchors of a colour map from far (0) to near (1) of increasing lightness: violet to yellow.

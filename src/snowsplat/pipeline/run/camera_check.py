@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from snowsplat.data import Dataset, View
-from snowsplat.data.decode import load_thumbnail
 from snowsplat.data.judge.verdict import judge
+from snowsplat.data.photos.decode import load_thumbnail
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)

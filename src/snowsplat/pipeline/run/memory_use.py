@@ -44,7 +44,7 @@ class MemoryUse:
 
         Raises: UserError: ``budget`` is not a number of bytes, or is too small.
         """
-        from snowsplat.data.image_loader import available_memory
+        from snowsplat.data.photos.image_loader import available_memory
         from snowsplat.training.budgets.memory_budget import plan_memory
         from snowsplat.util.byte_size import parse_bytes
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-from snowsplat.data.files.mask_look import doubt_about_masks
+from snowsplat.data.maps.mask_look import doubt_about_masks
 from snowsplat.sfm.ingest.content.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.photo import Photo

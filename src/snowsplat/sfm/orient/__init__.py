@@ -9,7 +9,7 @@ known scale, and the photographed object at the origin.
     positions      scale, north and level from GPS positions
     cameras        the data of the model
 
-What was found is recorded in sfm.json; see `snowsplat.data.placement`.
+What was found is recorded in sfm.json; see `snowsplat.data.frame.placement`.
 """
 
 from snowsplat.sfm.orient.scene_frame import Oriented, orientation

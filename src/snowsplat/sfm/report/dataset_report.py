@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
-from snowsplat.data.colour_profile import plain_pixels
-from snowsplat.data.placement import Placement, placement_of
+from snowsplat.data.frame.placement import Placement, placement_of
+from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.evaluation import verdict
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.pinhole_model import photo_of

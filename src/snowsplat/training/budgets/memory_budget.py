@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from snowsplat.data.dataset import Dataset
-from snowsplat.data.image_loader import DECODERS
+from snowsplat.data.photos.image_loader import DECODERS
 from snowsplat.scene.gaussians import SH_REST_COUNTS
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed

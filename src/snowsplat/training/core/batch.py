@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from snowsplat.data.dataset import View
-    from snowsplat.data.decode import LoadedImage
+    from snowsplat.data.photos.decode import LoadedImage
     from snowsplat.scene.gaussians import Gaussians
 
 _LOWER_RATES = "use lower learning rates"

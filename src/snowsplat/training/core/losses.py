@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 
 
 def view_loss(

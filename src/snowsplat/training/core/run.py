@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import ImageLoader, Photos, available_memory
+from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.data.photos.image_loader import ImageLoader, Photos, available_memory
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.gaussian_parameters import PARAMETERS
 from snowsplat.ops.readback import Readback

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.batch import BatchView, batch_gradients

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
 from snowsplat.training.core.background import Background
 from snowsplat.training.core.batch import BatchView

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops import scratch
 
 #: 8-bit values from this one on are overexposed.

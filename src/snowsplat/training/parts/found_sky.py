@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from snowsplat.data.dataset import Dataset, Points, View
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.orientation import scene_up
 from snowsplat.training.parts.direction_cells import (

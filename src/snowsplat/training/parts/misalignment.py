@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 from snowsplat.util.process import single_threaded

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.data.photos.image_loader import Photos
 
 
 class NeutralPhotos:

@@ -28,9 +28,9 @@ from torch.nn.functional import interpolate
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import Photos
 from snowsplat.data.lens.resample import nearest
-from snowsplat.data.normal_file import read_normal_file
+from snowsplat.data.maps.normal_file import read_normal_file
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import RenderOutput, project
 from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from torch import Tensor
 
 from snowsplat.data.dataset import Points
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
 

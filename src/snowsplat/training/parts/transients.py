@@ -35,7 +35,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from snowsplat import ops
-from snowsplat.data.decode import LoadedImage
+from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import project
 from snowsplat.training.parts.part import Part

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import ImageLoader
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_fit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render

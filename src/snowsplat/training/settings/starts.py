@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import torch
 
     from snowsplat.data.dataset import Dataset, Points
-    from snowsplat.data.image_loader import Photos
+    from snowsplat.data.photos.image_loader import Photos
 
     #: dataset, its photos, maximum number of points, random generator on the CPU -> points in the
     #: world frame, on the CPU; there may be none.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.starts.depth import depth_points
 from snowsplat.training.starts.map_views import map_pixels
 from snowsplat.training.starts.random_rays import random_points

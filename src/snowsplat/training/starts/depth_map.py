@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Points
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.training.starts.map_views import MapViews
 from snowsplat.training.starts.photos import in_threads, reduced_photo

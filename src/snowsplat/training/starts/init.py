@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
 from snowsplat.training.core.finite import check_finite

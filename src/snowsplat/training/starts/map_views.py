@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.dataset import Dataset, View
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.starts.depth_map import LONGER_SIDE, map_size
 from snowsplat.training.starts.source_views import source_views
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from snowsplat.data.dataset import View
-from snowsplat.data.decode import LoadedImage
-from snowsplat.data.image_loader import DECODERS, Photos
+from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.data.photos.image_loader import DECODERS, Photos
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from snowsplat import ops
 from snowsplat.data.dataset import View
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
 from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, photo_for_map

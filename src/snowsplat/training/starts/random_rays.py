@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from snowsplat.data.bounds import scene_bounds
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.frame.bounds import scene_bounds
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import transform_points
 from snowsplat.training.starts.photos import reduced_photo, usable_pixels

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from snowsplat.data.dataset import Dataset, Points
-from snowsplat.data.image_loader import Photos
+from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.starts.depth_map import LONGER_SIDE
 from snowsplat.training.starts.fusion import fused_points
 from snowsplat.training.starts.map_views import choose_views

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data import View
-from snowsplat.data.decode import load_image, load_mask, resize_area
+from snowsplat.data.photos.decode import load_image, load_mask, resize_area
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render

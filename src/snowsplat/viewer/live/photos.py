@@ -17,7 +17,7 @@ from torch import Tensor
 
 from snowsplat import ops
 from snowsplat.data import View
-from snowsplat.data.decode import load_image
+from snowsplat.data.photos.decode import load_image
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.live.display import PhotoRectangle, fit

@@ -6,7 +6,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from snowsplat.data.image_file import scaled_size
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.photos.photo_files import (
     Unusable,
     decode,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from snowsplat.data.image_file import scaled_size
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.photos.photo_files import open_image
 from snowsplat.util import array_kernels
 from snowsplat.util.machine import memory_bytes

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.image_file import scaled_size
+from snowsplat.data.photos.image_file import scaled_size
 
 #: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of
 #: the copy is still detected, while noise of the sensor and of compression is mostly averaged out.

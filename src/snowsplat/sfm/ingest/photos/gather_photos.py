@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.files.mask_look import MaskLook, look_of
+from snowsplat.data.maps.mask_look import MaskLook, look_of
 from snowsplat.sfm.ingest.content.panorama import (
     NOT_TWICE_AS_WIDE,
     Panorama,

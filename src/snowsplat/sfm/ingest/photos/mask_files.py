@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
-from snowsplat.data.files.mask_pixels import has_shape, mask_levels
-from snowsplat.data.image_file import reason_of
+from snowsplat.data.maps.mask_pixels import has_shape, mask_levels
+from snowsplat.data.photos.image_file import reason_of
 from snowsplat.sfm.ingest.photos.photo_files import Header, made_upright, open_image
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown

@@ -16,9 +16,9 @@ from pathlib import Path, PurePosixPath
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
-from snowsplat.data import image_file
-from snowsplat.data.colour_profile import is_transparent, plain_pixels
-from snowsplat.data.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
+from snowsplat.data.photos import image_file
+from snowsplat.data.photos.colour_profile import is_transparent, plain_pixels
+from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
 from snowsplat.sfm.ingest.content.panorama import STITCHED, Panorama, panorama_in_xmp
 from snowsplat.sfm.ingest.photos.exif import ExifInfo, exif_for_copy, read_exif
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from snowsplat.data.colour_profile import plain_pixels
+from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.sfm.ingest.content.fixed_parts import (
     ENOUGH_PHOTOS,
     FIXED_SIDE,

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from snowsplat.data.files.listing import folded
-from snowsplat.data.files.mask_pixels import has_shape, looks_like_mask
+from snowsplat.data.maps.mask_pixels import has_shape, looks_like_mask
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, open_image, read_header
 
 # What programs add to the name of a copy: "IMG (1)", "IMG - Copy (2)", "IMG copy", "IMG-edited".

@@ -11,9 +11,9 @@ from typing import Literal
 
 from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
-from snowsplat.data.image_file import OPTIONAL_FORMATS
-from snowsplat.data.imports import find_export
 from snowsplat.data.load import poses_in
+from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
+from snowsplat.data.readers import find_export
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.image_file import scaled_size
+from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.content.fixed_parts import (
     ENOUGH_PHOTOS,
     Crop,

@@ -1,0 +1,1 @@
+"""Maps that belong to photos: depths, normals and masks, read from files and judged."""

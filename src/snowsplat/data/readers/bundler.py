@@ -1,0 +1,78 @@
+"""Bundler: bundle.out and a list of photos, which RealityScan, VisualSFM and others export too.
+
+A camera has the axes of OpenGL: y is up, and it looks along −z. The origin of the photo is its
+centre. https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html describes the format.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.dataset import usable_points
+from snowsplat.data.photos.decode import read_header
+from snowsplat.data.readers.lenses import centred, perspective
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.values import head_of, load_text, numbers, rigid
+from snowsplat.util.errors import UserError
+
+#: Other files than bundle.out may be of an earlier step.
+PATTERNS = ("bundle.out", "*.out", "bundle/bundle.out", "bundle/*.out")
+# "photo.jpg 0 1500.2": a focal length from EXIF may follow the name.
+_FOCAL = re.compile(r"\s+\d+(\s+[-+.\deE]+)?$")
+_FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def is_bundler(path: Path) -> bool:
+    """Whether a file starts like one of Bundler."""
+    return head_of(path).lstrip().lower().startswith(b"# bundle file")
+
+
+def read(path: Path, photos: PhotoFolder) -> Reconstruction:
+    """Read cameras and points."""
+    lines = (line for line in load_text(path).splitlines() if line[:1] != "#" and line.strip())
+    cameras, count = numbers(path, next(lines, "").split(), 2).astype(int).tolist()
+    names = _names(path, photos.root, cameras)
+    found = Reconstruction(total=cameras)
+    for index, name in enumerate(names):
+        where = f"{path}: camera {index}"
+        focal, k1, k2 = numbers(where, next(lines, "").split(), 3)
+        rows = [numbers(where, next(lines, "").split(), 3) for _ in range(4)]
+        if focal == 0:  # not aligned
+            continue
+        if (photo := found.photo(photos, name)) is None:
+            continue
+        header = read_header(photos.root / photo)
+        size = header.width, header.height
+        lens = perspective(where, *size, centred(*size, focal), (k1, k2))
+        pose = rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
+        found.shots.append(Shot(photo, lens, pose))
+    xyz, rgb = [], []
+    for _ in range(count):
+        xyz.append(numbers(path, next(lines, "").split(), 3))
+        rgb.append(numbers(path, next(lines, "").split(), 3))
+        next(lines, "")  # the photos that show it
+    if xyz:
+        found.points = usable_points(path, np.stack(xyz), np.clip(np.stack(rgb), 0, 255))
+    return found
+
+
+def _names(path: Path, root: Path, count: int) -> list[str]:
+    """The photos in the order of the cameras, from a list in a text file beside ``path``."""
+    folders = dict.fromkeys((path.parent, root, root / "prepare"))
+    lists = [f for folder in folders for p in ("*.lst", "*.txt") for f in sorted(folder.glob(p))]
+    for file in lists:
+        names = [line.strip() for line in load_text(file).splitlines() if line.strip()]
+        if names[:1] == [str(count)]:  # some lists start with their length
+            names = names[1:]
+        names = [_FOCAL.sub("", name) for name in names]
+        if len(names) == count and all("." in name[-6:] for name in names):
+            return names
+    raise UserError(
+        "{path}: no list of its {count} photos beside it (list.txt, or .lst of RealityScan); add "
+        "the list that was exported with it",
+        path=path,
+        count=count,
+    )

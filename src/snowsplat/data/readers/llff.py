@@ -1,0 +1,55 @@
+"""LLFF: poses_bounds.npy. It has no names: the photos are those of the folder, sorted by name.
+
+A row has a matrix 3 × 5: world_from_cam with the axes down, right and backwards, and a column of
+height, width and focal length of the photos in full size; two depths follow.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.photos.image_file import reason_of
+from snowsplat.data.readers.lenses import centred, perspective
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.values import damaged, from_opengl, numbers
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import is_file
+
+_COLUMNS = 17
+_MOST_ROWS = 1_000_000
+
+
+def is_llff(path: Path) -> bool:
+    """Whether a file has the name that LLFF uses."""
+    return path.name == "poses_bounds.npy" and is_file(path)
+
+
+def read(path: Path, photos: PhotoFolder) -> Reconstruction:
+    """Read the cameras."""
+    try:
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+        if stored.ndim != 2 or stored.shape[1] != _COLUMNS or len(stored) > _MOST_ROWS:
+            raise ValueError(f"it has the shape {stored.shape}")
+    except Exception as error:  # numpy raises many kinds
+        raise damaged(path, f"not a table of poses ({reason_of(error)})") from None
+    rows = numbers(path, stored, len(stored), _COLUMNS)
+    files = photos.sorted_files()
+    if len(files) != len(rows):
+        raise UserError(
+            "{path}: has {rows} poses, but there are {files} photos in {root}; use exactly the "
+            "photos that the poses were estimated from",
+            path=path,
+            rows=len(rows),
+            files=len(files),
+            root=photos.root,
+        )
+    found = Reconstruction(total=len(rows))
+    for index, (file, row) in enumerate(zip(files, rows, strict=True)):
+        where = f"{path}: pose {index}"
+        down, right, back, position, (height, width, focal) = row[:15].reshape(3, 5).T
+        lens = perspective(where, width, height, centred(width, height, focal))
+        pose = from_opengl(where, np.column_stack([right, -down, back, position]))
+        found.shots.append(Shot(file, lens, pose))
+    return found

@@ -1,0 +1,129 @@
+"""OpenMVG: sfm_data.json. Poses are rotations cam_from_world, and centres, in OpenCV axes.
+
+The centre of the first pixel is at (0, 0). Without "structure", the file has no points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snowsplat.data.dataset import usable_points
+from snowsplat.data.lens.project import LensModel
+from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
+from snowsplat.data.readers.points import points_beside
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.values import (
+    damaged,
+    head_of,
+    load_json,
+    number,
+    numbers,
+    objects,
+    rigid,
+    table,
+)
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import quoted
+
+# Each kind of camera: the name of its coefficients, and their number.
+_DISTORTION = {
+    "pinhole": ("", 0),
+    "pinhole_radial_k1": ("disto_k1", 1),
+    "pinhole_radial_k3": ("disto_k3", 3),
+    "pinhole_brown_t2": ("disto_t2", 5),
+    "fisheye": ("fisheye", 4),
+    "spherical": ("", 0),
+}
+_NAMED = (1 << 30) - 1 | 1 << 30  # of an identifier; the highest bit tells that its name follows
+
+
+def is_openmvg(path: Path) -> bool:
+    """Whether a file starts like one of OpenMVG."""
+    return path.suffix.lower() == ".json" and b'"sfm_data_version"' in head_of(path)
+
+
+def read(path: Path, photos: PhotoFolder) -> Reconstruction:
+    """Read cameras and points."""
+    scene = table(path, load_json(path))
+    lenses = _lenses(path, scene)
+    where = f"{path}: extrinsics"
+    poses = {number(where, pose, "key"): pose for pose in objects(where, scene.get("extrinsics"))}
+    found = Reconstruction()
+    for view in objects(f"{path}: views", scene.get("views")):
+        data = _data(f"{path}: view", view)
+        name = f"{data.get('local_path') or ''}/{data.get('filename')}"
+        where = f"{path}: view {quoted(name)}"
+        found.total += 1
+        key, pose_key = data.get("id_intrinsic"), data.get("id_pose")
+        pose = poses.get(pose_key) if isinstance(pose_key, int) else None
+        if pose is None:
+            continue
+        if not isinstance(key, int) or key not in lenses:
+            raise damaged(where, f"has the intrinsic {quoted(key)}, which is not in the file")
+        values = table(where, pose.get("value"))
+        rotation = numbers(where, values.get("rotation"), 3, 3)
+        centre = numbers(where, values.get("center"), 3)
+        cam = rigid(where, rotation, -rotation @ centre)
+        if (photo := found.photo(photos, name)) is None:
+            continue
+        found.shots.append(Shot(photo, lenses[key], cam))
+    xyz = [
+        numbers(f"{path}: structure", table(path, point.get("value")).get("X"), 3)
+        for point in objects(f"{path}: structure", scene.get("structure") or [])
+    ]
+    if found.shots:  # the points of the file have no colours
+        points_beside(path.parent, photos, found)
+    if xyz and found.points is None:
+        found.points = usable_points(path, np.stack(xyz), np.full((len(xyz), 3), 128))
+    return found
+
+
+def _data(where: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The object behind a pointer of the library that writes the file."""
+    return table(
+        where, table(where, table(where, entry.get("value")).get("ptr_wrapper")).get("data")
+    )
+
+
+def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, LensModel]:
+    names: dict[int, str] = {}
+    lenses = {}
+    for entry in objects(f"{path}: intrinsics", scene.get("intrinsics")):
+        where = f"{path}: intrinsic {quoted(entry.get('key'))}"
+        value = table(where, entry.get("value"))
+        identifier = value.get("polymorphic_id")
+        if not isinstance(identifier, int) or not isinstance(entry.get("key"), int):
+            raise damaged(where, "has no identifier")
+        # Only the first camera of a kind has the name of the kind.
+        if isinstance(value.get("polymorphic_name"), str):
+            names[identifier & _NAMED] = value["polymorphic_name"]
+        lenses[entry["key"]] = _lens(where, names.get(identifier & _NAMED, ""), _data(where, entry))
+    return lenses
+
+
+def _lens(where: str, kind: str, data: dict[str, Any]) -> LensModel:
+    if kind not in _DISTORTION:
+        raise UserError(
+            "{where}: the camera model {kind} is not supported; export the scene with "
+            "openMVG_main_openMVG2Colmap",
+            where=where,
+            kind=quoted(kind),
+        )
+    # Some versions nest the fields of the base class.
+    while isinstance(data.get("value0"), dict):
+        data = {**data["value0"], **{key: v for key, v in data.items() if key != "value0"}}
+    width, height = number(where, data, "width"), number(where, data, "height")
+    if kind == "spherical":
+        return equirectangular(where, width, height)
+    focal = number(where, data, "focal_length")
+    cx, cy = numbers(where, data.get("principal_point"), 2) + 0.5
+    name, count = _DISTORTION[kind]
+    k = numbers(where, data.get(name), count).tolist() if count else []
+    intrinsics = (focal, focal, float(cx), float(cy))
+    if kind == "fisheye":
+        return fisheye(where, width, height, intrinsics, k)
+    return perspective(where, width, height, intrinsics, k[:3], k[3:] or (0.0, 0.0))

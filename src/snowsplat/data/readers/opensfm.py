@@ -1,0 +1,129 @@
+"""OpenSfM and OpenDroneMap: reconstruction.json.
+
+Poses are cam_from_world in OpenCV axes, with the rotation as a vector. Lengths in the photo are in
+units of its larger side, from its centre. https://opensfm.org/docs/geometry.html describes them.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snowsplat.data.dataset import usable_points
+from snowsplat.data.lens.project import LensModel
+from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.values import (
+    damaged,
+    head_of,
+    load_json,
+    number,
+    numbers,
+    objects,
+    rigid,
+    table,
+)
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import quoted
+
+logger = logging.getLogger(__name__)
+
+#: In a project of OpenDroneMap, there is a folder of OpenSfM.
+PATTERNS = ("reconstruction.json", "opensfm/reconstruction.json")
+_PERSPECTIVE = ("perspective", "brown", "simple_radial", "radial")
+_FISHEYE = ("fisheye", "fisheye_opencv")
+_SPHERICAL = ("spherical", "equirectangular")
+
+
+def is_opensfm(path: Path) -> bool:
+    """Whether a file starts like one of OpenSfM."""
+    if path.suffix.lower() != ".json":
+        return False
+    head = head_of(path, 1 << 16).lstrip(b"\xef\xbb\xbf \t\r\n")
+    return head[:1] == b"[" and any(key in head for key in (b'"cameras"', b'"shots"'))
+
+
+def read(path: Path, photos: PhotoFolder) -> Reconstruction:
+    """Read cameras and points of the largest reconstruction."""
+    scenes = list(objects(path, load_json(path)))
+    shots = [table(f"{path}: shots", scene.get("shots")) for scene in scenes]
+    if not scenes:
+        raise damaged(path, "has no reconstruction")
+    largest = max(range(len(scenes)), key=lambda i: len(shots[i]))
+    if len(scenes) > 1:
+        logger.warning(
+            "%s: has %d separate reconstructions; using the largest (%d photos)",
+            path,
+            len(scenes),
+            len(shots[largest]),
+        )
+    cameras = table(f"{path}: cameras", scenes[largest].get("cameras"))
+    lenses: dict[str, LensModel] = {}
+    found = Reconstruction(total=len(shots[largest]))
+    for name, entry in shots[largest].items():
+        where = f"{path}: shot {quoted(name)}"
+        shot = table(where, entry)
+        key = shot.get("camera")
+        if not isinstance(key, str) or key not in cameras:
+            raise damaged(where, f"has the camera {quoted(key)}, which is not in the file")
+        if (photo := found.photo(photos, name)) is None:
+            continue
+        if key not in lenses:
+            lenses[key] = _lens(f"{path}: camera {quoted(key)}", table(where, cameras[key]))
+        rotation = _rotation(numbers(where, shot.get("rotation"), 3))
+        pose = rigid(where, rotation, numbers(where, shot.get("translation"), 3))
+        found.shots.append(Shot(photo, lenses[key], pose))
+    _read_points(path, table(f"{path}: points", scenes[largest].get("points") or {}), found)
+    return found
+
+
+def _read_points(path: Path, entries: dict[str, Any], found: Reconstruction) -> None:
+    points = [table(f"{path}: points", entry) for entry in entries.values()]
+    if points:
+        where = f"{path}: points"
+        xyz = np.stack([numbers(where, point.get("coordinates"), 3) for point in points])
+        rgb = [numbers(where, point.get("color", [128.0] * 3), 3) for point in points]
+        found.points = usable_points(path, xyz, np.clip(np.stack(rgb), 0, 255))
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) from axis × angle in radians, by Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def _lens(where: str, camera: dict[str, Any]) -> LensModel:
+    kind = camera.get("projection_type", "perspective")
+    width, height = number(where, camera, "width"), number(where, camera, "height")
+    if kind in _SPHERICAL:
+        return equirectangular(where, width, height)
+    if kind not in _PERSPECTIVE + _FISHEYE:
+        raise UserError(
+            "{where}: the camera model {kind} is not supported; run opensfm export_colmap, or "
+            "opensfm undistort",
+            where=where,
+            kind=quoted(kind),
+        )
+
+    def value(key: str, default: float | None = 0.0) -> float:
+        return number(where, camera, key, default)
+
+    unit = max(width, height)
+    focal = number(where, camera, "focal_x" if "focal_x" in camera else "focal")
+    intrinsics = (
+        unit * focal,
+        unit * value("focal_y", focal),
+        unit * value("c_x") + width / 2,
+        unit * value("c_y") + height / 2,
+    )
+    radial = [value(key) for key in ("k1", "k2", "k3", "k4")]
+    if kind in _FISHEYE:
+        return fisheye(where, width, height, intrinsics, radial)
+    return perspective(where, width, height, intrinsics, radial[:3], (value("p1"), value("p2")))

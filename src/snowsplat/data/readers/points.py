@@ -1,0 +1,119 @@
+"""`points_beside`: the point cloud that was exported beside the cameras, in a file of its own."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from snowsplat.data.dataset import usable_points
+from snowsplat.data.lens.project import project
+from snowsplat.data.photos.decode import ImageSource, load_thumbnail, read_header
+from snowsplat.data.points_ply import read_points
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.util.errors import UserError
+from snowsplat.util.ply import open_table
+
+logger = logging.getLogger(__name__)
+
+_SAMPLE = 1000  # points and cameras at most that are compared
+# Share of the points that a photo must show. In another frame, photos show few of them.
+_LEAST_SEEN = 0.5
+# To choose between frames: photos, pixels of their longer side, points, and those in a photo at
+# least.
+_PICTURES, _SIDE, _COLOURS, _FEWEST_SEEN = 12, 320, 20_000, 20
+
+
+def points_beside(
+    folder: Path,
+    photos: PhotoFolder,
+    found: Reconstruction,
+    frames: Sequence[np.ndarray] = (np.eye(4)[:3],),
+) -> None:
+    """Add the points of the PLY file in ``folder`` that the photos of ``found`` show.
+
+    Programs let the user choose the coordinate system of each export, so the points may be in
+    another one than the cameras. Of several frames, the one in which the points have the colours of
+    the photos is used. If the photos show few points in all of them, a warning tells it.
+
+    ``frames``: world_from_frame (3, 4), which may have a scale, of the frames in which the points
+    may be, the most probable first.
+    """
+    fitting: list[tuple[Path, np.ndarray, np.ndarray]] = []
+    rejected = None
+    for path in sorted(folder.glob("*.ply")):
+        try:
+            if "f_dc_0" in open_table(path).columns:  # Gaussians
+                continue
+            xyz, rgb = read_points(path)
+        except UserError:  # another kind of PLY file
+            continue
+        rejected = path
+        for matrix in frames:
+            moved = xyz @ matrix[:, :3].T + matrix[:, 3]
+            if _share_seen(moved, found.shots) > _LEAST_SEEN:
+                fitting.append((path, moved, rgb))
+    if fitting:
+        scores = [0.0]
+        if len(fitting) > 1:
+            pictures = _pictures(photos, found.shots)
+            scores = [_agreement(xyz, rgb, pictures) for _, xyz, rgb in fitting]
+        path, moved, rgb = fitting[scores.index(max(scores))]
+        found.points, found.points_from = usable_points(path, moved, rgb), path.name
+    elif rejected is not None:
+        logger.warning(
+            "%s: its points are not where the cameras look; not used; export cameras and points "
+            "in the same coordinate system",
+            rejected,
+        )
+
+
+def _share_seen(xyz: np.ndarray, shots: Sequence[Shot]) -> float:
+    """The share of the points that at least one photo shows, from a sample."""
+    xyz = xyz[:: max(1, len(xyz) // _SAMPLE)]
+    seen = np.zeros(len(xyz), bool)
+    for shot in shots[:: max(1, len(shots) // _SAMPLE)]:
+        seen[_positions(xyz, shot)[0]] = True
+    return float(seen.mean()) if len(seen) else 0.0
+
+
+def _positions(xyz: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """The indices (N,) of the points that a photo shows, and where (N, 2), relative to its size."""
+    cam = xyz @ shot.cam_from_world[:, :3].T + shot.cam_from_world[:, 3]
+    where = project(shot.lens, cam) / (shot.lens.width, shot.lens.height)
+    seen = ((where >= 0) & (where < 1)).all(1)
+    return np.flatnonzero(seen), where[seen]
+
+
+def _pictures(photos: PhotoFolder, shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray]]:
+    """Some of the photos, spread over all, as small pictures (4, h, w) uint8."""
+    chosen = shots[:: max(1, len(shots) // _PICTURES)]
+    found = []
+    for shot in chosen:
+        path = photos.root / shot.photo
+        header = read_header(path)
+        source = ImageSource(path, header.width, header.height)
+        try:
+            found.append((shot, load_thumbnail(source, _SIDE)))
+        except UserError:  # the training says so
+            continue
+    return found
+
+
+def _agreement(
+    xyz: np.ndarray, rgb: np.ndarray, pictures: Sequence[tuple[Shot, np.ndarray]]
+) -> float:
+    """The mean correlation between the colours of points and of the pixels where they are."""
+    step = max(1, len(xyz) // _COLOURS)
+    xyz, rgb = xyz[::step], rgb[::step].astype(np.float32)
+    values = [0.0]
+    for shot, picture in pictures:
+        seen, where = _positions(xyz, shot)
+        column, row = (where * picture.shape[:0:-1]).astype(np.int64).T
+        a, b = rgb[seen], picture[:3, row, column].T.astype(np.float32)
+        if len(seen) >= _FEWEST_SEEN:
+            a, b = a - a.mean(0), b - b.mean(0)
+            values.append(float((a * b).sum() / max(1.0, np.sqrt((a * a).sum() * (b * b).sum()))))
+    return sum(values) / max(1, len(pictures))

@@ -1,0 +1,335 @@
+"""Exports of other programs: what is read must project points as the other program does."""
+
+import json
+import logging
+import shutil
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from snowsplat.data.lens.project import BROWN, project
+from snowsplat.data.load import NoPosesError, load_dataset
+from snowsplat.data.readers import find_export, read_export
+from snowsplat.pipeline.describe import describe
+from snowsplat.util.errors import SettingError, UserError
+
+from . import exports
+from .exports import COLORS, HEIGHT, NAMES, POINTS, WIDTH
+
+
+def read(path, images="images"):
+    export = find_export(path)
+    assert export is not None
+    assert export.cameras is not None
+    return read_export(path, export, images)
+
+
+def pixels(image):
+    """(P, 2): where a posed image shows `POINTS`, by the equations of COLMAP."""
+    camera = image.camera
+    pose = camera.cam_from_world.numpy()
+    cam = POINTS @ pose[:, :3].T + pose[:, 3]
+    if image.lens is None:
+        model, params = "PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy)
+    else:
+        model, params = image.lens.model, image.lens.params
+        assert (image.lens.width, image.lens.height) == (camera.width, camera.height)
+        assert params[:4] == (camera.fx, camera.fy, camera.cx, camera.cy)
+    if model == BROWN:  # COLMAP does not have it
+        return project(image.lens, cam)
+    lens = pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
+    return np.asarray(lens.img_from_cam(cam))
+
+
+CASES = {
+    "metashape": (exports.metashape, {}),
+    "metashape chunk": (exports.metashape, {"world": False}),
+    "metashape r8, skew": (exports.metashape, {"k": (0.1, -0.05, 0.03, -0.04), "b2": -1.3}),
+    "metashape fisheye": (exports.metashape, {"kind": "fisheye", "k": (0.1, -0.02, 0.01, 0.004)}),
+    "realityscan": (exports.realityscan, {}),
+    "realityscan 2": (exports.realityscan, {"newer": True}),
+    "bundler": (exports.bundler, {}),
+    "polycam": (exports.polycam, {}),
+    "polycam arkit": (exports.polycam, {"corrected": False}),
+    "polycam 2025": (exports.polycam, {"sizes": False}),
+    "record3d": (exports.record3d, {}),
+    "record3d rows": (exports.record3d, {"rows": True}),
+    "openmvg": (exports.openmvg, {}),
+    "openmvg fisheye": (exports.openmvg, {"kind": "fisheye"}),
+    "opensfm": (exports.opensfm, {}),
+    "opensfm perspective": (exports.opensfm, {"kind": "perspective"}),
+    "opensfm fisheye": (exports.opensfm, {"kind": "fisheye"}),
+    "alicevision": (exports.alicevision, {}),
+    "alicevision 1.2.0": (exports.alicevision, {"newer": False}),
+    "llff": (exports.llff, {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_points_are_projected_as_by_the_program(case, tmp_path):
+    write, options = CASES[case]
+    expected = write(tmp_path, **options)
+    posed, points, description = read(tmp_path)
+    assert len(posed) == len(NAMES)
+    for image in posed:
+        assert image.path.is_file()
+        assert np.abs(pixels(image) - expected[image.path.name]).max() < 1e-6
+    if points is not None:
+        assert torch.allclose(points.xyz.float(), torch.from_numpy(POINTS).float(), atol=1e-5)
+    assert f"{len(NAMES)} of" in description
+
+
+def test_the_description_tells_what_was_read(tmp_path):
+    exports.metashape(tmp_path)
+    _, points, description = read(tmp_path)
+    assert description == ("Metashape cameras.xml, 4 of 5 photos aligned, points from points.ply")
+    assert points is not None
+    assert points.rgb.tolist() == COLORS.tolist()
+
+
+def test_points_in_the_frame_of_the_chunk_are_moved_to_the_world(tmp_path):
+    exports.metashape(tmp_path)
+    turn, shift, scale = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]), 2.5
+    exports.points(tmp_path, (POINTS - shift) @ turn / scale)
+    exports.painted_photos(tmp_path / "images")
+    _, points, _ = read(tmp_path)
+    assert points is not None
+    assert torch.allclose(points.xyz.float(), torch.from_numpy(POINTS).float(), atol=1e-5)
+
+
+def test_points_in_another_frame_are_not_used(tmp_path, caplog):
+    exports.realityscan(tmp_path)
+    exports.points(tmp_path, POINTS + 100)
+    _, points, description = read(tmp_path)
+    assert points is None
+    assert "points" not in description
+    assert "are not where the cameras look" in caplog.text
+
+
+def test_cameras_on_the_earth_get_a_local_frame(tmp_path):
+    expected = exports.metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    file.write_text(file.read_text().replace("1.0 2.0 3.0", "4200000.0 500000.0 4750000.0"))
+    posed, _, _ = read(tmp_path)
+    centres = torch.stack([image.camera.position for image in posed])
+    assert centres.mean(0).abs().max() < 1e-6
+    a, b = centres[0] - centres[1], centres[0] - centres[2]
+    truth = [-r.T @ t for r, t in exports.rig().values()]
+    assert float(a.norm()) == pytest.approx(np.linalg.norm(truth[0] - truth[1]), rel=1e-9)
+    assert float(b.norm()) == pytest.approx(np.linalg.norm(truth[0] - truth[2]), rel=1e-9)
+    assert set(expected) == {image.path.name for image in posed}
+
+
+def test_a_document_type_is_refused(tmp_path):
+    exports.metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    start, end = file.read_text().split("<document", 1)
+    bomb = '<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+    file.write_text(f"{start}{bomb}<document{end}")
+    with pytest.raises(UserError, match="has a document type"):
+        read(tmp_path)
+
+
+def test_the_message_about_an_unknown_encoding_is_short(tmp_path):
+    exports.metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    file.write_text(file.read_text().replace("UTF-8", "UTF" + 500 * "-8"))
+    with pytest.raises(UserError, match="not a complete XML file .'unknown encoding") as refused:
+        read(tmp_path)
+    assert len(str(refused.value)) < len(str(file)) + 200
+
+
+def test_depth_maps_have_a_unit(tmp_path):
+    exports.polycam(tmp_path)
+    dataset = load_dataset(tmp_path, hold_out=None)
+    assert [view.depth_unit for view in dataset.train] == [1e-3] * len(NAMES)
+    assert dataset.metres_per_unit == 1
+    assert all(view.depth is not None for view in dataset.train)
+    assert all(view.depth_confidence.parent.name == "confidence" for view in dataset.train)
+    assert dataset.description == "Polycam corrected_cameras, 4 of 4 photos aligned"
+
+
+def test_keyframes_without_poses_are_photos(tmp_path):
+    exports.polycam(tmp_path, corrected=False)
+    for file in (tmp_path / "keyframes" / "cameras").iterdir():
+        file.write_text(json.dumps({"fx": 500, "t_00": 1}))
+    export = find_export(tmp_path)
+    assert export is not None
+    assert export.cameras is None
+    assert export.photos == tmp_path / "keyframes" / "images"
+
+
+def test_the_file_of_the_cameras_can_be_given(tmp_path):
+    exports.bundler(tmp_path)
+    assert len(read(tmp_path / "bundle.out")[0]) == len(NAMES)
+
+
+def test_a_list_that_starts_with_its_length(tmp_path):
+    exports.bundler(tmp_path)
+    expected = [image.path.name for image in read(tmp_path)[0]]
+    file = tmp_path / "list.txt"
+    file.write_text(f"{len(NAMES) + 1}\n{file.read_text()}")
+    assert [image.path.name for image in read(tmp_path)[0]] == expected
+
+
+def test_photos_elsewhere_are_one_line(tmp_path):
+    exports.realityscan(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    with pytest.raises(
+        UserError, match=r"none of its 4 photos .*'a\.png'.*; copy them to .*images"
+    ):
+        read(tmp_path)
+
+
+def test_missing_photos_are_skipped(tmp_path, caplog):
+    exports.openmvg(tmp_path)
+    (tmp_path / "images" / "b.png").unlink()
+    posed, _, description = read(tmp_path)
+    assert [image.path.name for image in posed] == ["a.png", "c.png", "d.png"]
+    assert "1 of 4 photos are missing (the first is '/b.png')" in caplog.text
+    assert "4 of 5 photos aligned" in description
+
+
+def test_photos_are_found_in_other_folders_and_with_other_suffixes(tmp_path):
+    exports.alicevision(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "Photos of Monday")
+    (tmp_path / "Photos of Monday" / "a.png").rename(tmp_path / "Photos of Monday" / "A.PNG")
+    exports.photos(tmp_path / "images_2", size=(WIDTH // 2, HEIGHT // 2))
+    names = {image.path.name for image in read(tmp_path)[0]}
+    assert names == {"A.PNG", "b.png", "c.png", "d.png"}
+
+
+def test_another_folder_of_images_can_be_chosen(tmp_path):
+    exports.llff(tmp_path)
+    exports.photos(tmp_path / "images_2", size=(WIDTH // 2, HEIGHT // 2))
+    dataset = load_dataset(tmp_path, images="images_2", hold_out=None)
+    assert dataset.train[0].name == "images_2/a.png"
+    assert dataset.train[0].camera.fx == pytest.approx(55 / 2)
+    with pytest.raises(SettingError, match="no such folder"):
+        load_dataset(tmp_path, images="images_8")
+
+
+def test_equal_names_are_told_apart_by_their_folder(tmp_path):
+    exports.alicevision(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "photos")
+    exports.photos(tmp_path / "retouched")
+    posed, _, _ = read(tmp_path)  # the file has /home/me/photos/
+    assert {image.folder.name for image in posed} == {"photos"}
+    (tmp_path / "photos").rename(tmp_path / "other")
+    with pytest.raises(UserError, match=r"several photos named 'a\.png'"):
+        read(tmp_path)
+
+
+def test_no_photo_outside_of_the_folder_is_used(tmp_path):
+    folder = tmp_path / "dataset"
+    folder.mkdir()
+    exports.opensfm(folder)
+    shutil.move(folder / "images", tmp_path / "images")
+    file = folder / "reconstruction.json"
+    file.write_text(file.read_text().replace('"a.png"', '"../images/a.png"'))
+    with pytest.raises(UserError, match="none of its 4 photos"):
+        read(folder)
+
+
+def test_positions_in_degrees_are_refused(tmp_path):
+    exports.realityscan(tmp_path)
+    file = tmp_path / "cameras.csv"
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    for line in lines[1:]:
+        line[1:3] = str(8.5 + float(line[1]) / 1e5), str(47.3 + float(line[2]) / 1e5)
+    file.write_text("\n".join(map(",".join, lines)))
+    with pytest.raises(UserError, match="longitude and latitude; export"):
+        read(tmp_path)
+
+
+def test_a_table_of_positions_alone_is_explained(tmp_path):
+    exports.photos(tmp_path)
+    (tmp_path / "cameras.csv").write_text("#name,x,y,alt\na.png,1,2,3\n")
+    with pytest.raises(UserError, match="export the alignment as Internal/External"):
+        read(tmp_path)
+
+
+def test_lenses_with_k1_alone_are_in_doubt(tmp_path, caplog):
+    exports.realityscan(tmp_path)
+    file = tmp_path / "cameras.csv"
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    for line in lines[1:]:
+        line[11:] = ["0"] * 5
+    file.write_text("\n".join(map(",".join, lines)))
+    read(tmp_path)
+    assert "division model" in caplog.text
+
+
+def test_compressed_depth_maps_are_named(tmp_path, caplog):
+    exports.record3d(tmp_path)
+    (tmp_path / "rgb").rename(tmp_path / "rgbd")
+    (tmp_path / "rgbd" / "0.depth").write_bytes(b"bvx2")
+    read(tmp_path)
+    assert "LZFSE" in caplog.text
+
+
+def test_packed_recordings_are_to_be_unpacked(tmp_path):
+    (tmp_path / "scan.r3d").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"scan\.r3d: is packed; unpack it"):
+        load_dataset(tmp_path / "scan.r3d")
+
+
+def test_info_describes_the_file_of_the_cameras(tmp_path):
+    exports.metashape(tmp_path)
+    facts = describe(tmp_path / "cameras.xml")
+    assert facts["description"].startswith("Metashape cameras.xml, 4 of 5 photos aligned")
+    assert facts["points"] == len(POINTS)
+
+
+def test_the_folder_of_an_unpacked_archive_may_be_inside(tmp_path):
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "__MACOSX").mkdir()
+    exports.polycam(tmp_path / "scan")
+    posed, _, _ = read(tmp_path)
+    assert len(posed) == len(NAMES)
+    export = find_export(tmp_path)
+    assert export.photos == tmp_path / "scan" / "keyframes" / "corrected_images"
+
+
+@pytest.mark.parametrize("name", ["garden.psx", "Garden.rcproj", "sfm_data.bin", "scan.r3d"])
+def test_projects_that_are_not_readable_are_explained(name, tmp_path):
+    exports.photos(tmp_path / "images")
+    (tmp_path / name).touch()
+    with pytest.raises(NoPosesError, match=rf"{name} is .*; (export|convert|unpack)"):
+        load_dataset(tmp_path)
+
+
+def test_other_files_are_no_exports(tmp_path):
+    exports.photos(tmp_path)
+    (tmp_path / "notes.xml").write_text("<notes><chunk/></notes>")
+    (tmp_path / "prices.csv").write_text("name,price\na,1\n")
+    (tmp_path / "metadata.json").write_text("{}")
+    (tmp_path / "a.out").write_bytes(b"\x7fELF")
+    assert find_export(tmp_path) is None
+
+
+def test_a_dataset_is_loaded(tmp_path, caplog):
+    caplog.set_level(logging.WARNING)
+    exports.llff(tmp_path)
+    dataset = load_dataset(tmp_path, hold_out=2)
+    assert [view.name for view in dataset.test] == ["images/a.png", "images/c.png"]
+    assert {(view.camera.width, view.camera.height) for view in dataset.train} == {(WIDTH, HEIGHT)}
+    assert dataset.train[0].camera.fx == 55
+    assert dataset.description == "LLFF poses_bounds.npy, 4 of 4 photos aligned"
+
+
+def test_nerfcapture_has_depth_maps_with_a_unit(tmp_path):
+    matrix = np.eye(4).tolist()
+    frames = [{"file_path": f"images/{i}", "depth_path": f"images/{i}.depth.png"} for i in range(2)]
+    for i, frame in enumerate(frames):
+        matrix[0][3] = float(i)
+        frame["transform_matrix"] = [row[:] for row in matrix]
+    exports.photos(tmp_path / "images", ["0.png", "1.png", "0.depth.png", "1.depth.png"])
+    scene = {"fl_x": 50.0, "fl_y": 50.0, "cx": 32.0, "cy": 24.0, "w": WIDTH, "h": HEIGHT}
+    scene |= {"integer_depth_scale": 10 / 65535, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(scene))
+    views = load_dataset(tmp_path, hold_out=None).train
+    assert [view.depth.name for view in views] == ["0.depth.png", "1.depth.png"]
+    assert [view.depth_unit for view in views] == [10 / 65535] * 2
