@@ -13,7 +13,7 @@ from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph
 from snowsplat.sfm.progress import silent
 
 from .. import look_alikes
-from ..test_repair import largest_centre_error, state_of
+from ..checks.test_repair import largest_centre_error, state_of
 
 pytestmark = pytest.mark.sfm
 
