@@ -63,7 +63,7 @@ def children_of(pid):
     """The child processes in which COLMAP runs."""
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     commands = {int(child): Path(f"/proc/{child}/cmdline").read_bytes() for child in children}
-    return [child for child, command in commands.items() if b"colmap.worker" in command]
+    return [child for child, command in commands.items() if b"colmap.process.worker" in command]
 
 
 def is_alive(pid):
