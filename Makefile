@@ -6,6 +6,7 @@
 # make docs     builds the documentation site in build/docs; warnings are errors
 # make format   formats the sources
 # make native   builds the native libraries
+# make messages brings the catalogues of translations up to date
 # make wheel    builds wheels for Linux on x86-64 and aarch64, for every version of Python, into dist/
 #
 # Each target works on a fresh clone and needs Python >= 3.10 and a C++ compiler. Everything is installed
@@ -39,7 +40,7 @@ BIOME = $(and $(shell command -v node),$(wildcard tests/node/node_modules/.bin/b
 NO_BIOME := lint: JavaScript is not checked; that needs Node, and npm ci --prefix tests/node --ignore-scripts
 CXX_FILES = $(shell find src/snowsplat/native tests -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort)
 
-.PHONY: demo quick test nightly dev docs format native wheel compiler lint types layers clean
+.PHONY: demo quick test nightly dev docs messages format native wheel compiler lint types layers clean
 .PHONY: pytest-quick pytest pytest-best pytest-repeated pytest-isas sanitized neon
 
 demo: native $(ENVIRONMENT)
@@ -61,7 +62,7 @@ UV := UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 .venv/bin/python -m uv pip install --
 install = $(UV) $(1) 2>/dev/null || .venv/bin/python -m pip install --no-compile $(1)
 
 # The part of the environment that compiles: the pinned tools among the packages for development.
-COMPILING := cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
+COMPILING := babel|cmake|ninja|nvidia-cuda-nvrtc-cu12|scikit-build-core
 .venv/.tools: pyproject.toml | compiler
 	@$(BOOTSTRAP) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || \
 	    { echo "$(NO_PYTHON)" >&2; exit 1; }
@@ -110,6 +111,9 @@ docs: $(ENVIRONMENT)
 
 wheel: $(ENVIRONMENT)
 	@$(PYTHON) tools/make_wheels.py
+
+messages: $(ENVIRONMENT)
+	$(PYTHON) tools/update_messages.py
 
 format: $(ENVIRONMENT)
 	ruff format .

@@ -31,6 +31,7 @@ from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, over
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError, message_of
 from snowsplat.util.interrupts import ended_by_signals
+from snowsplat.util.messages import as_message, language_of_environment, message, use
 from snowsplat.util.safe_json import printable
 
 # Former names of subcommands, still accepted but not listed.
@@ -53,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     accept_all_characters()
+    use(language_of_environment())
     _report_log_and_warnings_as_lines()
     if arguments in (["--version"], ["version"]):
         print("snowsplat", __version__)
@@ -175,9 +177,10 @@ def _print_error(message: str) -> None:
 
 
 class _LogHandler(logging.Handler):
-    """Prints log records in the same form as errors."""
+    """Prints log records in the same form as errors, in the language of the program."""
 
     def emit(self, record: logging.LogRecord) -> None:
+        record.msg = str(as_message(record.msg))
         _print_error(record.getMessage())
 
 

@@ -1,0 +1,79 @@
+"""Brings src/snowsplat/locale/zh/*.po up to date with the messages of the program: `make messages`.
+
+There is one file for each package. New messages have an empty text, which a translator fills in;
+texts of messages that no longer exist are removed. A message that moves keeps its text.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from babel.messages.catalog import Catalog
+from babel.messages.extract import extract_from_dir
+from babel.messages.pofile import read_po, write_po
+
+SOURCE = Path(__file__).resolve().parents[1] / "src" / "snowsplat"
+LANGUAGE = "zh"
+# The calls whose first text is a message. For others: the positions of the texts.
+_ERRORS = ("UserError", "InUse", "Diverged", "OtherScene", "ProcessLost", "NoPosesError", "NoSpace")
+_CALLS = ("message", "warning", "info", *_ERRORS, "UnknownScene")
+KEYWORDS = dict.fromkeys(_CALLS) | {"plural": (1, 2), "SettingError": (2,), "_InUse": (2,)}
+
+Key = str | tuple[str, str]
+
+
+def messages_of(source: Path = SOURCE) -> Iterator[tuple[str, Key]]:
+    """The package and the key of each message; two texts: one and many."""
+    found = extract_from_dir(source, [("**.py", "python")], keywords=KEYWORDS, comment_tags=())
+    for file, _, key, _, _ in found:
+        parts = Path(file).parts
+        # Texts with a space or a field; others are values, such as the name of a mode.
+        if isinstance(key, tuple) or any(mark in key for mark in " {%"):
+            yield parts[0] if len(parts) > 1 else "snowsplat", key
+
+
+def translations(folder: Path) -> Catalog:
+    """The catalogue of all files of a language."""
+    catalogue = Catalog(locale=folder.name)
+    for file in sorted(folder.glob("*.po")):
+        with file.open("rb") as opened:
+            for message in read_po(opened, locale=folder.name):
+                if message.id and message.string:
+                    catalogue[message.id] = message
+    return catalogue
+
+
+def main() -> int:
+    folder = SOURCE / "locale" / LANGUAGE
+    known = translations(folder)
+    packages: dict[str, Catalog] = {}
+    seen: set[Key] = set()
+    empty = 0
+    for package, key in messages_of():
+        if key in seen:
+            continue
+        seen.add(key)
+        catalogue = packages.setdefault(package, Catalog(locale=LANGUAGE, fuzzy=False))
+        before = known.get(key if isinstance(key, str) else key[0])
+        string = before.string if before is not None else ""
+        if isinstance(key, tuple) and isinstance(string, str):
+            string = (string,)
+        if isinstance(key, str) and not isinstance(string, str):
+            string = string[0]
+        empty += not any(string if isinstance(string, tuple) else (string,))
+        catalogue.add(key, string)
+    for file in folder.glob("*.po"):
+        if file.stem not in packages:
+            file.unlink()
+    for package, catalogue in sorted(packages.items()):
+        with (folder / f"{package}.po").open("wb") as target:
+            target.write(f"# The messages of snowsplat/{package} in Chinese.\n\n".encode())
+            write_po(target, catalogue, width=100, sort_output=True, omit_header=True)
+    print(f"{len(seen)} messages, {empty} without a translation")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
