@@ -38,11 +38,11 @@ from snowsplat.util.safe_json import printable
 _FORMER_NAMES = {"capture": "sfm"}
 
 _REMEDIES = {
-    errno.EACCES: "check the owner and the permissions, or use another folder",
-    errno.EROFS: "write the result to another folder",
-    errno.ENOSPC: "free some space, or write the result to another disk",
+    errno.EACCES: message("check the owner and the permissions, or use another folder"),
+    errno.EROFS: message("write the result to another folder"),
+    errno.ENOSPC: message("free some space, or write the result to another disk"),
 }
-_OUT_OF_MEMORY = (
+_OUT_OF_MEMORY = message(
     "out of memory; train with --memory and a smaller number, or use smaller photos, -r 2"
 )
 
@@ -70,9 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with ended_by_signals():
             return run(parse(arguments))
     except SettingError as error:
-        return _fail(with_flags(f"`{error.setting}`: {error.problem}"), 2)
+        return _fail(f"`{error.setting}`: {error.problem}", 2)
     except UserError as error:
-        return _fail(with_flags(str(error)), 2)
+        return _fail(error, 2)
     except KeyboardInterrupt:
         return _fail("stopped", 130)
     except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
@@ -86,8 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(_OUT_OF_MEMORY, 2)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0)
-        message = message_of(error, _locked_folder(error))
-        return _fail(f"{message}; {remedy}" if remedy else message, 2)
+        what = message_of(error, _locked_folder(error))
+        return _fail(f"{what}; {remedy}" if remedy else what, 2)
 
 
 def parse(arguments: Sequence[str]) -> Any:
@@ -167,13 +167,13 @@ def _locked_folder(error: OSError) -> str | None:
     return folder if locked else None
 
 
-def _fail(message: str, code: int) -> int:
-    _print_error(message)
+def _fail(text: object, code: int) -> int:
+    _print_error(with_flags(str(text)))
     return code
 
 
-def _print_error(message: str) -> None:
-    print("snowsplat:", printable(" ".join(message.split())), file=sys.stderr)
+def _print_error(text: object) -> None:
+    print("snowsplat:", printable(" ".join(str(text).split())), file=sys.stderr)
 
 
 class _LogHandler(logging.Handler):
@@ -185,8 +185,8 @@ class _LogHandler(logging.Handler):
 
 
 def _report_log_and_warnings_as_lines() -> None:
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        _print_error(f"warning: {message}")
+    def show(text: Warning | str, *_: Any, **__: Any) -> None:
+        _print_error(message("warning: {text}", text=text))
 
     warnings.showwarning = show
     # Pillow warns about each unreadable tag of a damaged photo; snowsplat reports its effect once.
