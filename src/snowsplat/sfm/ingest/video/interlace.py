@@ -3,18 +3,17 @@
 A frame of interlaced video consists of two fields, the even and the odd rows, from two moments. A
 moving camera shifts them against each other, so that edges look like combs. What the file says is
 not sufficient: programs convert such video without separating the fields, and mark it as
-progressive; other cameras store whole frames in a stream that is marked as interlaced.
+progressive; other cameras store whole frames in a stream that is marked as interlaced. FFmpeg's
+filter idet looks for the combs, and its filter bwdif interpolates the rows of one field.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from itertools import islice, pairwise
+from itertools import islice
 from typing import TYPE_CHECKING, Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from snowsplat.sfm.ingest.video.clip import Clip, decoded_frames, open_video, video_stream
 
@@ -25,12 +24,9 @@ if TYPE_CHECKING:
 #: Which field of a frame is shown first: that of the even rows ("tff"), or that of the odd rows.
 FieldOrder = Literal["tff", "bff"]
 
-_PLACES = 6  # in the video where successive frames are compared
+_PLACES = 6  # in the video where successive frames are examined
 _FRAMES = 5  # at each place
-_COLUMNS = 3  # every third column is sufficient
-# The logarithm of the ratio that `field_order` measures. Of a hand-held video: −0.01 to 0.01 for
-# each pair of frames; if it is interlaced, 0.56 to 1.3 (or negative, with the other order).
-_DECISIVE = 0.1
+_FEWEST = 3  # frames with combs; a single one may be a cut
 
 
 def field_order(clip: Clip) -> FieldOrder | None:
@@ -42,14 +38,12 @@ def field_order(clip: Clip) -> FieldOrder | None:
     Raises:
         av.FFmpegError, ValueError: the video cannot be opened.
     """
-    early = late = 0.0
+    kinds: Counter[str] = Counter()
     for place in range(_PLACES):
-        lumas = [_luma(frame) for frame in _frames_at(clip, place / _PLACES)]
-        for first, second in pairwise(lumas):
-            if first.shape == second.shape and len(first) > 2:
-                early += _difference(second, first)
-                late += _difference(first, second)
-    if min(early, late) <= 0 or abs(np.log(early / late)) < _DECISIVE:
+        examined = _filtered(_frames_at(clip, place / _PLACES), "idet")
+        kinds.update(frame.metadata["lavfi.idet.single.current_frame"] for frame in examined)
+    early, late, whole = kinds["tff"], kinds["bff"], kinds["progressive"]
+    if max(early, late) < max(_FEWEST, whole + min(early, late)):
         return None
     return "tff" if early > late else "bff"
 
@@ -69,44 +63,32 @@ def _frames_at(clip: Clip, part: float) -> list[VideoFrame]:
         return list(islice(decoded_frames(container), _FRAMES))
 
 
-def _luma(frame: VideoFrame) -> NDArray[np.float32]:
-    grey = frame.reformat(format="gray").to_ndarray()
-    return grey[:, ::_COLUMNS].astype(np.float32)
-
-
-def _difference(odd: NDArray[np.float32], even: NDArray[np.float32]) -> float:
-    """The mean difference between the odd rows of a frame and the even rows of another.
-
-    Let two frames follow each other. If the even rows are earlier, the odd rows of the first frame
-    are nearly of the same time as the even rows of the second; the odd rows of the second are three
-    times as far from the even rows of the first. If both fields of a frame are of one moment, both
-    differences are equal, whatever the frames show and however the camera moves.
-    """
-    odd_rows, even_rows = odd[1::2], even[0::2]
-    count = min(len(odd_rows), len(even_rows) - 1)
-    between = (even_rows[:count] + even_rows[1 : count + 1]) / 2
-    return float(np.abs(odd_rows[:count] - between).mean())
-
-
-def whole_frames(frames: Iterator[VideoFrame], order: FieldOrder) -> Iterator[VideoFrame]:
+def whole_frames(frames: Iterable[VideoFrame], order: FieldOrder) -> Iterator[VideoFrame]:
     """Frames of one moment: the rows of the first field, and between them interpolated rows.
 
     Raises:
         av.FFmpegError: the filter does not support the pixel format.
     """
+    return _filtered(frames, "bwdif", f"mode=send_frame:parity={order}:deint=all")
+
+
+def _filtered(
+    frames: Iterable[VideoFrame], name: str, options: str | None = None
+) -> Iterator[VideoFrame]:
+    """What a filter of FFmpeg makes of ``frames``, whose size and format may change."""
     graph = None
     kind: tuple[object, ...] = ()
     for frame in frames:
         new = frame.width, frame.height, frame.format.name, frame.colorspace, frame.color_range
         if new != kind:
-            yield from _filtered(graph, None)
-            graph, kind = _filter(frame, order), new
-        yield from _filtered(graph, frame)
-    yield from _filtered(graph, None)
+            yield from _pulled(graph, None)
+            graph, kind = _graph_for(frame, name, options), new
+        yield from _pulled(graph, frame)
+    yield from _pulled(graph, None)
 
 
-def _filter(frame: VideoFrame, order: FieldOrder) -> Graph:
-    """FFmpeg's deinterlacer for frames like this one."""
+def _graph_for(frame: VideoFrame, name: str, options: str | None) -> Graph:
+    """A filter for frames like this one."""
     from av.filter import Graph
 
     graph = Graph()
@@ -116,14 +98,14 @@ def _filter(frame: VideoFrame, order: FieldOrder) -> Graph:
         f"time_base={frame.time_base or '1/25'}:colorspace={int(frame.colorspace)}:"
         f"range={int(frame.color_range)}",
     )
-    deinterlacer = graph.add("bwdif", f"mode=send_frame:parity={order}:deint=all")
-    source.link_to(deinterlacer)
-    deinterlacer.link_to(graph.add("buffersink"))
+    middle = graph.add(name, options)
+    source.link_to(middle)
+    middle.link_to(graph.add("buffersink"))
     graph.configure()
     return graph
 
 
-def _filtered(graph: Graph | None, frame: VideoFrame | None) -> Iterator[VideoFrame]:
+def _pulled(graph: Graph | None, frame: VideoFrame | None) -> Iterator[VideoFrame]:
     """What the filter returns for a frame; None: the frames that it has kept."""
     import av
 
