@@ -133,7 +133,6 @@ def test_a_folder_of_version_0_1_is_continued(run, photos, tmp_path, monkeypatch
     with monkeypatch.context() as former:
         former.setattr(make_module, "DATASET", "capture")
         assert run(*command, out).code == 0
-    (out / "capture/sfm.json").rename(out / "capture/capture.json")
     again = run(*command, out)
     assert again.code == 0, again.err
     assert again.out.count("done before") == 7

@@ -104,22 +104,6 @@ def test_finished_stages_are_skipped_and_a_changed_photo_is_detected(garden, pho
     assert not (out / "images" / last.name).exists()
 
 
-def test_a_dataset_of_version_0_1_is_continued(garden, photos, run, refused, tmp_path):
-    """Its record and its report had other names."""
-    old = tmp_path / "garden"
-    shutil.copytree(garden, old)
-    (old / "sfm.json").rename(old / "capture.json")
-    (old / "dataset_report.html").rename(old / "capture_report.html")
-    assert "contains a dataset made from" in refused(
-        "sfm", *sorted(photos.iterdir())[:3], "-o", old, *QUICK
-    )
-    assert (old / "capture.json").is_file()
-    again = run("sfm", photos, "-o", old, *QUICK, "--resize")
-    assert again.code == 0, again.err
-    assert again.out.count("done before") == len(STAGES) - 1  # the report has a new name
-    assert {path.name for path in old.iterdir()} == {path.name for path in garden.iterdir()}
-
-
 def test_photos_in_place(garden, photos, run, refused, tmp_path):
     place = tmp_path / "place"
     shutil.copytree(photos, place / "input")

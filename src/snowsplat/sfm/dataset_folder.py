@@ -9,8 +9,7 @@
     DATASET/dataset_report.html   the same as a page, with a map of cameras and points
 
 The layout is that of the reference implementation's convert.py. An interrupted run resumes where
-it stopped; see `snowsplat.util.stages`. In version 0.1.0, the two last files were called
-capture.json and capture_report.html.
+it stopped; see `snowsplat.util.stages`.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -33,7 +32,7 @@ from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.search.sources import RECORDS, Sources, find_sources
+from snowsplat.sfm.ingest.search.sources import RECORD, Sources, find_sources
 from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
 from snowsplat.sfm.progress import Report
@@ -53,8 +52,6 @@ from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("photos", "poses", "images", "report")
-RECORD, FORMER_RECORD = RECORDS
-FORMER_REPORT = "capture_report.html"
 _IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
 _OUTPUT_NAMES = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
 
@@ -129,7 +126,6 @@ def make_dataset(
     in_place = sources.contain(folder / "input")
     with one_run(folder):
         _check_free(folder, in_place, sources, options, overwrite)
-        _rename_former_files(folder)
         with _remove_on_failure(folder):
             stages = Stages(folder / RECORD, STAGES)
             paths = [str(path.absolute()) for path in sources.inputs]
@@ -175,14 +171,8 @@ def _run(
     def gather_photos(report: Report) -> dict[str, Any]:
         return _gather(sources, folder, chosen_photos, report, stages.about["in_place"])
 
-    chosen = asdict(chosen_photos)
-    for name, default in (("photos", None), ("panoramas", False), ("as_stored", False)):
-        if chosen[name] == default:  # earlier versions did not have these settings
-            del chosen[name]
-    fingerprint, former = _fingerprints(sources.paths)
-    if stages.settings("photos").get("input") == former:
-        fingerprint = former
-    stage("photos", {"input": fingerprint, **chosen}, ["input", "distorted/masks"], gather_photos)
+    of_photos = {"input": _fingerprint(sources.paths), **asdict(chosen_photos)}
+    stage("photos", of_photos, ["input", "distorted/masks"], gather_photos)
     photos = _photos(folder, outcomes["photos"].result)
     left.gathered(len(photos))
     if options.skip_matching:
@@ -205,9 +195,7 @@ def _run(
     def make_images(report: Report) -> dict[str, Any]:
         return _undistort(folder, photos, options, report)
 
-    of_images: dict[str, Any] = {"resize": options.resize}
-    if options.marker is not None:  # earlier versions did not have this setting
-        of_images["marker"] = options.marker
+    of_images = {"resize": options.resize, "marker": options.marker}
     stage("images", of_images, _IMAGE_FOLDERS, make_images)
 
     def write(report: Report) -> dict[str, Any]:
@@ -227,7 +215,7 @@ def _run(
         }
         return {"file": write_report(folder, facts).name, "verdict": facts["verdict"]}
 
-    stage("report", {"verdict": 1}, [REPORT], write)  # earlier versions gave no verdict
+    stage("report", {}, [REPORT], write)
     return outcomes
 
 
@@ -281,10 +269,9 @@ def _check_free(
 ) -> None:
     """Raises UserError if the dataset must not be written to ``folder``."""
     remove_temporaries(folder, (RECORD, REPORT))
-    record = next((folder / name for name in RECORDS if (folder / name).is_file()), None)
-    if record is not None:
-        stages = Stages(record, STAGES)
-        if not in_place and _were_in_place(stages.about, folder):
+    if (folder / RECORD).is_file():
+        stages = Stages(folder / RECORD, STAGES)
+        if not in_place and stages.about.get("in_place") is True:
             raise UserError(
                 "{folder}: contains the original photos of this dataset, not copies; use another "
                 "folder",
@@ -293,7 +280,7 @@ def _check_free(
         before = stages.about.get("inputs")
         same = before == [str(path.absolute()) for path in sources.inputs]
         # The photos may have been moved.
-        same |= stages.settings("photos").get("input") in _fingerprints(sources.paths)
+        same |= stages.settings("photos").get("input") == _fingerprint(sources.paths)
         if not same and not overwrite:
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
@@ -314,23 +301,6 @@ def _check_free(
             others=", ".join(others[:3]),
             what=", …" if len(others) > 3 else "",
         )
-
-
-def _rename_former_files(folder: Path) -> None:
-    """Rename the record of version 0.1.0; its report is written again, with the new name."""
-    former, record = folder / FORMER_RECORD, folder / RECORD
-    if former.is_file() and not record.exists():
-        former.rename(record)
-        (folder / FORMER_REPORT).unlink(missing_ok=True)
-
-
-def _were_in_place(about: Mapping[str, Any], folder: Path) -> bool:
-    """Whether the ``input`` folder of the dataset itself was an input, as its record says."""
-    if isinstance(about.get("in_place"), bool):  # also after the folder was moved
-        return bool(about["in_place"])
-    names = inputs if isinstance(inputs := about.get("inputs"), list) else []
-    own = (folder / "input").resolve()
-    return any(isinstance(name, str) and Path(name).resolve() == own for name in names)
 
 
 @contextmanager
@@ -368,25 +338,20 @@ def _remove(path: Path) -> None:
 # JSON
 
 
-def _fingerprints(files: Sequence[Path]) -> tuple[str, str]:
-    """Hashes of file names, sizes and times; they change if a photo is added, removed or edited.
+def _fingerprint(files: Sequence[Path]) -> str:
+    """A hash of file names, sizes and times; it changes if a photo is added, removed or edited.
 
-    The names are relative to the folder of all files, which may be moved, and, in the second hash,
-    which earlier versions recorded, absolute.
+    The names are relative to the folder of all files, which may be moved.
     """
     paths = [file.absolute() for file in files]
     try:
         base = Path(os.path.commonpath([path.parent for path in paths]))
     except ValueError:  # no files, or several drives of Windows
         base = Path()
+    names = [os.path.relpath(path, base) if base.name else str(path) for path in paths]
     status = [path.stat() for path in paths]
-
-    def hashed(names: Sequence[str]) -> str:
-        entries = [[n, s.st_size, s.st_mtime_ns] for n, s in zip(names, status, strict=True)]
-        return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
-
-    relative = [os.path.relpath(path, base) if base.name else str(path) for path in paths]
-    return hashed(relative), hashed([str(path) for path in paths])
+    entries = [[n, s.st_size, s.st_mtime_ns] for n, s in zip(names, status, strict=True)]
+    return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
 
 
 def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:

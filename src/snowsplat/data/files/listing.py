@@ -54,7 +54,7 @@ _CHANGED = re.compile(r"(corrected|undistorted|resized|downscaled)[_-](?P<origin
 _MOST_FILES = 500_000
 
 # Folders that contain one of these files are outputs of snowsplat: datasets, scenes, trainings.
-_OUTPUT_FILES = ("sfm.json", "capture.json", "make.json", "cfg_args")
+_OUTPUT_FILES = ("sfm.json", "make.json", "cfg_args")
 
 FolderKind = Literal["masks", "maps", "thumbnails", "photos"]
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.evaluation.verdict import Grade, Reason, Verdict
-from snowsplat.sfm.ingest.search.sources import RECORDS
+from snowsplat.sfm.ingest.search.sources import RECORD
 from snowsplat.sfm.report.coverage import Coverage
 from snowsplat.util.messages import message
 from snowsplat.util.safe_json import read_json
@@ -77,13 +77,11 @@ def capture_verdict(
 
 def recorded_verdict(dataset: Path) -> Verdict | None:
     """The verdict that the record of a dataset contains; None: there is none."""
-    for name in RECORDS:
-        try:
-            values = read_json(dataset / name)["stages"]["report"]["result"]["verdict"]
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        return Verdict.from_json(values)
-    return None
+    try:
+        values = read_json(dataset / RECORD)["stages"]["report"]["result"]["verdict"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Verdict.from_json(values)
 
 
 def _lost(sfm: Mapping[str, Any]) -> list[Reason]:

@@ -25,7 +25,7 @@ def test_a_folder_is_searched_recursively(tmp_path):
     photo().save(root / ".hidden.jpg")
     photo(200).save(root / "Ünïcode name (1).JPG")
     (root / "notes.txt").write_text("x")
-    for name in ("sfm.json", "capture.json", "cfg_args"):
+    for name in ("sfm.json", "cfg_args"):
         write_photos(root / f"made with {name}" / "input")
         (root / f"made with {name}" / name).write_text("{}")
     expected = ["0.jpg", "1.jpg", "2.jpg", "näher dran/0.PNG", "näher dran/1.PNG"]
