@@ -5,7 +5,7 @@
 
 The costs of one process are measured: the stages of an iteration with the threads that each process
 has, and the backward pass of the projection. So is the rate at which two processes of this computer
-exchange data. See docs/measurements/2026-11-25-processes.md.
+exchange data. See docs/what-was-tried.md.
 """
 
 from __future__ import annotations

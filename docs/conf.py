@@ -3,9 +3,6 @@
 import sys
 from pathlib import Path
 
-from docutils import nodes
-from sphinx.application import Sphinx
-
 _DOCS = Path(__file__).parent
 sys.path[:0] = [str(_DOCS / "extensions"), str(_DOCS.parent / "src")]
 
@@ -82,13 +79,3 @@ nitpick_ignore_regex = [
     ("py:class", r"snowsplat\..*|Alignment|DepthKind|LivePage|Moment|PlacedPhoto|Shards|Start"),
 ]
 
-
-def setup(app: Sphinx) -> None:
-    app.connect("doctree-read", _outside_of_the_sidebar)
-
-
-def _outside_of_the_sidebar(app: Sphinx, doctree: nodes.document) -> None:
-    """Leave dated measurements out of the sidebar: their index is a table, and they are many."""
-    name = app.env.docname
-    if name.startswith("measurements/20"):
-        app.env.metadata[name]["orphan"] = ""

@@ -2,7 +2,7 @@
 
 It continues the training for a moment with fixed Gaussians, at the learning rates of its end and
 somewhat above. The metrics remain those of the scene before: afterwards, no photo can judge it. See
-docs/measurements/2026-11-26-all-photos.md.
+docs/what-was-tried.md.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from snowsplat.util.errors import SettingError
 from snowsplat.util.files import atomic_path
 
 _UNITS = {"kb": 1000, "mb": 1000**2, "gb": 1000**3}
-# Steps of the distillation. See docs/measurements/2026-11-25-fewer-gaussians.md.
+# Steps of the distillation. See docs/what-was-tried.md.
 _STEPS = 60
 
 

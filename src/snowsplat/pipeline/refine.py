@@ -15,7 +15,7 @@ from snowsplat.training.core.distillation import MERGED_RATES
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.recipes import recipe
 
-# See docs/measurements/2026-11-25-fewer-gaussians.md.
+# See docs/what-was-tried.md.
 _STEPS = 600
 # In so many steps, the means may move farther than in those of `distill`.
 _RATES = replace(MERGED_RATES, means=1.44e-4, means_final=4.8e-6, anneal=0.1, anneal_from=0.7)

@@ -15,7 +15,7 @@ from snowsplat.training.settings.config import TrainConfig
 if TYPE_CHECKING:
     from snowsplat.data import Dataset
 
-# Seconds of a step on the machine of docs/measurements/2026-11-25-kernels.md. Only their
+# Seconds of a step on two cores of a Zen 5 with AVX-512. Only their
 # proportions matter: the time on this machine with this scene, divided by these seconds, is
 # measured. It is the `time_ratio`. The fixed part is small: with fox and lego, steps at a quarter
 # of the width take no more than their pixels and Gaussians account for.
@@ -71,7 +71,7 @@ class Work:
         return cls(config, sum(sizes) / len(sizes), len(dataset.test))
 
     def seconds(self, downscale: int, gaussians: float) -> float:
-        """Seconds of one step on the machine of docs/measurements/2026-11-25-kernels.md."""
+        """Seconds of one step on the machine of these constants."""
         megapixels = self.pixels / downscale**2 / 1e6
         return (
             _SECONDS_PER_STEP

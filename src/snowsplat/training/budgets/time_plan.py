@@ -1,7 +1,7 @@
 """Plans a training run for a given time on this machine: photo size, number of Gaussians, steps.
 
 If there is more time, first the number of steps is increased, then the size of the photos, then the
-number of Gaussians: see docs/measurements/2026-11-22-time-budgets.md.
+number of Gaussians: see docs/performance.md.
 """
 
 from __future__ import annotations

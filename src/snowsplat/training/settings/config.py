@@ -333,8 +333,7 @@ class TrainConfig(Settings):
         """This configuration of a recipe, with more steps if ``views`` are used in few passes.
 
         Early steps with small images are cheap looks at many photos, so they are extended, too, as
-        if the passes were as few as before. See docs/measurements/2026-11-26-fewer-pairs.md and
-        2026-11-27-many-photos.md.
+        if the passes were as few as before. See docs/what-was-tried.md.
         """
         more = 1.0 + _LONGER * self._few(views)
         passes = more * self.few_passes

@@ -1,6 +1,6 @@
 """Finds the photos that have a wrong pose in a model, from their verified matches.
 
-docs/cameras.md describes the method, docs/measurements/2026-11-23-checking-poses.md an example.
+docs/cameras.md describes the method.
 
 If two places look alike, the mapper may register a photo, and then all following photos, at the
 wrong place. The reprojection error remains small, because the matches that disagree are dropped. A
