@@ -117,7 +117,7 @@ def slugs(page: Path) -> set[str]:
 
 def test_links_lead_to_files_and_headings_of_the_repository():
     pages = sorted(DOCS.rglob("*.md"))
-    assert len(pages) > 100
+    assert len(pages) > 50
     for page in pages:
         text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
         for target, anchor in LINK.findall(text):
