@@ -78,4 +78,3 @@ nitpick_ignore_regex = [
     # types of snowsplat that are not public: the API pages describe the public names only
     ("py:class", r"snowsplat\..*|Alignment|DepthKind|LivePage|Moment|PlacedPhoto|Shards|Start"),
 ]
-
