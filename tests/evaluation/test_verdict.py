@@ -6,11 +6,14 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.util.messages import message
 
-REMARK = Reason("good", "all photos show one side")
-FEW = Reason("usable", "11 photos are few", "take more")
-FAR = Reason("poor", "the photos are far apart <here>", "take more")
-LOST = Reason("usable", "3 photos are lost", "take photos in between")
+MORE = message("take more")
+REMARK = Reason("good", message("all photos show one side"))
+FEW = Reason("usable", message("{count} photos are few", count=11), MORE)
+FAR = Reason("poor", message("the photos are far apart <here>"), MORE)
+LOST = Reason("usable", message("3 photos are lost"), message("take photos in between"))
+PHOTOS = message("the photos")
 
 
 def test_the_worst_reason_is_the_grade_and_comes_first():
@@ -20,23 +23,23 @@ def test_the_worst_reason_is_the_grade_and_comes_first():
     assert verdict.grade == "poor"
     assert verdict.reasons == (FAR, FEW, LOST, REMARK)
     assert verdict.told == (FAR, FEW, LOST)
-    assert verdict.advice == ["take more", "take photos in between"]
+    assert list(map(str, verdict.advice)) == ["take more", "take photos in between"]
 
 
 def test_lines():
-    assert Verdict.of([REMARK, FEW]).lines("the photos") == [
+    assert Verdict.of([REMARK, FEW]).lines(PHOTOS) == [
         "the photos: usable, with limits",
         "  - 11 photos are few",
         "  also: all photos show one side",
         "  next time: take more",
     ]
-    assert Verdict.of([REMARK]).lines("it") == ["it: good", "  - all photos show one side"]
-    box = "".join(ET.fromstring(Verdict.of([REMARK, FEW]).html("the photos")).itertext())
+    assert Verdict.of([REMARK]).lines(message("it")) == ["it: good", "  - all photos show one side"]
+    box = "".join(ET.fromstring(Verdict.of([REMARK, FEW]).html(PHOTOS)).itertext())
     assert "11 photos are fewAlso: all photos show one side" in box
 
 
 def test_html_is_escaped():
-    box = ET.fromstring(Verdict.of([FAR]).html("the scene"))
+    box = ET.fromstring(Verdict.of([FAR]).html(message("the scene")))
     assert box.attrib["class"] == "verdict poor"
     words = " ".join("".join(box.itertext()).split())
     assert words.startswith("The scene: poor; expect blurred or wrong parts")

@@ -7,6 +7,7 @@ import tyro
 
 from snowsplat.scene.length import metres_of
 from snowsplat.util.errors import SettingError
+from snowsplat.util.messages import as_message
 
 _SETTING = re.compile(r"`([a-z][a-z0-9_]*)`")
 # Settings whose flag has another name.
@@ -53,7 +54,7 @@ def marker_side(text: str | None) -> float | None:
     try:
         return None if text is None else metres_of(text)
     except ValueError as error:
-        raise SettingError("marker", str(error)) from None
+        raise SettingError("marker", as_message(error)) from None
 
 
 def with_flags(message: str) -> str:

@@ -200,7 +200,7 @@ def print_summary(made: MakeResult) -> None:
         )
     )
     if made.verdict is not None:
-        print("\n" + "\n".join(made.verdict.lines("The scene")))
+        print("\n" + "\n".join(made.verdict.lines(message("the scene"))))
     sys.stdout.flush()
 
 

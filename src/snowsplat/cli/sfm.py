@@ -104,7 +104,7 @@ class Sfm(Reports):
         for line in placement.lines() if placement is not None else []:
             print(line)
         verdict = Verdict.from_json(outcomes["report"].result["verdict"])
-        for line in [] if verdict is None else verdict.lines("the photos"):
+        for line in [] if verdict is None else verdict.lines(message("the photos")):
             print(line)
         print(next_step("train it with", "train", folder, "-o", "OUT", "--eval"))
         results = {stage: outcome.result for stage, outcome in outcomes.items()}

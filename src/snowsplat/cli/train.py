@@ -96,7 +96,7 @@ class Train(TrainFlags, Reports):
             measured = None if metrics is None else {"step": step, **metrics.as_json()}
             self.report = {**vars(result), "evaluation": measured}
             if result.verdict is not None:
-                print("\n".join(result.verdict.lines("the scene")), flush=True)
+                print("\n".join(result.verdict.lines(message("the scene"))), flush=True)
             if not self.quiet:
                 print(see_and_share(self.output), flush=True)
             if page is not None:

@@ -6,10 +6,11 @@ Whoever judges lists reasons. The worst grade of a reason is the grade of the ve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from snowsplat.util.html import text
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import from_json
 
 Grade = Literal["good", "usable", "poor"]
@@ -18,7 +19,11 @@ Grade = Literal["good", "usable", "poor"]
 GRADES: tuple[Grade, ...] = ("poor", "usable", "good")
 #: At most this number of reasons is told, and as many kinds of advice: more are not read.
 _TOLD = 3
-_MEANING = {"good": "", "usable": ", with limits", "poor": "; expect blurred or wrong parts"}
+_MEANING = {
+    "good": message("{what}: good"),
+    "usable": message("{what}: usable, with limits"),
+    "poor": message("{what}: poor; expect blurred or wrong parts"),
+}
 
 #: The style of `Verdict.html`.
 STYLE = """
@@ -30,13 +35,16 @@ STYLE = """
 """
 
 
+_NO_ADVICE = Message("")
+
+
 @dataclass(frozen=True)
 class Reason:
     """One reason."""
 
     grade: Grade  # the best grade that is possible with this reason; "good": only a remark
-    text: str  # a clause without a full stop
-    advice: str = ""  # what to do next time, as an imperative clause; empty: nothing
+    text: Message  # a clause without a full stop
+    advice: Message = _NO_ADVICE  # what to do next time, an imperative clause; empty: nothing
 
 
 @dataclass(frozen=True)
@@ -71,36 +79,43 @@ class Verdict:
         return self.reasons[:_TOLD]
 
     @property
-    def advice(self) -> list[str]:
+    def advice(self) -> list[Message]:
         """What to do next time, each advice once."""
         return list(dict.fromkeys(reason.advice for reason in self.told if reason.advice))
 
-    def lines(self, what: str) -> list[str]:
-        """The verdict as lines for a terminal. ``what``: what is judged, such as "the photos"."""
+    def head(self, what: Message) -> Message:
+        """The grade in a line. ``what``: what is judged, such as "the photos"."""
+        return replace(_MEANING[self.grade], values={"what": what})
+
+    def why(self) -> list[Message]:
+        """The reasons that are told: a remark that is none for this grade begins with "also:"."""
+        remark = [self.grade != "good" and reason.grade == "good" for reason in self.told]
         return [
-            f"{what}: {self.grade}{_MEANING[self.grade]}",
-            *(f"  {self._mark(reason)} {reason.text}" for reason in self.told),
-            *(f"  next time: {advice}" for advice in self.advice),
+            message("also: {reason}", reason=reason.text) if also else reason.text
+            for also, reason in zip(remark, self.told, strict=True)
         ]
 
-    def _mark(self, reason: Reason) -> str:
-        """What stands before a reason: "also:" before a remark that is none for this grade."""
-        return "-" if self.grade == "good" or reason.grade != "good" else "also:"
+    def lines(self, what: Message) -> list[str]:
+        """The verdict as lines for a terminal. ``what``: see `head`."""
+        marks = ["" if why.key.startswith("also:") else "- " for why in self.why()]
+        return [
+            str(self.head(what)),
+            *(f"  {mark}{why}" for mark, why in zip(marks, self.why(), strict=True)),
+            *(f"  {message('next time: {advice}', advice=advice)}" for advice in self.advice),
+        ]
 
-    def html(self, what: str) -> str:
+    def html(self, what: Message) -> str:
         """The verdict as a box of a page with `STYLE`."""
-        marked = [(self._mark(reason), reason.text) for reason in self.told]
-        told = [why if mark == "-" else f"{mark} {why}" for mark, why in marked]
-        reasons = "".join(f"<li>{text(_sentence(why))}</li>" for why in told)
-        advice = "".join(f"<li>{text(_sentence(advice))}</li>" for advice in self.advice)
+        reasons = "".join(f"<li>{text(sentence(why))}</li>" for why in self.why())
+        advice = "".join(f"<li>{text(sentence(advice))}</li>" for advice in self.advice)
         return (
-            f'<div class="verdict {self.grade}"><b>{text(_sentence(what))}: {self.grade}</b>'
-            f"{_MEANING[self.grade]}"
+            f'<div class="verdict {self.grade}"><b>{text(sentence(self.head(what)))}</b>'
             + (f"<ul>{reasons}</ul>" if reasons else "")
             + (f"<p>Next time:</p><ul>{advice}</ul>" if advice else "")
             + "</div>"
         )
 
 
-def _sentence(clause: str) -> str:
-    return clause[:1].upper() + clause[1:]
+def sentence(clause: Message) -> str:
+    """A clause with a capital letter."""
+    return str(clause)[:1].upper() + str(clause)[1:]

@@ -11,6 +11,7 @@ from snowsplat.ops.cuda import availability
 from snowsplat.ops.native import get_num_threads, isa
 from snowsplat.util.errors import UserError
 from snowsplat.util.machine import processor_name
+from snowsplat.util.messages import message
 
 
 def default_device(note: Callable[[str], None] | None = None) -> torch.device:
@@ -24,7 +25,7 @@ def default_device(note: Callable[[str], None] | None = None) -> torch.device:
     if why is None:
         return torch.device("cuda", index)
     if note is not None and availability.has_gpu():
-        note(f"the GPU cannot be used: {why}; computing on the CPU")
+        note(str(message("the GPU cannot be used: {why}; computing on the CPU", why=why)))
     return torch.device("cpu")
 
 

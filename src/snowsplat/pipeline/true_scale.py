@@ -15,6 +15,7 @@ from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.length import metres_of
 from snowsplat.util.errors import SettingError
+from snowsplat.util.messages import as_message
 from snowsplat.util.safe_json import quoted
 
 _EXAMPLE = "0,0.5,2 for a point, or the name of a photo"
@@ -39,7 +40,7 @@ class KnownDistance:
         try:
             metres_of(self.length)
         except ValueError as error:
-            raise SettingError("scale_to", str(error)) from None
+            raise SettingError("scale_to", as_message(error)) from None
         if not all(self.between):
             raise SettingError(
                 "scale_to", "between what? add `between` A B, each {example}", example=_EXAMPLE

@@ -227,7 +227,7 @@ def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
         "psnr": made.psnr_aligned if made.exposures else made.psnr,
         "aligned": made.exposures,
         "seconds": made.seconds,
-        "verdict": [] if made.verdict is None else made.verdict.lines("The scene"),
+        "verdict": [] if made.verdict is None else made.verdict.lines(message("the scene")),
         "reports": existing_reports(scene, reports),
     }
 

@@ -18,7 +18,7 @@ import gettext
 import os
 import string
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -37,13 +37,18 @@ class Message:
     Attributes:
         key: the English text.
         values: of its fields: texts, numbers, paths, and other messages or errors, which are
-            rendered in the same language. The items of a list are joined by ", ".
+            rendered in the same language. The items of a list are joined by ", ". They are kept
+            as values of JSON and messages.
         many: the English text if ``values["n"]`` is not 1; None: there is one text.
     """
 
     key: str
     values: Mapping[str, Any] = field(default_factory=dict)
     many: str | None = None
+
+    def __post_init__(self) -> None:
+        plain = {name: _plain(value) for name, value in self.values.items()}
+        object.__setattr__(self, "values", plain)
 
     def __str__(self) -> str:
         return self.text(_current)
@@ -64,20 +69,16 @@ class Message:
         return _Rendering(language).vformat(template, (), self.values) if self.values else template
 
     def as_json(self) -> dict[str, Any]:
-        """JSON values, which `from_json` reads."""
-        values = {name: _as_json(value) for name, value in self.values.items()}
-        many = {} if self.many is None else {"many": self.many}
-        return {"key": self.key, "values": values, **many}
+        """JSON values, which `from_json` reads; the same as those of `dataclasses.asdict`."""
+        return asdict(self)
 
     @classmethod
     def from_json(cls, json: Any) -> Message:
         """The message of `as_json`. Raises: ValueError: it is none."""
         match json:
-            case {"key": str(key), "values": dict(values), **rest} if set(rest) <= {"many"}:
-                many = rest.get("many")
-                if isinstance(many, str | None) and (many is None or "n" in values):
-                    read = {str(name): _from_json(value) for name, value in values.items()}
-                    return cls(key, read, many)
+            case {"key": str(key), "values": dict(values), "many": (None | str()) as many}:
+                if len(json) == 3 and (many is None or isinstance(values.get("n"), int)):
+                    return cls(key, {name: _read(value) for name, value in values.items()}, many)
         raise ValueError("not a message")
 
     def in_all_languages(self) -> dict[Language, str]:
@@ -96,9 +97,11 @@ def plural(one: str, many: str, /, *, n: int, **values: Any) -> Message:
 
 
 def as_message(text: object) -> Message:
-    """A text of any origin: a message, the message of an error, or a text without values."""
+    """A text of any origin: a message or its JSON, an error, or a text without values."""
     if isinstance(text, Message):
         return text
+    if isinstance(text, dict):
+        return Message.from_json(text)
     inner = getattr(text, "message", None) if isinstance(text, Exception) else None
     return inner if isinstance(inner, Message) else Message(str(text))
 
@@ -133,12 +136,10 @@ class _Rendering(string.Formatter):
         return self._rendered(kwargs[field_name]), field_name
 
     def _rendered(self, value: Any) -> Any:
-        if isinstance(value, Message | Exception):
-            return as_message(value).text(self._language)
-        if isinstance(value, list | tuple):
+        if isinstance(value, Message):
+            return value.text(self._language)
+        if isinstance(value, list):
             return ", ".join(str(self._rendered(item)) for item in value)
-        if value is None or isinstance(value, Path):
-            return str(value)
         return value
 
 
@@ -151,17 +152,18 @@ def _catalogue(language: Language) -> gettext.NullTranslations:
         return gettext.GNUTranslations(compiled)
 
 
-def _as_json(value: Any) -> Any:
+def _plain(value: Any) -> Any:
+    """A value of JSON, or a message. Numbers of other libraries become those of Python."""
     if isinstance(value, Message | Exception):
-        return as_message(value).as_json()
+        return as_message(value)
     if isinstance(value, list | tuple):
-        return [_as_json(item) for item in value]
+        return [_plain(item) for item in value]
+    if not isinstance(value, str | int | float | bool) and hasattr(value, "item"):
+        value = value.item()
     return value if isinstance(value, str | int | float | bool) else str(value)
 
 
-def _from_json(value: Any) -> Any:
+def _read(value: Any) -> Any:
     if isinstance(value, dict):
         return Message.from_json(value)
-    if isinstance(value, list):
-        return [_from_json(item) for item in value]
-    return value
+    return [_read(item) for item in value] if isinstance(value, list) else value

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from snowsplat.util.messages import Message, message
 
-def first_names(names: Sequence[str], most: int) -> str:
+
+def first_names(names: Sequence[str | Message], most: int) -> Message:
     """The first ``most`` names, and how many more there are: "a, b and 5 more"."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    if len(names) <= most:
+        return message("{names}", names=names)
+    more = len(names) - most
+    return message("{names} and {more} more", names=names[:most], more=more)

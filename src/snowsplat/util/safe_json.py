@@ -12,6 +12,8 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from snowsplat.util.messages import Message
+
 _Kind = TypeVar("_Kind")
 
 # Upper bounds of the memory of JSON values in CPython: bytes per occurrence of each character.
@@ -127,6 +129,7 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
     """A dataclass from JSON values. The values must have the declared types of the fields.
 
     Lists are accepted for tuples, and integers for floats. Fields with a default may be missing.
+    A `Message` is read as it is written by `dataclasses.asdict`.
 
     Raises:
         ValueError: a value has another type or is not finite, or a field is unknown or missing.
@@ -177,6 +180,8 @@ def _as(hint: Any, value: Any) -> Any:
     elif hint is int:
         if type(value) is int and abs(value) < _MAX_INTEGER:
             return value
+    elif hint is Message:
+        return Message.from_json(value)
     elif isinstance(hint, type) and is_dataclass(hint):
         return from_json(hint, value)
     elif isinstance(hint, type) and type(value) is hint:

@@ -12,7 +12,7 @@ import pytest
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.sfm.report.capture_verdict import capture_verdict, recorded_verdict
 from snowsplat.sfm.report.coverage import Coverage, measure_coverage
-from snowsplat.sfm.report.photo_problems import BLURRED, DARK
+from snowsplat.util.messages import message
 
 CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "captures"
 
@@ -34,7 +34,7 @@ def sfm(count: int = 50, lost: int = 0, **more: Any) -> dict[str, Any]:
 
 
 def told(verdict: Verdict) -> str:
-    return "\n".join(reason.text for reason in verdict.reasons)
+    return "\n".join(str(reason.text) for reason in verdict.reasons)
 
 
 def test_good_photos():
@@ -81,12 +81,12 @@ def test_a_model_without_observations_has_no_reasons_about_them():
 
 
 def test_bad_photos_count_if_they_are_many():
-    assert capture_verdict(coverage(), sfm(), {"01.jpg": BLURRED}).grade == "good"
-    bad = {f"{i:02d}.jpg": BLURRED for i in range(14)} | {"20.jpg": DARK}
+    assert capture_verdict(coverage(), sfm(), {"01.jpg": "blurred"}).grade == "good"
+    bad = {f"{i:02d}.jpg": "blurred" for i in range(14)} | {"20.jpg": "dark"}
     verdict = capture_verdict(coverage(), sfm(), bad)
     assert verdict.grade == "usable"
     assert told(verdict) == "14 of 50 photos: each is blurred"
-    assert verdict.advice == ["hold the camera still, or take it in more light"]
+    assert list(map(str, verdict.advice)) == ["hold the camera still, or take it in more light"]
 
 
 def test_weak_ends_of_the_path_are_named():
@@ -99,7 +99,7 @@ def test_weak_ends_of_the_path_are_named():
 
 def test_the_verdict_is_read_from_the_record_of_a_dataset(tmp_path):
     assert recorded_verdict(tmp_path) is None
-    verdict = Verdict.of([Reason("poor", "far", "closer")])
+    verdict = Verdict.of([Reason("poor", message("far"), message("closer"))])
     record = {"stages": {"report": {"result": {"verdict": verdict.as_json()}}}}
     (tmp_path / "sfm.json").write_text(json.dumps(record))
     assert recorded_verdict(tmp_path) == verdict

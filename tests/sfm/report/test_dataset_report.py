@@ -18,7 +18,7 @@ from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.scene.geometry import look_at
 from snowsplat.sfm.report import dataset_report
 from snowsplat.sfm.report.dataset_report import write_report
-from snowsplat.sfm.report.photo_problems import DARK
+from snowsplat.util.messages import message
 
 from ...browser import chinese_labels
 
@@ -84,7 +84,9 @@ def facts(**sfm: Any) -> dict[str, Any]:
         "seconds": {"photos": 3.21, "poses": 6000.0, "images": 130.0},
         "problems": {},
         "alone": True,
-        "verdict": Verdict.of([Reason("usable", "30 photos < 31", "take <more>")]).as_json(),
+        "verdict": Verdict.of(
+            [Reason("usable", message("30 photos < 31"), message("take <more>"))]
+        ).as_json(),
     }
 
 
@@ -169,7 +171,7 @@ def test_pictures_are_reduced_images(dataset, monkeypatch):
 
 def test_photos_with_problems_are_shown(dataset):
     assert "may be better" not in visible_text(write_report(dataset, facts()))
-    page = write_report(dataset, facts() | {"problems": {NAMES[0]: DARK}})
+    page = write_report(dataset, facts() | {"problems": {NAMES[0]: "dark"}})
     assert f"1 of {len(NAMES)} photos may be better" in visible_text(page)
     assert "is too dark; use more light" in visible_text(page)
 
@@ -239,7 +241,7 @@ def test_level_north_and_scale_are_told(dataset):
 
 @pytest.mark.browser
 def test_headings_and_labels_are_chinese_in_a_browser_in_chinese(dataset):
-    known = facts() | {"problems": {NAMES[0]: DARK}}
+    known = facts() | {"problems": {NAMES[0]: "dark"}}
     known["undistorted"]["placement"] = {
         "up_from": ["the ground", "the accelerometers of 18 photos"],
         "level_error": 0.7,

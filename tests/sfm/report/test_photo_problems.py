@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from snowsplat.sfm.report.photo_problems import BLURRED, BRIGHT, DARK, problem_of, problems
+from snowsplat.sfm.report.photo_problems import problem_of, problems
 
 
 @pytest.fixture
@@ -27,17 +27,17 @@ def moved(image: Image.Image, pixels: int) -> Image.Image:
 
 def test_blur(sharp):
     assert problem_of(np.asarray(sharp)) is None
-    assert problem_of(np.asarray(sharp.filter(ImageFilter.GaussianBlur(2)))) == BLURRED
-    assert problem_of(np.asarray(moved(sharp, 30))) == BLURRED
+    assert problem_of(np.asarray(sharp.filter(ImageFilter.GaussianBlur(2)))) == "blurred"
+    assert problem_of(np.asarray(moved(sharp, 30))) == "blurred"
 
 
 def test_exposure(sharp):
     pixels = np.asarray(sharp)
-    assert problem_of(pixels // 4) == DARK
-    assert problem_of(np.minimum(pixels * 2.2, 255).astype(np.uint8)) == BRIGHT
+    assert problem_of(pixels // 4) == "dark"
+    assert problem_of(np.minimum(pixels * 2.2, 255).astype(np.uint8)) == "bright"
 
 
 def test_a_folder(sharp, tmp_path):
     Image.merge("RGB", [sharp] * 3).save(tmp_path / "good.jpg")
     sharp.point(lambda value: value // 5).save(tmp_path / "dark.png")
-    assert problems(tmp_path, ["good.jpg", "dark.png", "missing.jpg"]) == {"dark.png": DARK}
+    assert problems(tmp_path, ["good.jpg", "dark.png", "missing.jpg"]) == {"dark.png": "dark"}

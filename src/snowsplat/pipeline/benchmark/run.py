@@ -19,6 +19,7 @@ from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
 from snowsplat.pipeline.run import option
 from snowsplat.training.settings.recipes import check_recipe, recipe
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import as_message
 from snowsplat.util.run_lock import InUse
 from snowsplat.util.settings import Settings, setting
 
@@ -99,7 +100,7 @@ def benchmark(
         try:  # what is wrong is reported before hours of training
             Lpips.load(options.lpips)
         except UserError as error:
-            raise SettingError("lpips", str(error)) from None
+            raise SettingError("lpips", as_message(error)) from None
     output.mkdir(parents=True, exist_ok=True)
     on_line(f"{SUITES[name].title}: {len(jobs)} scenes, {len(finished)} finished")
     waiting = [job for job in jobs if job.scene not in finished]

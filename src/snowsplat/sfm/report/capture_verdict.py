@@ -15,7 +15,8 @@ import numpy as np
 from snowsplat.evaluation.verdict import Grade, Reason, Verdict
 from snowsplat.sfm.ingest.search.sources import RECORD
 from snowsplat.sfm.report.coverage import Coverage
-from snowsplat.util.messages import message
+from snowsplat.sfm.report.photo_problems import PROBLEMS, Problem
+from snowsplat.util.messages import as_message, message, plural
 from snowsplat.util.safe_json import read_json
 
 #: With fewer photos, no photo is left to check the poses and to hold out.
@@ -43,14 +44,14 @@ _MAX_ERROR = 1.5
 #: or more in right ones.
 _BENT = 0.86
 
-_CLOSER = (
+_CLOSER = message(
     "move by at most a tenth of the distance to what you photograph from one photo to the next, so "
     "that every place is in at least five photos"
 )
 
 
 def capture_verdict(
-    coverage: Coverage, sfm: Mapping[str, Any], problems: Mapping[str, str]
+    coverage: Coverage, sfm: Mapping[str, Any], problems: Mapping[str, Problem]
 ) -> Verdict:
     """The verdict.
 
@@ -89,17 +90,21 @@ def _lost(sfm: Mapping[str, Any]) -> list[Reason]:
     share = lost / max(lost + placed, 1)
     if share < _SOME_LOST:
         return []
-    groups = len(sfm["sub_models"])
-    apart = f"; the photos form {groups} groups without common points" if groups > 1 else ""
-    text = f"{lost} of {lost + placed} photos could not be placed{apart}"
-    advice = "take more photos between those that are placed and those that are not"
+    text = message("{lost} of {all} photos could not be placed", lost=lost, all=lost + placed)
+    if (groups := len(sfm["sub_models"])) > 1:
+        text = message(
+            "{text}; the photos form {groups} groups without common points",
+            text=text,
+            groups=groups,
+        )
+    advice = message("take more photos between those that are placed and those that are not")
     return [Reason("poor" if share >= _MANY_LOST else "usable", text, advice)]
 
 
 def _doubts(sfm: Mapping[str, Any]) -> list[Reason]:
     """What is doubtful about the cameras. In a bent model, parts of the scene are doubled."""
     grade: Grade = "poor" if sfm.get("agreement", 1.0) < _BENT else "usable"
-    return [Reason(grade, doubt) for doubt in sfm.get("doubts", ())]
+    return [Reason(grade, as_message(doubt)) for doubt in sfm.get("doubts", ())]
 
 
 def _distances(coverage: Coverage) -> list[Reason]:
@@ -108,16 +113,18 @@ def _distances(coverage: Coverage) -> list[Reason]:
         return []
     reasons = []
     confirmed, step = _median(coverage.confirmed), _median(coverage.step)
-    far = (
-        f"the photos are far apart: the next one is typically {100 * step:.0f}% of the distance "
-        "to the scene away"
-        if np.isfinite(step)
-        else "most photos have no other photo that shows the same"
+    far = message(
+        "the photos are far apart: the next one is typically {step:.0%} of the distance to the "
+        "scene away",
+        step=step,
     )
+    if not np.isfinite(step):
+        far = message("most photos have no other photo that shows the same")
     if confirmed < _CONFIRMED:
-        why = (
-            f"too few photos show the same: in a typical photo, {100 * (1 - confirmed):.0f}% of "
-            "the points are in only one other photo"
+        why = message(
+            "too few photos show the same: in a typical photo, {share:.0%} of the points are in "
+            "only one other photo",
+            share=1 - confirmed,
         )
         reasons.append(Reason("poor", why, _CLOSER))
     if step > _LARGE_STEP:
@@ -126,7 +133,7 @@ def _distances(coverage: Coverage) -> list[Reason]:
 
 
 def _count(coverage: Coverage, count: int) -> list[Reason]:
-    advice = "take 30 to 100 photos of an object or a room, and more of a larger place"
+    advice = message("take 30 to 100 photos of an object or a room, and more of a larger place")
     if count < _TOO_FEW:
         return [Reason("poor", message("{count} photos are too few", count=count), advice)]
     # A few photos are enough for one side of a scene.
@@ -143,11 +150,13 @@ def _ends(coverage: Coverage) -> list[Reason]:
     weak = [coverage.names[i] for i in (0, -1) if coverage.confirmed[i] < least]
     if not weak:
         return []
-    text = (
-        f"most of what {' and '.join(weak)} show{'s' if len(weak) == 1 else ''}, at the end of "
-        "your path, is in only one other photo"
+    text = plural(
+        "most of what {photos} shows, at the end of your path, is in only one other photo",
+        "most of what {photos} show, at the end of your path, is in only one other photo",
+        n=len(weak),
+        photos=" + ".join(weak),
     )
-    advice = "begin earlier and end later than the place that you want to show"
+    advice = message("begin earlier and end later than the place that you want to show")
     return [Reason("good", text, advice)]
 
 
@@ -155,34 +164,33 @@ def _errors(sfm: Mapping[str, Any]) -> list[Reason]:
     error = sfm["reprojection_error"]
     if error is None or error <= _MAX_ERROR:
         return []
-    text = f"the reprojection error is high: {error:.1f} pixels"
-    advice = "leave out photos that are blurred or show moving objects, or try another --camera"
+    text = message("the reprojection error is high: {error:.1f} pixels", error=error)
+    advice = message(
+        "leave out photos that are blurred or show moving objects, or try another --camera"
+    )
     return [Reason("usable", text, advice)]
 
 
-def _bad_photos(problems: Mapping[str, str], count: int) -> list[Reason]:
+def _bad_photos(problems: Mapping[str, Problem], count: int) -> list[Reason]:
     if len(problems) < _BAD_PHOTOS * count:
         return []
-    # All of one kind have the same text: "is blurred; hold the camera still …".
     kinds = list(problems.values())
     most = max(dict.fromkeys(kinds), key=kinds.count)
-    what, _, advice = most.partition("; ")
-    number = kinds.count(most)
-    return [
-        Reason(
-            "usable",
-            message(
-                "{number} of {count} photos: each {what}", number=number, count=count, what=what
-            ),
-            advice,
-        )
-    ]
+    text = message(
+        "{number} of {count} photos: each {what}",
+        number=kinds.count(most),
+        count=count,
+        what=PROBLEMS[most].what,
+    )
+    return [Reason("usable", text, PROBLEMS[most].advice)]
 
 
 def _one_side(coverage: Coverage) -> list[Reason]:
     if not _looks_one_way(coverage):
         return []
-    text = "all photos look in about the same direction: the scene can be seen from there only"
+    text = message(
+        "all photos look in about the same direction: the scene can be seen from there only"
+    )
     return [Reason("good", text)]
 
 
@@ -191,10 +199,14 @@ def _looks_one_way(coverage: Coverage) -> bool:
 
 
 def _praise(coverage: Coverage, photos: int) -> Reason:
-    text = f"{photos} photos"
-    if (confirmed := _median(coverage.confirmed)) > 0.0:
-        share = f"{100 * confirmed:.0f}%"
-        text += f"; in a typical one, {share} of the points are in at least two others"
+    confirmed = _median(coverage.confirmed)
+    if confirmed <= 0.0:
+        return Reason("good", message("{photos} photos", photos=photos))
+    text = message(
+        "{photos} photos; in a typical one, {share:.0%} of the points are in at least two others",
+        photos=photos,
+        share=confirmed,
+    )
     return Reason("good", text)
 
 

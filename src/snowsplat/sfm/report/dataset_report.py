@@ -20,10 +20,12 @@ from snowsplat.evaluation import verdict
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.report.more_photos import Advice, advice
+from snowsplat.sfm.report.photo_problems import Problem, what_to_do
 from snowsplat.sfm.report.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
 from snowsplat.util.html import bar, cards, page, picture, table, text
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import printable
 
 REPORT = "dataset_report.html"
@@ -66,7 +68,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     placement = placement_of(facts["undistorted"])
     body = [
         _headline(name, facts),
-        "" if judged is None else judged.html("the photos"),
+        "" if judged is None else judged.html(message("the photos")),
         _cards(facts),
         _your_photos(dataset, [photo.name for photo in photos], facts, more),
         _maps(photos, xyz, rgb, more.places, placement),
@@ -166,9 +168,9 @@ def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], mor
     return "<h2>Your photos</h2>\n" + "\n".join(lines)
 
 
-def _bad_photos(dataset: Path, bad: dict[str, str]) -> str:
+def _bad_photos(dataset: Path, bad: dict[str, Problem]) -> str:
     rows = [
-        [picture(_reduced(_file_of(dataset, name)), name), text(name), text(problem)]
+        [picture(_reduced(_file_of(dataset, name)), name), text(name), text(what_to_do(problem))]
         for name, problem in list(bad.items())[:_MAX_PICTURES]
     ]
     rest = "" if len(bad) <= _MAX_PICTURES else f", and {len(bad) - _MAX_PICTURES:,} more"

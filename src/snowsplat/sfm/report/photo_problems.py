@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from snowsplat.sfm.ingest.content.sharpness import SHARPNESS_SIDE, fine_detail, grey_copy
+from snowsplat.util.messages import Message, message
 
 # A photo with less detail in one direction is blurred; see `fine_detail`. Of 30 photos of five real
 # datasets, 500 to 1000 pixels wide, the least value is 0.46. If they are blurred by a Gaussian
@@ -24,24 +26,44 @@ _LEAST_DETAIL = 0.35
 _DARK, _WHITE = 70, 251
 _WHITE_SHARE = 0.25
 
-BLURRED = "is blurred; hold the camera still, or take it in more light"
-DARK = "is too dark; use more light, or a longer exposure"
-BRIGHT = "is too bright: large parts are pure white; use a shorter exposure"
+Problem = Literal["blurred", "dark", "bright"]
 
 
-def problem_of(grey: np.ndarray) -> str | None:
-    """What is wrong with a photo, and what to do; None: nothing.
+class _Texts(NamedTuple):
+    what: Message  # is wrong with a photo
+    advice: Message
+
+
+PROBLEMS: dict[Problem, _Texts] = {
+    "blurred": _Texts(
+        message("is blurred"), message("hold the camera still, or take it in more light")
+    ),
+    "dark": _Texts(message("is too dark"), message("use more light, or a longer exposure")),
+    "bright": _Texts(
+        message("is too bright: large parts are pure white"), message("use a shorter exposure")
+    ),
+}
+
+
+def what_to_do(problem: Problem) -> Message:
+    """What is wrong with a photo, and what to do."""
+    what, advice = PROBLEMS[problem]
+    return message("{what}; {advice}", what=what, advice=advice)
+
+
+def problem_of(grey: np.ndarray) -> Problem | None:
+    """What is wrong with a photo; None: nothing.
 
     ``grey``: (H, W) uint8, a copy of `SHARPNESS_SIDE`.
     """
     if np.quantile(grey, 0.95) < _DARK:
-        return DARK
+        return "dark"
     if (grey > _WHITE).mean() > _WHITE_SHARE:
-        return BRIGHT
-    return BLURRED if min(fine_detail(grey, SHARPNESS_SIDE)) < _LEAST_DETAIL else None
+        return "bright"
+    return "blurred" if min(fine_detail(grey, SHARPNESS_SIDE)) < _LEAST_DETAIL else None
 
 
-def problems(folder: Path, names: Iterable[str]) -> dict[str, str]:
+def problems(folder: Path, names: Iterable[str]) -> dict[str, Problem]:
     """The photos of a folder with a problem: names and `problem_of` them. Missing ones are skipped.
 
     Raises: OSError: a photo cannot be read.

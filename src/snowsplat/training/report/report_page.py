@@ -25,6 +25,7 @@ from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
 from snowsplat.util.html import bar, cards, page, table, text
 from snowsplat.util.machine import memory_bytes, system_name
+from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 
 #: Number of training views that are evaluated if no views were held out.
@@ -90,7 +91,7 @@ def write_training_report(path: Path, trained: Trained) -> None:
             evaluation = evaluate_views(trained.gaussians, views, background=trained.background)
         body = [
             _headline(trained, evaluation, held_out),
-            "" if trained.verdict is None else trained.verdict.html("the scene"),
+            "" if trained.verdict is None else trained.verdict.html(message("the scene")),
             _cards(trained, evaluation, held_out),
             _left_out(trained.left_out),
             masks.masked(trained.dataset.train, trained.masks),

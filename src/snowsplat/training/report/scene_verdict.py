@@ -15,7 +15,7 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.training.starts.point_colors import point_pixels
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.names import first_names
 
 #: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
@@ -43,8 +43,12 @@ _POINTS = 2000
 #: Standard deviation of the exposures, in EV, from which the camera should be set by hand.
 _SPREAD = 0.3
 
-_MORE = "take more photos, closer together, also from the places of the worst held-out photos"
-_CHECK = "train longer; if that does not help, check the camera poses in the report of the dataset"
+_MORE = message(
+    "take more photos, closer together, also from the places of the worst held-out photos"
+)
+_CHECK = message(
+    "train longer; if that does not help, check the camera poses in the report of the dataset"
+)
 
 
 def scene_verdict(
@@ -54,7 +58,7 @@ def scene_verdict(
     *,
     left_out: Sequence[str] = (),
     spread: float = 0.0,
-    poses: str | None = None,
+    poses: Message | None = None,
     capture: Verdict | None = None,
 ) -> Verdict:
     """The verdict.
@@ -89,25 +93,39 @@ def _new_views(held_out: Evaluation, trained_on: Evaluation) -> list[Reason]:
     """Whether held-out photos are explained and, if not, why."""
     share, own = _typical(held_out), _typical(trained_on)
     if own < _USABLE:
-        text = (
-            f"the scene reproduces only {_percent(own)} of the contrast of the photos that it was "
-            f"trained on ({_psnr(trained_on):.1f} dB)"
+        text = message(
+            "the scene reproduces only {share:.0%} of the contrast of the photos that it was "
+            "trained on ({psnr:.1f} dB)",
+            share=own,
+            psnr=_psnr(trained_on),
         )
         return [Reason("poor", text, _CHECK)]
-    count = len(held_out.views)
-    photos = f"{count} photo" if count == 1 else f"{count} photos"
-    only = "" if share >= _GOOD else "only "
-    text = (
-        f"the scene reproduces {only}{_percent(share)} of the contrast of a typical held-out photo "
-        f"({_psnr(held_out):.1f} dB, colour-aligned, {photos})"
-    )
+    values = {
+        "share": share,
+        "psnr": _psnr(held_out),
+        "photos": plural("{n} photo", "{n} photos", n=len(held_out.views)),
+    }
     if share >= _GOOD:
+        text = message(
+            "the scene reproduces {share:.0%} of the contrast of a typical held-out photo "
+            "({psnr:.1f} dB, colour-aligned, {photos})",
+            **values,
+        )
         return [Reason("good", text)]
+    text = message(
+        "the scene reproduces only {share:.0%} of the contrast of a typical held-out photo "
+        "({psnr:.1f} dB, colour-aligned, {photos})",
+        **values,
+    )
     factor = 10.0 ** ((_psnr(trained_on) - _psnr(held_out)) / 20.0)
-    lacks = factor >= _LACKS_PHOTOS
-    if lacks:
-        text += f"; the error is {factor:.1f} times that of the photos that it was trained on"
-    return [Reason("poor" if share < _USABLE or lacks else "usable", text, _MORE if lacks else "")]
+    if factor < _LACKS_PHOTOS:
+        return [Reason("poor" if share < _USABLE else "usable", text)]
+    text = message(
+        "{text}; the error is {factor:.1f} times that of the photos that it was trained on",
+        text=text,
+        factor=factor,
+    )
+    return [Reason("poor", text, _MORE)]
 
 
 def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
@@ -119,12 +137,16 @@ def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
     if not wrong:
         return []
     names = [f"{view.name} ({view.psnr_aligned:.1f} dB)" for view in wrong]
-    text = f"the scene looks wrong in {first_names(names, 3)}"
+    text = message("the scene looks wrong in {names}", names=first_names(names, 3))
     views = {view.name: view for view in dataset.test}
     seldom = _seen_by_few(views[wrong[0].name], dataset) if wrong[0].name in views else 0.0
     if seldom >= _SELDOM:
-        it = "it" if len(wrong) == 1 else wrong[0].name
-        text += f"; {_percent(seldom)} of what {it} shows is in at most two training photos"
+        text = message(
+            "{text}; {share:.0%} of what {name} shows is in at most two training photos",
+            text=text,
+            share=seldom,
+            name=message("it") if len(wrong) == 1 else wrong[0].name,
+        )
     return [Reason("usable", text, _MORE)]
 
 
@@ -158,9 +180,11 @@ def _sharpness(held_out: Evaluation) -> list[Reason]:
 def _left_out(names: Sequence[str], count: int) -> list[Reason]:
     if not names:
         return []
-    text = (
-        f"{len(names)} of {count} photos contradict the others and were left out: "
-        f"{first_names(names, 3)}"
+    text = message(
+        "{number} of {count} photos contradict the others and were left out: {names}",
+        number=len(names),
+        count=count,
+        names=first_names(names, 3),
     )
     return [Reason("usable" if len(names) > _LEFT_OUT * count else "good", text)]
 
@@ -182,16 +206,12 @@ def _exposures(spread: float) -> list[Reason]:
 
 
 def _typical(evaluation: Evaluation) -> float:
-    return float(np.median([_share(view) for view in evaluation.views]))
+    return max(0.0, float(np.median([_share(view) for view in evaluation.views])))
 
 
 def _psnr(evaluation: Evaluation) -> float:
     """The median of the colour-aligned PSNR, in dB; at most 60."""
     return min(60.0, float(np.median([view.psnr_aligned for view in evaluation.views])))
-
-
-def _percent(share: float) -> str:
-    return f"{100 * max(share, 0.0):.0f}%"
 
 
 def _share(view: ViewMetrics) -> float:
