@@ -26,14 +26,14 @@ from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import Execute, launch_by
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.scene.render import project, render
-from snowsplat.training.core.batch import BatchView
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.density import AdaptiveDensity
+from snowsplat.training.density import AdaptiveDensity, density_control
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
 from snowsplat.util.native_layout import Params
 
 GPU = torch.device("cuda")
@@ -80,7 +80,8 @@ class Step:
         trainer.optimizer = Adam(
             gaussians, CONFIG.learning_rates, schedule=trainer.schedule, extent=EXTENT
         )
-        trainer.part(Densification).control = CONFIG.density.control(
+        trainer.part(Densification).control = density_control(
+            CONFIG.density,
             len(gaussians),
             schedule=trainer.schedule,
             extent=EXTENT,

@@ -54,8 +54,9 @@ if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.scene.rasterization import rasterization
     from snowsplat.training.core.trainer import Trainer
+    from snowsplat.training.parts.list import parts_of
     from snowsplat.training.parts.part import Part
-    from snowsplat.training.settings.config import TrainConfig, parts_of
+    from snowsplat.training.settings.config import TrainConfig
     from snowsplat.training.settings.recipes import recipe
     from snowsplat.util.errors import UserError
 
@@ -99,7 +100,7 @@ _MODULES = {
     "PlanOptions": "pipeline.blocks.plan",
     "PublishOptions": "pipeline.publish",
     "merge_blocks": "pipeline.blocks.merge",
-    "parts_of": "training.settings.config",
+    "parts_of": "training.parts.list",
     "plan_blocks": "pipeline.blocks.plan",
     "train_blocks": "pipeline.blocks.train",
     "publish": "pipeline.publish",

@@ -8,11 +8,12 @@ import torch
 from snowsplat import Gaussians
 from snowsplat.ops import Splats2D, View, reference
 from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.density.adaptive import RESET_OPACITY, SPLIT_SHRINK, AdaptiveDensity
+from snowsplat.training.density.adaptive import RESET_OPACITY, SPLIT_SHRINK, AdaptiveDensityControl
 from snowsplat.training.density.mcmc import McmcDensity
+from snowsplat.training.settings.density import AdaptiveDensity
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.optim import Adam
 
 
 def gaussians(log_scales: list[float], opacities: list[float]) -> Gaussians:
@@ -32,7 +33,8 @@ def refined(scene: Gaussians, grads: list[float], seed: int = 0) -> Gaussians:
     """The scene after one densification at step 600, with these mean gradients."""
     schedule = Schedule(30_000)
     optimizer = Adam(scene, LearningRates(), schedule=schedule, extent=1.0)
-    control = AdaptiveDensity(prune_screen_size=0.0).control(
+    control = AdaptiveDensityControl.begin(
+        AdaptiveDensity(prune_screen_size=0.0),
         len(scene),
         schedule=schedule,
         extent=1.0,
@@ -91,8 +93,13 @@ def test_the_opacity_reset():
     schedule = Schedule(30_000)
     optimizer = Adam(scene, LearningRates(), schedule=schedule, extent=1.0)
     optimizer.exp_avg["opacity_logits"][:] = 1.0
-    control = AdaptiveDensity().control(
-        2, schedule=schedule, extent=1.0, random_init=False, generator=torch.Generator()
+    control = AdaptiveDensityControl.begin(
+        AdaptiveDensity(),
+        2,
+        schedule=schedule,
+        extent=1.0,
+        random_init=False,
+        generator=torch.Generator(),
     )
     after = control.after_step(3000, scene, optimizer)
     assert after.opacities.sort().values.tolist() == pytest.approx([0.006, RESET_OPACITY])

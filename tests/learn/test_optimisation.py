@@ -8,8 +8,8 @@ import torch
 
 from snowsplat import Gaussians, Points, TrainConfig, ops
 from snowsplat.ops import reference
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
 
 
 def test_the_table_of_parameters():

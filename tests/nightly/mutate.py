@@ -53,11 +53,11 @@ _OPS = (
 PARTS = {
     "density": Part(("training/density/*.py",), ("tests/training/density",)),
     "optim": Part(
-        ("training/core/optim.py", "training/core/lr_schedule.py"),
+        ("training/step/optim.py", "training/core/lr_schedule.py"),
         ("tests/training/test_optim.py", "tests/training/test_lr_schedule.py"),
     ),
     "config": Part(("training/core/config.py",), ("tests/training/test_config.py",)),
-    "losses": Part(("training/core/losses.py",), ("tests/training/test_losses.py",)),
+    "losses": Part(("training/step/losses.py",), ("tests/training/test_losses.py",)),
     "trainer": Part(
         tuple(f"training/core/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
         ("tests/training/test_trainer.py", "tests/training/test_step_runner.py"),

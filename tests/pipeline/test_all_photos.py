@@ -17,10 +17,10 @@ from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolde
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.history import History
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 
 CONFIG = recipe("default", iterations=200, init="points", max_gaussians=300, exposure="on")
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from snowsplat.data.dataset import Points
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.schedule import Schedule
 
 
 def stage(

@@ -26,8 +26,6 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.batch import BatchView
-from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.exposure_start import (
@@ -39,6 +37,8 @@ from snowsplat.training.parts.exposure_start import (
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.processes.shards import ALONE
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.losses import view_loss
 
 from .stage import stage
 

@@ -15,13 +15,13 @@ from snowsplat.data.dataset import Points
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.finite import Diverged, check_loss, rows_not_finite
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import McmcDensity
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.finite import Diverged, check_loss, rows_not_finite
+from snowsplat.training.step.optim import Adam
 from snowsplat.util.errors import UserError
 
 from ..ops.engines import launcher

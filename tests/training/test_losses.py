@@ -5,7 +5,7 @@ import torch
 
 from snowsplat import ops
 from snowsplat.data.photos.decode import LoadedImage
-from snowsplat.training.core.losses import view_loss
+from snowsplat.training.step.losses import view_loss
 
 BLACK = torch.zeros(3)
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
 
 
 def test_the_papers_rates():

@@ -18,12 +18,12 @@ from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.parts import pose_refinement
 from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
 from snowsplat.training.parts.pose_refinement import PoseRefinement
 from snowsplat.training.settings import TrainConfig, config_from_json, config_to_json
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.step.view_gradient import ViewGradient
 from snowsplat.util.errors import UserError
 
 

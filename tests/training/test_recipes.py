@@ -2,10 +2,10 @@
 
 import pytest
 
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.settings.rates import DecayRates
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.util.errors import SettingError
 
 

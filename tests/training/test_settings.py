@@ -15,7 +15,6 @@ from snowsplat.cli.main import main
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.make import MakeOptions
 from snowsplat.pipeline.train import TrainOptions, train
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings import (
     DENSITY_CONTROLS,
     RECIPES,
@@ -33,6 +32,7 @@ from snowsplat.training.settings import (
     register_recipe,
     register_start,
 )
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.settings import declarations
 
@@ -338,7 +338,7 @@ def test_starts_and_recipes_of_a_user(monkeypatch):
     assert recipe("mine", seed=3).starts == ("laser", "points")
     assert TrainOptions(recipe="mine").recipe == "mine"
     with pytest.raises(ValueError, match="must not contain"):
-        register_start("a+b", STARTS["points"])
+        register_start("a+b", STARTS["laser"])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -16,12 +16,12 @@ from snowsplat.data.dataset import View
 from snowsplat.data.photos.decode import ImageSource, LoadedImage
 from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
-from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_runner import StepRunner
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.finite import Diverged
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.step_runner import StepRunner
+from snowsplat.training.step.view_gradient import ViewGradient
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(3, 4).double())
 VIEW = View("a.png", CAMERA, ImageSource(Path("a.png"), 8, 6))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.schedule import Schedule
 
 
 def test_moments():

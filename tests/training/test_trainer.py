@@ -20,16 +20,16 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
 from snowsplat.scene.render import render
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.background import Background
-from snowsplat.training.core.losses import view_loss
 from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.starts import STARTS
+from snowsplat.training.step.background import Background
+from snowsplat.training.step.losses import view_loss
 from snowsplat.util.errors import UserError
 
 WIDTH, HEIGHT, COUNT = 24, 20, 40
@@ -223,7 +223,7 @@ def test_a_resumed_run_does_not_initialise_again(dataset, monkeypatch):
     first = Trainer(dataset, config)
     first.run(until=30)
     state = {name: tensor.clone() for name, tensor in first.state_tensors().items()}
-    monkeypatch.setitem(STARTS, "sweep", None)
+    monkeypatch.delitem(STARTS, "sweep")
     second = Trainer(dataset, config, state=state)
     assert second.step == 30
     second.run()

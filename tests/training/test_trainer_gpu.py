@@ -16,10 +16,10 @@ from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.ops.cuda.launches import launch_by
 from snowsplat.ops.native import LAUNCHERS
-from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.step.finite import Diverged
 from snowsplat.util.native_layout import Params, layout_of
 
 from ..ops.engines import launcher

@@ -18,7 +18,6 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.parts.densification import delayed
 from snowsplat.training.parts.transients import (
     MOMENTS,
@@ -27,6 +26,7 @@ from snowsplat.training.parts.transients import (
     large_residual,
 )
 from snowsplat.training.parts.view_residuals import CellMap, residuals_elsewhere
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.depth_map import DepthMap
 from snowsplat.util.errors import UserError
 

@@ -12,12 +12,12 @@ from torch import Tensor
 from snowsplat.data import Dataset
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.render import RenderOutput
-from snowsplat.training.core.batch import BatchView
 from snowsplat.training.core.run import Run
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.core.view_graphs import MOST_RECORDINGS, ViewGraphs, recordable
 from snowsplat.training.parts.part import Part
 from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.step.batch import BatchView
 
 from .test_trainer import BUSY, CALM, dataset, every_density_control
 

@@ -7,9 +7,9 @@ from training_run import STEPS, record, snapshot
 
 import scene
 from snowsplat.scene.render import project, render
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.rates import LearningRates
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 
 
 def clone_and_split() -> None:

@@ -19,12 +19,12 @@ from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.unexplained import unexplained_views
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.rates import DecayRates
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.safe_json import read_json
 

@@ -31,14 +31,15 @@ from snowsplat.pipeline.run.training_run import TrainingRun
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.checkpoint import Checkpoint
 from snowsplat.training.core.run import Loss
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.exposure import exposure_hint
+from snowsplat.training.parts.list import parts_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards
-from snowsplat.training.settings.config import TrainConfig, parts_of
+from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError

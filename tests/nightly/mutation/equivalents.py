@@ -9,7 +9,7 @@ from __future__ import annotations
 #: {(file in the package, lines before, lines after): why no test can detect the fault}
 EQUIVALENTS: dict[tuple[str, str, str], str] = {
     (
-        "training/core/losses.py",
+        "training/step/losses.py",
         "target = photo.rgb if photo.alpha is None else photo.over(background)",
         "target = photo.rgb if (photo.alpha is None) and False else photo.over(background)",
     ): "an opaque photo over a background is that photo; 8 bits only save memory",

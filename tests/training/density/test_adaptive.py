@@ -9,10 +9,6 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.density.adaptive import (
     RESET_OPACITY,
     RESET_RECOVERY,
@@ -21,6 +17,10 @@ from snowsplat.training.density.adaptive import (
     AdaptiveDensityControl,
 )
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.finite import Diverged
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.view_gradient import ViewGradient
 
 EXTENT = 10.0  # with percent_dense = 0.01: scales up to 0.1 are cloned, larger ones split
 #: φ of section 5.2. It is not imported, so that the tests detect a changed value.
@@ -49,7 +49,8 @@ def names(gaussians: Gaussians) -> list[int]:
 def set_up(
     gaussians: Gaussians, iterations: int = 30_000, random_init: bool = False, **settings: object
 ) -> tuple[AdaptiveDensityControl, Adam]:
-    control = AdaptiveDensity(**settings).control(  # type: ignore[arg-type]
+    control = AdaptiveDensityControl.begin(
+        AdaptiveDensity(**settings),  # type: ignore[arg-type]
         len(gaussians),
         schedule=Schedule(iterations),
         extent=EXTENT,

@@ -10,10 +10,6 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
-from snowsplat.training.core.finite import Diverged
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.density.mcmc import (
     NOISE_SHARPNESS,
     USUAL_EXTENT,
@@ -22,6 +18,10 @@ from snowsplat.training.density.mcmc import (
     shared_opacity,
 )
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.finite import Diverged
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.view_gradient import ViewGradient
 
 
 def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
@@ -37,7 +37,8 @@ def some_gaussians(n: int, opacity: float = 0.5) -> Gaussians:
 
 
 def set_up(gaussians: Gaussians, **settings: object) -> tuple[McmcDensityControl, Adam]:
-    control = McmcDensity(**settings).control(  # type: ignore[arg-type]
+    control = McmcDensityControl.begin(
+        McmcDensity(**settings),  # type: ignore[arg-type]
         len(gaussians),
         schedule=Schedule(30_000),
         extent=1.0,

@@ -6,9 +6,9 @@ import pytest
 
 from snowsplat.training.budgets.pace import FEWEST_STEPS, Pace
 from snowsplat.training.budgets.step_cost import StepCost, Work
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 
 PIXELS, FINAL, VIEWS = 500_000.0, 120_000, 6
 

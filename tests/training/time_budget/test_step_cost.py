@@ -3,8 +3,8 @@
 import pytest
 
 from snowsplat.training.budgets.step_cost import StepCost, Work
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 
 
 def test_a_densification_adds_a_quarter_until_the_limit():

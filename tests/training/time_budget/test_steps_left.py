@@ -4,8 +4,8 @@ import pytest
 
 from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.budgets.steps_left import StepsLeft
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.settings.schedule import Schedule
 
 from .test_pace import FINAL, PIXELS, VIEWS, usual
 

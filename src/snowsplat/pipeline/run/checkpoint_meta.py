@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.output.output_folder import FORMER_DATASET, DatasetSettings
 from snowsplat.pipeline.run.photo_stamps import Stamp
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import from_json
 

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
     from snowsplat.pipeline.output.output_folder import DatasetSettings
     from snowsplat.training.core.run import Loss
-    from snowsplat.training.core.step_schedule import Schedule
     from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
     from snowsplat.training.settings.config import TrainConfig
+    from snowsplat.training.settings.schedule import Schedule
 
 # Process 0 may compute the first Gaussians for a long time, while the others wait.
 _TIMEOUT = timedelta(hours=2)
@@ -128,9 +128,9 @@ def follow(
     """Take part in the training of process 0, until it ends; ``parts`` and ``loss`` as there."""
     from snowsplat.pipeline.run.collective import Collective
     from snowsplat.training.core.checkpoint import load
-    from snowsplat.training.core.finite import Diverged
     from snowsplat.training.core.trainer import Trainer
-    from snowsplat.training.settings.config import parts_of
+    from snowsplat.training.parts.list import parts_of
+    from snowsplat.training.step.finite import Diverged
 
     setup = shards.of_first(None)
     assert isinstance(setup, Setup)

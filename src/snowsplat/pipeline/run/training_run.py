@@ -31,7 +31,6 @@ from snowsplat.training.budgets.pace import Pace
 from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.budgets.steps_left import StepsLeft
 from snowsplat.training.core import checkpoint
-from snowsplat.training.core.finite import Diverged
 from snowsplat.training.core.history import History
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.run import DatasetCameras
@@ -43,6 +42,7 @@ from snowsplat.training.parts.transients import Transients
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.report.scene_verdict import scene_verdict
 from snowsplat.training.settings.stored import config_to_json
+from snowsplat.training.step.finite import Diverged
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded

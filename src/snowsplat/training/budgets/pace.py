@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 
 from snowsplat.training.budgets.step_cost import StepCost, Work
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.schedule import Schedule
 
 #: Fraction of the time budget over which measurements are averaged. It is long enough to average
 #: over views, and short enough to follow a change of the load.

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.schedule import Schedule
 
 if TYPE_CHECKING:
     from snowsplat.data import Dataset

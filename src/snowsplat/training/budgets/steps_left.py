@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 from snowsplat.training.budgets.step_cost import GROWTH, StepCost, Work
-from snowsplat.training.core.step_schedule import Schedule
+from snowsplat.training.settings.schedule import Schedule
 
 #: Number of seconds over which measurements are averaged.
 _AVERAGING_SECONDS = 10.0

@@ -16,10 +16,10 @@ import torch
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.training.budgets.pace import FEWEST_STEPS
 from snowsplat.training.budgets.step_cost import Work
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts import map_pixels
 from snowsplat.training.starts.init import initial_count
 

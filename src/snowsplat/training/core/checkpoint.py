@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.training.core import checkpoint_file
-from snowsplat.training.core.finite import check_finite
+from snowsplat.training.step.finite import check_finite
 from snowsplat.util.errors import UserError
 
 _NAME = re.compile(r"step_(\d+)\.safetensors")

@@ -19,7 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from snowsplat.training.core.finite import listed
+from snowsplat.training.step.finite import listed
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.safe_json import check_header, parse_json

@@ -16,10 +16,10 @@ from snowsplat.data.dataset import scene_extent
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project, render
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.view_gradient import ViewGradient
 
 #: Learning rates for merged Gaussians, which are nearly right. The means move a tenth as far as in
 #: a training from points: at its rates, small Gaussians would leave the surfaces.

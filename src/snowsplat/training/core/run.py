@@ -16,19 +16,20 @@ from snowsplat.data.photos.image_loader import ImageLoader, Photos, available_me
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import seen_from
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.background import Background
-from snowsplat.training.core.losses import view_loss
-from snowsplat.training.core.optim import Adam
 from snowsplat.training.core.regularizers import regularizing
 from snowsplat.training.core.run_state import RESERVED, load_state, state_tensors
-from snowsplat.training.core.step_runner import StepRunner
-from snowsplat.training.core.step_schedule import Schedule
 from snowsplat.training.core.view_graphs import GraphRecorder, ViewGraphs, recordable
 from snowsplat.training.core.view_queue import ViewQueue
+from snowsplat.training.parts.list import parts_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards, sharded_render
-from snowsplat.training.settings.config import TrainConfig, parts_of
+from snowsplat.training.settings.config import TrainConfig
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts.init import initial_gaussians
+from snowsplat.training.step.background import Background
+from snowsplat.training.step.losses import view_loss
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.step_runner import StepRunner
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
 

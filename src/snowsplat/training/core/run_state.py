@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from snowsplat.training.core.finite import check_state
-from snowsplat.training.settings.config import parts_of
+from snowsplat.training.parts.list import parts_of
+from snowsplat.training.step.finite import check_state
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ from torch import Tensor
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.scene.render import RenderOutput
-from snowsplat.training.core.batch import BatchView, batch_gradients
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.regularizers import add_regularizers
 from snowsplat.training.core.run import Run
-from snowsplat.training.core.view_gradient import ViewGradient
+from snowsplat.training.step.batch import BatchView, batch_gradients
+from snowsplat.training.step.view_gradient import ViewGradient
 from snowsplat.util.interrupts import interrupts_between_steps
 from snowsplat.util.process import single_threaded
 

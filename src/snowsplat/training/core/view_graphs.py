@@ -25,10 +25,10 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
-from snowsplat.training.core.batch import BatchView
-from snowsplat.training.core.step_runner import StepRunner, Summary
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.parts.part import Part
+from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.step_runner import StepRunner, Summary
+from snowsplat.training.step.view_gradient import ViewGradient
 
 #: A recording keeps the memory of its splats and their gradient: 132 bytes per Gaussian.
 MOST_RECORDINGS = 4

@@ -9,9 +9,9 @@ import torch
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.camera import Camera
-from snowsplat.training.core.background import Background
-from snowsplat.training.core.batch import BatchView
 from snowsplat.training.processes.shards import Shards
+from snowsplat.training.step.background import Background
+from snowsplat.training.step.batch import BatchView
 
 #: The order of the views is drawn at least this number of steps in advance, so that other threads
 #: can decode their photos before they are needed.

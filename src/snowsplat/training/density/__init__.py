@@ -1,21 +1,24 @@
 """Density control: adds and removes Gaussians during training.
 
 A density control has two dataclasses: its settings, and its state. The settings are frozen and part
-of `TrainConfig`; those of the package are in `snowsplat.training.settings.density`. The method
-`DensityConfig.control` of the settings creates the state, which follows the protocol
-`DensityControl`. The trainer uses only these two dataclasses. `AdaptiveDensity` is the density
-control of the paper, and `McmcDensity` is that of Kheradmand et al. 2024.
+of `TrainConfig`; those of the package are in `snowsplat.training.settings.density`.
+`density_control` creates the state, which follows the protocol `DensityControl`. The trainer uses
+only these two dataclasses. `AdaptiveDensity` is the density control of the paper, and `McmcDensity`
+is that of Kheradmand et al. 2024.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.view_gradient import ViewGradient
+from snowsplat.training.density.adaptive import AdaptiveDensityControl
+from snowsplat.training.density.mcmc import McmcDensityControl
+from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.density import (
     DENSITY_CONTROLS,
     AdaptiveDensity,
@@ -24,6 +27,9 @@ from snowsplat.training.settings.density import (
     McmcDensity,
     register_density,
 )
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.view_gradient import ViewGradient
 
 __all__ = [
     "DENSITY_CONTROLS",
@@ -32,6 +38,7 @@ __all__ = [
     "DensityControl",
     "DensitySettings",
     "McmcDensity",
+    "density_control",
     "register_density",
 ]
 
@@ -69,3 +76,49 @@ class DensityControl(Protocol):
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Copy what `state_tensors` returned."""
+
+
+#: The state of each density control of the package: from its settings and the arguments of
+#: `density_control`.
+_STATES: dict[type, Callable[..., DensityControl]] = {
+    AdaptiveDensity: AdaptiveDensityControl.begin,
+    McmcDensity: McmcDensityControl.begin,
+}
+
+
+def density_control(
+    settings: Any,
+    count: int,
+    *,
+    schedule: Schedule,
+    extent: float,
+    random_init: bool,
+    generator: torch.Generator,
+    device: torch.device | None = None,
+    shards: Shards = ALONE,
+) -> DensityControl:
+    """The initial state of a density control.
+
+    Args:
+        settings: a `DensityConfig`. If it is from outside of the package, it has a method
+            ``control`` with the other arguments of this function, which returns the state.
+        count: number of Gaussians of this process.
+        extent: extent of the scene, in world units.
+        random_init: whether training starts from random points instead of SfM points.
+        generator: a random generator on the CPU.
+        device: the device of the Gaussians; default: the CPU.
+        shards: the processes of the training; default: this one alone.
+    """
+    state: dict[str, Any] = {
+        "schedule": schedule,
+        "extent": extent,
+        "random_init": random_init,
+        "generator": generator,
+        "device": device,
+        "shards": shards,
+    }
+    if hasattr(settings, "control"):
+        made: DensityControl = settings.control(count, **state)
+        return made
+    begin = next(begin for kind, begin in _STATES.items() if isinstance(settings, kind))
+    return begin(settings, count, **state)

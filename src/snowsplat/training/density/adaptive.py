@@ -15,12 +15,12 @@ from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
-from snowsplat.training.core.finite import check_parameters
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.density import AdaptiveDensity
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.finite import check_parameters
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.view_gradient import ViewGradient
 
 #: φ of the paper: a split divides the scale by this factor, which was determined by experiments.
 SPLIT_SHRINK = 1.6
@@ -62,7 +62,7 @@ class AdaptiveDensityControl:
         device: torch.device | None = None,
         shards: Shards = ALONE,
     ) -> AdaptiveDensityControl:
-        """The initial state; see `DensityConfig.control`."""
+        """The initial state; see `density_control`."""
         return cls(
             settings=settings,
             schedule=schedule,

@@ -19,12 +19,12 @@ from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
-from snowsplat.training.core.finite import check_parameters
-from snowsplat.training.core.optim import Adam
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.density import McmcDensity
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.finite import check_parameters
+from snowsplat.training.step.optim import Adam
+from snowsplat.training.step.view_gradient import ViewGradient
 
 #: Maximum number of copies of one Gaussian for which eq. 9 is evaluated; larger numbers are rare.
 MAX_COPIES = 51
@@ -51,6 +51,7 @@ class McmcDensityControl:
     def begin(
         cls,
         settings: McmcDensity,
+        count: int,
         *,
         schedule: Schedule,
         extent: float,
@@ -58,7 +59,7 @@ class McmcDensityControl:
         shards: Shards = ALONE,
         **_: object,
     ) -> McmcDensityControl:
-        """The initial state; see `DensityConfig.control`. The other arguments are not used."""
+        """The initial state; see `density_control`. The other arguments are not used."""
         return cls(settings, schedule, extent, generator, shards)
 
     @property

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from snowsplat.training.density import DensityConfig, DensityControl
+from snowsplat.training.density import DensityConfig, DensityControl, density_control
 from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.init import starts_at_random
+from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.view_gradient import ViewGradient
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
-    from snowsplat.training.core.view_gradient import ViewGradient
 
 
 #: If Gaussians are added late, the first moment: that of the second masks of what moves.
@@ -56,7 +56,8 @@ class Densification(Part):
 
         Raises: SettingError: a setting of the density control is invalid.
         """
-        self.control = self.settings.control(
+        self.control = density_control(
+            self.settings,
             len(run.gaussians),
             schedule=run.schedule,
             extent=run.dataset.extent,

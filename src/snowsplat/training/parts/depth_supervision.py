@@ -30,12 +30,12 @@ from snowsplat.scene.render import RenderOutput
 from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth import aligned_depth_map, contradicts
 from snowsplat.training.starts.depth_map import LONGER_SIDE
+from snowsplat.training.step.batch import BatchView
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
 
 #: c: the residual, relative to the median inverse depth, at which a pixel has half the pull.

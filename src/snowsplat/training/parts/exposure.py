@@ -30,9 +30,9 @@ from snowsplat.training.parts.exposed_image import ExposedImages
 from snowsplat.training.parts.exposure_start import GAMMA, ExposureStart, exposure_start
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.parts.part import Part
+from snowsplat.training.step.batch import BatchView
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
 
 #: With a smaller spread, in EV, the gains are not learnt.

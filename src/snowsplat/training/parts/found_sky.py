@@ -39,8 +39,6 @@ from snowsplat.training.starts.photos import in_threads, reduced_photo, usable_p
 #: Distance of the sky from the middle of the cameras, in units of the root mean square of their
 #: distances from it. From two of them, the sky is seen in directions that differ by a degree.
 _DISTANCE = 100.0
-#: At most this share of the points of a start, which is a twentieth of the limit of Gaussians.
-_SHARE = 0.125
 #: At most this number of views is used, evenly chosen, to limit the time.
 _VIEWS = 100
 #: At most this number of points of the dataset is projected into each view.
@@ -122,11 +120,6 @@ class Sky:
 def sky_distance(cameras: Sequence[Camera]) -> float:
     """The distance of the sky from the middle of the cameras, in world units."""
     return _DISTANCE * float(_offsets(cameras)[1].square().sum(1).mean().sqrt())
-
-
-def most_sky_points(count: int) -> int:
-    """The maximum number of points of the sky, for ``count`` points per start."""
-    return math.ceil(_SHARE * count)
 
 
 def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | None:

@@ -37,12 +37,12 @@ from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounde
 from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
 from snowsplat.training.starts.photos import usable_pixels
+from snowsplat.training.step.batch import BatchView
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
 
 #: c: the value of a at which a pixel has half the pull of its square.

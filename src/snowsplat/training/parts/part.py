@@ -27,11 +27,11 @@ from snowsplat.data.dataset import Points
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
+from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.view_gradient import ViewGradient
 
 if TYPE_CHECKING:  # these modules import this one
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
-    from snowsplat.training.core.view_gradient import ViewGradient
 
 #: The opacity of a removed Gaussian, as a logit. It is too transparent to be visible, so the
 #: optimiser does not restore it, and density control removes it or uses it elsewhere.

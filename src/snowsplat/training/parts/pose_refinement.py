@@ -35,11 +35,11 @@ from snowsplat.scene.camera import Camera
 from snowsplat.training.parts.misalignment import shift_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
+from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.view_gradient import ViewGradient
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
-    from snowsplat.training.core.view_gradient import ViewGradient
 
 #: The first fraction of the steps, in which the scene is still too blurred to move cameras.
 BEGIN = 0.2

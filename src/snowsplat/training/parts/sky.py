@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from snowsplat.data.dataset import Points
-from snowsplat.training.parts.found_sky import Sky, find_sky, most_sky_points
+from snowsplat.training.parts.found_sky import Sky, find_sky
 from snowsplat.training.parts.part import REMOVED, Part
+from snowsplat.training.starts.init import most_sky_points
 from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 

@@ -34,13 +34,12 @@ from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
-from snowsplat.training.core.batch import rounds
 from snowsplat.training.parts.part import Part
+from snowsplat.training.step.batch import BatchView, rounds
+from snowsplat.training.step.view_gradient import ViewGradient
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
-    from snowsplat.training.core.view_gradient import ViewGradient
 
 #: The weight of the consistency, the share of the steps after which it begins, and the number of
 #: steps of which one has it.

@@ -46,10 +46,10 @@ from snowsplat.training.parts.view_residuals import (
     residuals_elsewhere,
 )
 from snowsplat.training.settings.config import AutoOnOff
+from snowsplat.training.step.batch import BatchView
 from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
-    from snowsplat.training.core.batch import BatchView
     from snowsplat.training.core.run import Run
 
 #: When masks are computed, as fractions of the schedule.

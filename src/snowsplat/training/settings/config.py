@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from snowsplat.training.settings.density import AdaptiveDensity, DensityConfig, check_density
 from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.starts import check_starts
 from snowsplat.util.errors import SettingError
 from snowsplat.util.settings import Settings, When, part, setting
-
-if TYPE_CHECKING:
-    from snowsplat.training.core.step_schedule import Schedule
-    from snowsplat.training.parts.part import Part
 
 #: Whether a part takes part: always, never, or if the photos show that it is needed.
 AutoOnOff = Literal["auto", "on", "off"]
@@ -22,9 +19,13 @@ AutoOnOff = Literal["auto", "on", "off"]
 #: The generators are seeded with four times the seed, which has to fit into 64 bits.
 _SEED_LIMIT = 2**61
 
-#: What is added to the two moments of `TrainConfig.coarse_to_fine` if each photo is used a few
-#: times only, and the share of further steps.
-_COARSER, _LONGER = (0.05, 0.1), 0.75
+# What changes if each photo is used half as often as `TrainConfig.few_passes` says, or less. Both
+# are measured: see "few passes" in docs/performance.md.
+#: What is added to the two moments of `TrainConfig.coarse_to_fine`, as shares of all steps: early
+#: steps with small images are cheap looks at many photos.
+_LATER_MOMENTS = (0.05, 0.1)
+#: The number of further steps, as a share of the steps of the recipe.
+_MORE_STEPS = 0.75
 
 
 @dataclass(frozen=True)
@@ -335,7 +336,7 @@ class TrainConfig(Settings):
         Early steps with small images are cheap looks at many photos, so they are extended, too, as
         if the passes were as few as before. See docs/what-was-tried.md.
         """
-        more = 1.0 + _LONGER * self._few(views)
+        more = 1.0 + _MORE_STEPS * self._few(views)
         passes = more * self.few_passes
         return replace(self, iterations=round(more * self.iterations), few_passes=passes)
 
@@ -350,7 +351,7 @@ class TrainConfig(Settings):
         few = self._few(views)
         quarter, half = (
             when + few * later if isinstance(when, float) else when
-            for when, later in zip(self.coarse_to_fine, _COARSER, strict=True)
+            for when, later in zip(self.coarse_to_fine, _LATER_MOMENTS, strict=True)
         )
         return replace(self, coarse_to_fine=(quarter, half), few_passes=0.0)
 
@@ -367,41 +368,3 @@ class TrainConfig(Settings):
     def sh_degree_at(self, step: int) -> int:
         """The degree of the spherical harmonics in use at this step."""
         return min(self.sh_degree, step // self.sh_interval) if self.sh_interval else self.sh_degree
-
-
-def parts_of(config: TrainConfig) -> list[Part]:
-    """What takes part in a training with these settings, in order. This is the only list of parts.
-
-    A new option is a field of `TrainConfig`, a part in its own file, and a line here.
-    """
-    # The settings can be read without the parts.
-    from snowsplat.training.parts.decay import Decay
-    from snowsplat.training.parts.densification import Densification
-    from snowsplat.training.parts.depth_supervision import DepthSupervision
-    from snowsplat.training.parts.exposure import Exposure
-    from snowsplat.training.parts.near_limit import NearLimit
-    from snowsplat.training.parts.normal_supervision import NormalSupervision
-    from snowsplat.training.parts.pose_refinement import PoseRefinement
-    from snowsplat.training.parts.scale_limit import ScaleLimit
-    from snowsplat.training.parts.sky import SkyPart
-    from snowsplat.training.parts.smoothing import SmoothingFilter
-    from snowsplat.training.parts.surfaces import Surfaces
-    from snowsplat.training.parts.transients import Transients
-    from snowsplat.training.parts.unexplained import Unexplained
-
-    parts: list[tuple[bool, Part]] = [
-        (config.exposure != "off", Exposure(config.exposure)),
-        (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
-        (config.refine_poses, PoseRefinement()),
-        (config.transients != "off", Transients(config.transients)),
-        (config.depth_weight > 0, DepthSupervision(config.depth_weight)),
-        (config.depth_weight > 0, NormalSupervision(config.depth_weight)),
-        (config.near_limit > 0, NearLimit(config.near_limit)),
-        (config.sky, SkyPart(config.sky_distance)),
-        (True, Densification(late=config.transients == "on")),
-        (True, Decay(config.decay)),
-        (config.relative_scale > 0, ScaleLimit(config.relative_scale)),
-        (config.antialias, SmoothingFilter()),
-        (config.surfaces, Surfaces()),
-    ]
-    return [part for used, part in parts if used]

@@ -1,9 +1,10 @@
 """The settings of density control, which adds and removes Gaussians; their registered names.
 
 A density control has two dataclasses: its settings, here, and its state, in
-`snowsplat.training.density`. The method `DensityConfig.control` of the settings creates the state.
-A class from outside of the package can be used as it is, ``TrainConfig(density=MyDensity())``. To
-resume such a training from a checkpoint, the class is registered:
+`snowsplat.training.density`. Settings from outside of the package have a method that creates their
+state, see `density_control` there. They can be used as they are,
+``TrainConfig(density=MyDensity())``. To resume such a training from a checkpoint, the class is
+registered:
 
     @register_density
     @dataclass(frozen=True)
@@ -13,18 +14,9 @@ resume such a training from a checkpoint, the class is registered:
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from snowsplat.util.settings import Settings, When, checked, declarations, same, setting
-
-if TYPE_CHECKING:
-    import torch
-
-    from snowsplat.training.core.step_schedule import Schedule
-    from snowsplat.training.density import DensityControl
-    from snowsplat.training.density.adaptive import AdaptiveDensityControl
-    from snowsplat.training.density.mcmc import McmcDensityControl
-    from snowsplat.training.processes.shards import Shards
 
 _Kind = TypeVar("_Kind", bound=type)
 
@@ -57,29 +49,6 @@ class DensityConfig(Protocol):
     @property
     def densify_interval(self) -> int:
         """Number of steps between two densifications."""
-        ...
-
-    def control(
-        self,
-        count: int,
-        *,
-        schedule: Schedule,
-        extent: float,
-        random_init: bool,
-        generator: torch.Generator,
-        device: torch.device | None = ...,
-        shards: Shards = ...,
-    ) -> DensityControl:
-        """The initial state.
-
-        Args:
-            count: number of Gaussians of this process.
-            extent: extent of the scene, in world units.
-            random_init: whether training starts from random points instead of SfM points.
-            generator: a random generator on the CPU.
-            device: the device of the Gaussians; default: the CPU.
-            shards: the processes of the training; default: this one alone.
-        """
         ...
 
 
@@ -173,12 +142,6 @@ class AdaptiveDensity(Settings):
         "and at least 500 steps are left.",
     )
 
-    def control(self, count: int, **state: Any) -> AdaptiveDensityControl:
-        """The initial state for ``count`` Gaussians; see `DensityConfig.control`."""
-        from snowsplat.training.density.adaptive import AdaptiveDensityControl
-
-        return AdaptiveDensityControl.begin(self, count, **state)
-
 
 @dataclass(frozen=True)
 class DensitySettings(Settings):
@@ -226,12 +189,6 @@ class McmcDensity(Settings):
     opacity_regularizer: float = setting(0.01, "Weight of the mean opacity in the loss.", least=0.0)
     scale_regularizer: float = setting(0.01, "Weight of the mean scale in the loss.", least=0.0)
 
-    def control(self, count: int, **state: Any) -> McmcDensityControl:
-        """The initial state; see `DensityConfig.control`."""
-        from snowsplat.training.density.mcmc import McmcDensityControl
-
-        return McmcDensityControl.begin(self, **state)
-
 
 #: The settings class of every density control, by its name. Checkpoints contain this name.
 DENSITY_CONTROLS: dict[str, type[DensityConfig]] = {
@@ -257,7 +214,8 @@ def check_density(density: Any) -> str | None:
     """
     if isinstance(density, type) or not is_dataclass(density):
         return "is not an object of a dataclass; use e.g. AdaptiveDensity()"
-    missing = [name for name in (*_REQUIRED, "control") if not hasattr(density, name)]
+    own = () if isinstance(density, (AdaptiveDensity, McmcDensity)) else ("control",)
+    missing = [name for name in (*_REQUIRED, *own) if not hasattr(density, name)]
     if missing:
         return f"has no {missing[0]}; see DensityConfig"
     if not isinstance(density, Settings):  # a plain dataclass has not checked its values

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
+from snowsplat.training.settings.schedule import Schedule
 from snowsplat.util.settings import Settings, When, setting
 
-if TYPE_CHECKING:
-    from snowsplat.training.core.step_schedule import Schedule
-
-#: The factor of the rate of the view-dependent colours with few passes: power, largest factor.
-_POWER, _MOST = 1.5, 6.0
+# The factor of the rate of the view-dependent colours with few passes over the photos, as measured:
+# see "few passes" in docs/performance.md.
+#: The power of the ratio of `sh_rest_passes` to the passes. With 1, a colour can change as much in
+#: total as with more passes; with more than 1, it also reaches its value earlier.
+_POWER_OF_PASSES = 1.5
+#: The largest factor.
+_LARGEST_FACTOR = 6.0
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,7 @@ class LearningRates(Settings):
         """
         # Adam changes a coefficient by about its rate in each step that shows it.
         few = self.sh_rest_passes * views / schedule.iterations
+        faster = min(max(1.0, few) ** _POWER_OF_PASSES, _LARGEST_FACTOR)
         t = schedule.share(step, self.means_steps)
         means = math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
         u = (schedule.share(step) - self.anneal_from) / (1.0 - self.anneal_from)
@@ -115,7 +119,7 @@ class LearningRates(Settings):
             "quats": factor * self.quats,
             "opacity_logits": factor * self.opacity_logits,
             "sh_dc": factor * self.sh_dc,
-            "sh_rest": factor * min(max(1.0, few) ** _POWER, _MOST) * self.sh_rest,
+            "sh_rest": factor * faster * self.sh_rest,
         }
 
 

@@ -1,15 +1,13 @@
-"""`STARTS`: where the first Gaussians come from, by name; a start is registered here.
+"""The names of the starts: where the first Gaussians come from; a start is registered here.
 
 A start is a function that returns points; `initial_gaussians` makes one Gaussian of each. Those of
-the package are in `snowsplat.training.starts`, which is imported when one of them is called.
+the package are in `snowsplat.training.starts`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from snowsplat.util.settings import suggestion
 
@@ -23,24 +21,8 @@ if TYPE_CHECKING:
     #: world frame, on the CPU; there may be none.
     Start: TypeAlias = Callable[[Dataset, Photos, int, torch.Generator], Points]
 
-
-@dataclass(frozen=True)
-class _OfPackage:
-    """A function of `snowsplat.training.starts`, which is imported at the first call."""
-
-    function: str
-
-    def __call__(self, *arguments: Any, **settings: Any) -> Any:
-        start = getattr(import_module("snowsplat.training.starts"), self.function)
-        return start(*arguments, **settings)
-
-
-STARTS: dict[str, Start] = {
-    "points": _OfPackage("dataset_points"),
-    "random": _OfPackage("random_points"),
-    "depth": _OfPackage("depth_points"),
-    "sweep": _OfPackage("swept_points"),
-}
+#: The starts by name; None: that of the package, see `snowsplat.training.starts.start_of`.
+STARTS: dict[str, Start | None] = {"points": None, "random": None, "depth": None, "sweep": None}
 
 
 def register_start(name: str, start: Start) -> None:

@@ -11,10 +11,17 @@ from snowsplat.data.dataset import Dataset, Points
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
-from snowsplat.training.core.finite import check_finite
-from snowsplat.training.parts.found_sky import most_sky_points
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.training.settings.starts import STARTS
+from snowsplat.training.starts import start_of
+from snowsplat.training.step.finite import check_finite
+
+#: The sky has at most this share of the points of a start, a twentieth of the limit of Gaussians.
+_SHARE_OF_SKY = 0.125
+
+
+def most_sky_points(count: int) -> int:
+    """The maximum number of points of the sky, for ``count`` points per start."""
+    return math.ceil(_SHARE_OF_SKY * count)
 
 
 def initial_count(dataset: Dataset, config: TrainConfig) -> int:
@@ -87,6 +94,6 @@ def _points_of(
     count = 0 if starts == ("points",) else config.points_per_start
     sizes = {"sweep": {"longer_side": config.sweep_side}}
     found = [
-        STARTS[name](dataset, images, count, generator, **sizes.get(name, {})) for name in starts
+        start_of(name)(dataset, images, count, generator, **sizes.get(name, {})) for name in starts
     ]
     return Points(torch.cat([p.xyz for p in found]), torch.cat([p.rgb for p in found]))

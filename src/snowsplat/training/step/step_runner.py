@@ -41,9 +41,9 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
-from snowsplat.training.core import finite
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
+from snowsplat.training.step import finite
+from snowsplat.training.step.view_gradient import ViewGradient
 
 #: Initial capacity, in instances per Gaussian. A visible Gaussian has about seven instances, and a
 #: view shows only a part of the scene. If the capacity is too small, one step is repeated.

@@ -15,9 +15,9 @@ from snowsplat.ops.splats import Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput, project
-from snowsplat.training.core.step_runner import StepRunner
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import Shards
+from snowsplat.training.step.step_runner import StepRunner
+from snowsplat.training.step.view_gradient import ViewGradient
 
 Each = TypeVar("Each")
 

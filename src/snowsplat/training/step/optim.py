@@ -15,10 +15,10 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops import AdamRates, Moments, SplatGradient, scratch
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.core.step_schedule import Schedule
-from snowsplat.training.core.view_gradient import ViewGradient
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.rates import LearningRates
+from snowsplat.training.settings.schedule import Schedule
+from snowsplat.training.step.view_gradient import ViewGradient
 
 #: β₂ for a batch of one view.
 _BETA2 = 0.999

@@ -1,0 +1,42 @@
+"""`parts_of`: which parts take part in a training."""
+
+from __future__ import annotations
+
+from snowsplat.training.parts.decay import Decay
+from snowsplat.training.parts.densification import Densification
+from snowsplat.training.parts.depth_supervision import DepthSupervision
+from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.near_limit import NearLimit
+from snowsplat.training.parts.normal_supervision import NormalSupervision
+from snowsplat.training.parts.part import Part
+from snowsplat.training.parts.pose_refinement import PoseRefinement
+from snowsplat.training.parts.scale_limit import ScaleLimit
+from snowsplat.training.parts.sky import SkyPart
+from snowsplat.training.parts.smoothing import SmoothingFilter
+from snowsplat.training.parts.surfaces import Surfaces
+from snowsplat.training.parts.transients import Transients
+from snowsplat.training.parts.unexplained import Unexplained
+from snowsplat.training.settings.config import TrainConfig
+
+
+def parts_of(config: TrainConfig) -> list[Part]:
+    """What takes part in a training with these settings, in order. This is the only list of parts.
+
+    A new option is a field of `TrainConfig`, a part in its own file, and a line here.
+    """
+    parts: list[tuple[bool, Part]] = [
+        (config.exposure != "off", Exposure(config.exposure)),
+        (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
+        (config.refine_poses, PoseRefinement()),
+        (config.transients != "off", Transients(config.transients)),
+        (config.depth_weight > 0, DepthSupervision(config.depth_weight)),
+        (config.depth_weight > 0, NormalSupervision(config.depth_weight)),
+        (config.near_limit > 0, NearLimit(config.near_limit)),
+        (config.sky, SkyPart(config.sky_distance)),
+        (True, Densification(late=config.transients == "on")),
+        (True, Decay(config.decay)),
+        (config.relative_scale > 0, ScaleLimit(config.relative_scale)),
+        (config.antialias, SmoothingFilter()),
+        (config.surfaces, Surfaces()),
+    ]
+    return [part for used, part in parts if used]
