@@ -25,7 +25,8 @@ from PIL import Image
 from torch.nn.functional import interpolate, normalize
 
 from snowsplat import Trainer, load_dataset, recipe
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
 from snowsplat.scene.render import render
@@ -62,9 +63,7 @@ def write_room(folder: Path, views: int, width: int, height: int) -> None:
         ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
         for name, pose in truth.poses.items()
     ]
-    pinhole = ColmapCamera(
-        "PINHOLE", width, height, (lens.focal, lens.focal, width / 2, height / 2)
-    )
+    pinhole = lens_of("PINHOLE", width, height, (lens.focal, lens.focal, width / 2, height / 2))
     grey = np.full(xyz.shape, 128, np.uint8)
     write_model(folder / "sparse" / "0", {1: pinhole}, images, xyz, grey)
 

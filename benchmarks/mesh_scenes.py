@@ -18,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.scenes.street import street
 from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, take_photos, walk
@@ -87,7 +88,7 @@ def write_dataset(folder: Path, scene: Procedural, width: int) -> Scene:
         moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
         quat = quat_from_rotation(moved[:, :3])
         images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
-    camera = ColmapCamera("PINHOLE", lens.width, lens.height, lens.params[:4])
+    camera = lens_of("PINHOLE", lens.width, lens.height, lens.params[:4])
     write_model(
         folder / "sparse" / "0", {1: camera}, images, np.concatenate(xyz), np.concatenate(rgb)
     )

@@ -23,7 +23,8 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
@@ -64,7 +65,7 @@ def write_dataset(
         ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
         for name, pose in truth.poses.items()
     ]
-    camera = ColmapCamera("PINHOLE", lens.width, lens.height, lens.params[:4])
+    camera = lens_of("PINHOLE", lens.width, lens.height, lens.params[:4])
     xyz, rgb = (np.concatenate(parts) for parts in zip(*found, strict=True))
     write_model(folder / "sparse" / "0", {1: camera}, records, xyz, rgb)
 

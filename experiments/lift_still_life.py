@@ -21,7 +21,8 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.extras.lift.lift_photo import DepthSource
@@ -167,7 +168,7 @@ def write_dataset(folder: Path, shots: list[Shot]) -> None:
         rgb.append(shot.pixels[row, column])
     camera = shots[0].camera
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    model = {1: ColmapCamera("PINHOLE", camera.width, camera.height, intrinsics)}
+    model = {1: lens_of("PINHOLE", camera.width, camera.height, intrinsics)}
     write_model(folder / "sparse" / "0", model, images, np.concatenate(xyz), np.concatenate(rgb))
 
 

@@ -9,7 +9,6 @@ import torch
 
 from snowsplat.data import load_dataset
 from snowsplat.data.colmap import (
-    ColmapCamera,
     ColmapImage,
     ColmapModel,
     posed_camera,
@@ -18,6 +17,7 @@ from snowsplat.data.colmap import (
     types,
     write_model,
 )
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 
@@ -28,8 +28,8 @@ POSE = (0.5, -0.5, 0.5, 0.5, 1.25, -2.5, 1e-3)
 def test_model_round_trip(tmp_path, text):
     random = np.random.default_rng(0)
     cameras = {
-        7: ColmapCamera("PINHOLE", 640, 480, (500.5, 501.5, 320.25, 239.75)),
-        2: ColmapCamera("OPENCV", 100, 90, (80.0, 81.0, 50.0, 45.0, 0.1, 0.0, 0.0, -0.2)),
+        7: lens_of("PINHOLE", 640, 480, (500.5, 501.5, 320.25, 239.75)),
+        2: lens_of("OPENCV", 100, 90, (80.0, 81.0, 50.0, 45.0, 0.1, 0.0, 0.0, -0.2)),
     }
     images = [ColmapImage("a b/ä.jpg", 7, POSE), ColmapImage("c.png", 2, (1.0, *[0.1] * 6))]
     xyz = random.normal(size=(50, 3)).astype(np.float32)
@@ -77,7 +77,7 @@ def test_pose_is_cam_from_world_of_the_quaternion(dataset_copy):
 
 def rewrite_cameras(folder, model, params):
     colmap = read_model(folder / "sparse/0")
-    camera = ColmapCamera(model, 32, 24, params)
+    camera = lens_of(model, 32, 24, params)
     nothing = np.empty((0, 3))
     write_model(folder / "sparse/0", {1: camera}, colmap.images, nothing, nothing)
 
@@ -114,7 +114,7 @@ def test_invalid_intrinsics_are_rejected(dataset_copy, params):
 def test_one_camera_per_image(dataset_copy):
     folder = dataset_copy("colmap-txt")
     model = read_model(folder / "sparse/0")
-    cameras = {i: ColmapCamera("PINHOLE", 32, 24, (30.0 + i, 30, 16, 12)) for i in range(9)}
+    cameras = {i: lens_of("PINHOLE", 32, 24, (30.0 + i, 30, 16, 12)) for i in range(9)}
     images = [ColmapImage(v.name, i, v.pose) for i, v in enumerate(model.images)]
     nothing = np.empty((0, 3))
     write_model(folder / "sparse/0", cameras, images, nothing, nothing, text=True)
@@ -298,7 +298,7 @@ def test_words_of_observations_are_counted_in_blocks(tmp_path, monkeypatch, bloc
     ],
 )
 def test_limits_of_poses(tmp_path, norm, distance, valid):
-    camera = ColmapCamera("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0))
+    camera = lens_of("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0))
     image = ColmapImage("a.png", 1, (0.6 * norm, 0.8 * norm, 0.0, 0.0, 0.0, 0.0, -distance))
     model = ColmapModel(tmp_path, False, {1: camera}, [image])
     if valid:
@@ -335,7 +335,7 @@ def test_numbers_of_the_camera_models_in_binary_files(tmp_path):
     nothing = np.empty((0, 3))
     for name, (number, count) in models.items():
         params = tuple(float(i + 1) for i in range(count))
-        camera = ColmapCamera(name, 640, 480, params)
+        camera = lens_of(name, 640, 480, params)
         write_model(tmp_path, {3: camera}, [ColmapImage("a", 3, POSE)], nothing, nothing)
         content = (tmp_path / "cameras.bin").read_bytes()
         expected = struct.pack(f"<QIiQQ{count}d", 1, 3, number, 640, 480, *params)
@@ -345,7 +345,7 @@ def test_numbers_of_the_camera_models_in_binary_files(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 def test_the_number_of_records_is_limited(tmp_path, monkeypatch, suffix):
-    cameras = {i: ColmapCamera("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0)) for i in range(2)}
+    cameras = {i: lens_of("SIMPLE_PINHOLE", 32, 24, (30.0, 16.0, 12.0)) for i in range(2)}
     images = [ColmapImage(f"{i}.png", 0, POSE) for i in range(3)]
     nothing = np.empty((0, 3))
     write_model(tmp_path, cameras, images, nothing, nothing, text=suffix == "txt")

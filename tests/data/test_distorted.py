@@ -13,10 +13,9 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, load_dataset
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, read_model, write_model
-from snowsplat.data.colmap.types import CAMERA_MODELS
+from snowsplat.data.colmap import ColmapImage, read_model, write_model
 from snowsplat.data.judge.verdict import judge
-from snowsplat.data.lens.project import LensModel, intrinsics, project
+from snowsplat.data.lens.models import COLMAP_LENSES, lens_of
 from snowsplat.data.maps.depth_file import to_z
 from snowsplat.data.photos.decode import load_image, load_thumbnail
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
@@ -53,7 +52,7 @@ def write(folder, model="OPENCV", params=OPENCV, count=3, image=None, text=False
     for i in range(count):
         (image or photo()).save(folder / f"images/{i}.png")
     images = [ColmapImage(f"{i}.png", 1, (1.0, 0, 0, 0, 0.1 * i, 0, 0)) for i in range(count)]
-    camera = {1: ColmapCamera(model, W, H, tuple(map(float, params)))}
+    camera = {1: lens_of(model, W, H, tuple(map(float, params)))}
     nothing = np.empty((0, 3))
     write_model(folder / "sparse/0", camera, images, nothing, nothing, text=text)
     return folder
@@ -64,7 +63,7 @@ def source_positions(view, lens):
     camera = view.camera
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    return project(lens, rays @ camera.cam_from_world[:, :3].numpy())
+    return lens.project(rays @ camera.cam_from_world[:, :3].numpy())
 
 
 def check(view, lens, loaded, error=4.0):
@@ -79,7 +78,7 @@ def check(view, lens, loaded, error=4.0):
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("model", [name for name, _ in CAMERA_MODELS])
+@pytest.mark.parametrize("model", [lens.model for lens in COLMAP_LENSES])
 def test_each_model_becomes_pinhole_views(tmp_path, model, text):
     params = params_of(model)
     dataset = load_dataset(write(tmp_path, model, params, 2, text=text), hold_out=None)
@@ -88,7 +87,7 @@ def test_each_model_becomes_pinhole_views(tmp_path, model, text):
         for view in dataset.train:
             loaded = images.get(view)
             assert loaded.rgb.shape == (view.camera.height, view.camera.width, 3)
-            check(view, LensModel(model, W, H, params), loaded, error=8.0)
+            check(view, lens_of(model, W, H, params), loaded, error=8.0)
 
 
 def test_the_focal_length_is_kept_and_no_border_is_blank(tmp_path):
@@ -104,7 +103,7 @@ def test_scaled_photos(tmp_path, resolution):
     view = dataset.train[0]
     assert view.camera.width == pytest.approx(90 if resolution == 90 else W / resolution, abs=5)
     with ImageLoader([view]) as images:
-        check(view, LensModel("OPENCV", W, H, OPENCV), images.get(view), error=12.0 * resolution)
+        check(view, lens_of("OPENCV", W, H, OPENCV), images.get(view), error=12.0 * resolution)
 
 
 @pytest.mark.parametrize("size", [(80, 60), (240, 180), (119, 89)])
@@ -112,7 +111,7 @@ def test_photos_of_another_size_than_the_camera(tmp_path, size):
     view = load_dataset(write(tmp_path, image=photo(*size)), hold_out=None).train[0]
     assert view.camera.fx == pytest.approx(110.0 * size[0] / W, rel=0.01)
     with ImageLoader([view]) as images:
-        check(view, LensModel("OPENCV", W, H, OPENCV), images.get(view), error=12.0)
+        check(view, lens_of("OPENCV", W, H, OPENCV), images.get(view), error=12.0)
 
 
 def test_a_folder_of_smaller_copies_gives_the_same_view(tmp_path):
@@ -139,7 +138,7 @@ def test_masks_are_undistorted_with_their_photos(tmp_path, scale):
     view = load_dataset(folder, hold_out=None).train[0]
     with ImageLoader([view]) as images:
         found = images.get(view).mask.numpy()
-    x = source_positions(view, LensModel("OPENCV", W, H, OPENCV))[..., 0]
+    x = source_positions(view, lens_of("OPENCV", W, H, OPENCV))[..., 0]
     sure = np.abs(x - 60) > scale
     assert (found == (x < 60))[sure].all()
 
@@ -153,7 +152,7 @@ def test_a_photo_that_exif_turns(tmp_path):
         turned.save(folder / f"images/{i}.png", exif=exif)
     view = load_dataset(folder, hold_out=None).train[0]
     with ImageLoader([view]) as images:
-        check(view, LensModel("OPENCV", W, H, OPENCV), images.get(view), error=8.0)
+        check(view, lens_of("OPENCV", W, H, OPENCV), images.get(view), error=8.0)
 
 
 def test_a_wide_lens_has_several_views_with_masks(tmp_path):
@@ -175,8 +174,8 @@ def test_a_wide_lens_has_several_views_with_masks(tmp_path):
     with ImageLoader(views) as images:
         for view in views:
             loaded = images.get(view)
-            check(view, LensModel(WIDE[0], W, H, WIDE[1]), loaded, error=12.0)
-            at = source_positions(view, LensModel(WIDE[0], W, H, WIDE[1]))
+            check(view, lens_of(WIDE[0], W, H, WIDE[1]), loaded, error=12.0)
+            at = source_positions(view, lens_of(WIDE[0], W, H, WIDE[1]))
             outside = (at < -1).any(-1) | (at > (W + 1, H + 1)).any(-1)
             if outside.any():
                 assert not loaded.mask.numpy()[outside].any()
@@ -289,7 +288,7 @@ def test_lenses_of_transforms_json(tmp_path, name):
     common = entries if coefficients is None else {**INTRINSICS, **entries}
     params = (float(W), float(H)) if coefficients is None else (*OPENCV[:4], *coefficients)
     dataset = load_dataset(write_json(tmp_path, common), hold_out=None)
-    lens = LensModel(model, W, H, params)
+    lens = lens_of(model, W, H, params)
     with ImageLoader(dataset.train) as images:
         for view in dataset.train:
             check(view, lens, images.get(view), error=9.0)
@@ -304,9 +303,9 @@ def test_a_polynomial_of_the_eighth_degree(tmp_path):
     x, y = np.meshgrid(np.linspace(-0.7, 0.7, 20), np.linspace(-0.5, 0.5, 20))
     s = x * x + y * y
     factor = 1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))
-    fx, fy, cx, cy, _ = intrinsics(lens)
+    fx, fy, cx, cy = lens.intrinsics
     true = np.stack([fx * x * factor + cx, fy * y * factor + cy], -1)
-    found = project(lens, np.stack([x, y, np.ones_like(x)], -1))
+    found = lens.project(np.stack([x, y, np.ones_like(x)], -1))
     assert np.abs(found - true).max() < 0.01
 
 
@@ -314,10 +313,10 @@ def test_a_lens_for_each_frame(tmp_path):
     frames = [{"k1": -0.1}, {"k1": 0.05, "fl_x": 120.0}, {}, {"is_fisheye": True}]
     dataset = load_dataset(write_json(tmp_path, INTRINSICS, frames), hold_out=None)
     lenses = [
-        LensModel("OPENCV", W, H, (110.0, 108.0, 82.0, 59.0, -0.1, 0, 0, 0)),
-        LensModel("OPENCV", W, H, (120.0, 108.0, 82.0, 59.0, 0.05, 0, 0, 0)),
-        LensModel("PINHOLE", W, H, (110.0, 108.0, 82.0, 59.0)),
-        LensModel("OPENCV_FISHEYE", W, H, (110.0, 108.0, 82.0, 59.0, 0, 0, 0, 0)),
+        lens_of("OPENCV", W, H, (110.0, 108.0, 82.0, 59.0, -0.1, 0, 0, 0)),
+        lens_of("OPENCV", W, H, (120.0, 108.0, 82.0, 59.0, 0.05, 0, 0, 0)),
+        lens_of("PINHOLE", W, H, (110.0, 108.0, 82.0, 59.0)),
+        lens_of("OPENCV_FISHEYE", W, H, (110.0, 108.0, 82.0, 59.0, 0, 0, 0, 0)),
     ]
     with ImageLoader(dataset.train) as images:
         for view, lens in zip(dataset.train, lenses, strict=True):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.pipeline.demo import compare_with_truth, is_accurate
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.synthetic import Truth
@@ -26,7 +27,7 @@ def test_wrong_or_missing_poses_fail(tmp_path, moved, count, near):
         shift = pose[:, 3] + torch.tensor([moved * (not images), 0, 0])
         quat = quat_from_rotation(pose[:, :3])
         images.append(ColmapImage(name, 1, (*quat.tolist(), *shift.tolist())))
-    camera = ColmapCamera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
+    camera = lens_of("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
     nothing = np.zeros((0, 3))
     write_model(tmp_path / "sparse" / "0", {1: camera}, images, nothing, nothing.astype(np.uint8))
     errors = compare_with_truth(tmp_path, TRUTH.poses)

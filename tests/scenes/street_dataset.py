@@ -10,7 +10,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.lens import Lens
@@ -67,7 +68,7 @@ def write_street_dataset(
         moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
         quat = quat_from_rotation(moved[:, :3])
         images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
-    camera = ColmapCamera("PINHOLE", width, height, lens.params[:4])
+    camera = lens_of("PINHOLE", width, height, lens.params[:4])
     turned = np.concatenate(xyz) @ DATASET_FROM_SCENE[:, :3].numpy().T
     write_model(folder / "sparse" / "0", {1: camera}, images, turned, np.concatenate(rgb))
     return folder

@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.lens.project import LensModel, directions, project
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import lens_views, pinhole_view
 from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
@@ -36,7 +36,7 @@ def found(model_of) -> pycolmap.Reconstruction:
 def written(model: pycolmap.Reconstruction, folder) -> pycolmap.Reconstruction:
     pinholes = {
         number: pinhole_view(
-            LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+            lens_of(camera.model_name, camera.width, camera.height, tuple(camera.params))
         )
         for number, camera in model.cameras.items()
     }
@@ -85,7 +85,7 @@ def test_keypoints_without_an_undistorted_position_are_finite(found, tmp_path):
     assert tuple(positions[0]) == (-1.0, -1.0)
 
 
-FISHEYE = LensModel("OPENCV_FISHEYE", 320, 240, (100.0, 100.0, 160.0, 120.0, 0.02, 0.0, 0.0, 0.0))
+FISHEYE = lens_of("OPENCV_FISHEYE", 320, 240, (100.0, 100.0, 160.0, 120.0, 0.02, 0.0, 0.0, 0.0))
 
 
 def test_photos_of_a_wide_lens_become_views(model_of):
@@ -117,11 +117,11 @@ def test_photos_of_a_wide_lens_become_views(model_of):
     "lens",
     [
         FISHEYE,
-        LensModel("OPENCV", 320, 240, (260.0, 258.0, 164.0, 119.0, -0.12, 0.02, 0.001, -0.002)),
+        lens_of("OPENCV", 320, 240, (260.0, 258.0, 164.0, 119.0, -0.12, 0.02, 0.001, -0.002)),
     ],
 )
 def test_directions_are_the_inverse_of_project(lens):
     pixels = np.random.default_rng(0).uniform(0, (320, 240), (500, 2))
-    found = directions(lens, pixels)
+    found = lens.directions(pixels)
     assert np.allclose(np.linalg.norm(found, axis=1), 1)
-    assert np.abs(project(lens, found) - pixels).max() < 1e-6
+    assert np.abs(lens.project(found) - pixels).max() < 1e-6

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from snowsplat import Trainer, recipe
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
 from snowsplat.data.dataset import Dataset
-from snowsplat.data.lens.project import LensModel, directions
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
@@ -229,7 +229,7 @@ def test_maps_of_fisheyes_and_panoramas(tmp_path, model: str, params: tuple[floa
     (tmp_path / "images").mkdir()
     (tmp_path / "normals").mkdir()
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-    rays = directions(LensModel(model, width, height, params), pixels.reshape(-1, 2))
+    rays = lens_of(model, width, height, params).directions(pixels.reshape(-1, 2))
     face = np.abs(rays).argmax(1)
     normals = -np.sign(rays[np.arange(len(rays)), face, None]) * np.eye(3)[face]
     normals = normals.reshape(height, width, 3)
@@ -240,7 +240,7 @@ def test_maps_of_fisheyes_and_panoramas(tmp_path, model: str, params: tuple[floa
         )
         np.save(tmp_path / f"normals/{i}.npy", normals * (1, -1, -1))
         images.append(ColmapImage(f"{i}.png", 1, (1.0, 0, 0, 0, 0.1 * i, 0, 0)))
-    camera = ColmapCamera(model, width, height, params)
+    camera = lens_of(model, width, height, params)
     write_model(tmp_path / "sparse/0", {1: camera}, images, np.eye(3), np.zeros((3, 3), np.uint8))
     data = load_dataset(tmp_path, hold_out=None)
     assert len(data.train) > 4

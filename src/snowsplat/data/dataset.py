@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from snowsplat.data.frame.bounds import EXTENT_FACTOR, scene_bounds
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import HERE, Origin
@@ -165,7 +165,7 @@ class PosedImage:
     depth_confidence: Path | None = None  # as `View.depth_confidence`
     normals: Path | None = None  # as `View.normals`
     frame: str | None = None  # images of one frame of a rig, taken at one time, share this name
-    lens: LensModel | None = None  # of a distorted photo; ``camera`` then has its pose and size
+    lens: Lens | None = None  # of a distorted photo; ``camera`` then has its pose and size
 
     @property
     def path(self) -> Path:

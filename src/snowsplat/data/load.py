@@ -18,7 +18,7 @@ from snowsplat.data.frame.move_to_origin import moved_to_origin
 from snowsplat.data.frame.near import near_of
 from snowsplat.data.frame.placement import read_placement
 from snowsplat.data.lens.circle import image_circle
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.maps.map_file import MAP_SUFFIXES
 from snowsplat.data.photos.decode import (
@@ -112,7 +112,7 @@ class DatasetFiles:
 
     root: Path
     images: list[tuple[PosedImage, Header, tuple[int, int, bool]]]
-    circles: Mapping[LensModel, float]
+    circles: Mapping[Lens, float]
     points: Points | None
     description: str
     test_names: set[str]
@@ -392,17 +392,17 @@ def _shrink_factor(image: PosedImage, header: Header) -> tuple[float | None, boo
 
 def _circles(
     images: Sequence[tuple[PosedImage, Header, tuple[int, int, bool]]],
-) -> dict[LensModel, float]:
+) -> dict[Lens, float]:
     """The radius in pixels of the image circle of each wide lens that has one; see `image_circle`.
     Decodes a few photos of each of these lenses."""
     # Photos may have a calibration each, of the same lens.
-    kinds: dict[tuple[str, int, int], dict[LensModel, list[ImageSource]]] = {}
+    kinds: dict[tuple[str, int, int], dict[Lens, list[ImageSource]]] = {}
     for image, _, (width, height, sideways) in images:
         if (lens := image.lens) is not None and is_wide(lens):
             source = ImageSource(image.path, width, height, sideways)
             kind = kinds.setdefault((lens.model, lens.width, lens.height), {})
             kind.setdefault(lens, []).append(source)
-    circles: dict[LensModel, float] = {}
+    circles: dict[Lens, float] = {}
     for lenses in kinds.values():
         photos = [photo for sources in lenses.values() for photo in sources]
         chosen = photos[:: -(-len(photos) // _CIRCLE_PHOTOS)]
@@ -418,7 +418,7 @@ def _views(
     header: Header,
     size: tuple[int, int, bool],
     resolution: int | None,
-    circles: Mapping[LensModel, float],
+    circles: Mapping[Lens, float],
 ) -> Iterator[View]:
     """The view of an image; of a wide lens, several views. All of them are without distortion."""
     width, height, sideways = size
@@ -439,9 +439,7 @@ def _maps_of(image: PosedImage) -> tuple[Path | None, float, Path | None, Path |
     return image.depth, image.depth_unit, image.depth_confidence, image.normals
 
 
-def _pinhole_views(
-    image: PosedImage, lens: LensModel, circle: float | None
-) -> tuple[LensView, ...]:
+def _pinhole_views(image: PosedImage, lens: Lens, circle: float | None) -> tuple[LensView, ...]:
     try:
         return lens_views(lens, circle)
     except ValueError as error:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from snowsplat.data.lens.project import directions
 from snowsplat.data.lens.views import LensView
 from snowsplat.scene.geometry import Similarity
 from snowsplat.util.files import new_folder
@@ -123,7 +122,7 @@ def in_views(
         else:
             images, first = [], _rotation(views[camera_id][0])
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(first), np.zeros(3)) * pose
-            rays = directions(views[camera_id][0].lens, xy)
+            rays = views[camera_id][0].lens.directions(xy)
             for view, camera in zip(views[camera_id], cameras[camera_id], strict=True):
                 pixels, rows = _seen(view, rays)
                 points = [ids[row] for row in rows]

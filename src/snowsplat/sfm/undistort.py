@@ -26,7 +26,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data.lens.coverage import shown
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, lens_views, pinhole_view
 from snowsplat.data.photos.colour_profile import plain_pixels
@@ -175,7 +175,7 @@ def _views_of(camera: pycolmap.Camera, masks: Sequence[Path]) -> Sequence[LensVi
     ``masks``: of photos of the camera. If they mask what is outside of an image circle, the views
     show only the circle.
     """
-    lens = LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+    lens = lens_of(camera.model_name, camera.width, camera.height, camera.params)
     found = f"{camera.model_name} {', '.join(f'{value:.5g}' for value in camera.params)}"
     with suppress(ValueError):  # then `pinhole_view` decides: a part of the photo, or an error
         fisheye = not (camera.is_spherical() or camera.is_perspective_pinhole())

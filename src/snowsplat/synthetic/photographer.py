@@ -14,7 +14,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.lens import CentredLens, Lens
@@ -48,7 +49,7 @@ class Truth:
             ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
             for name, pose in self.poses.items()
         ]
-        camera = ColmapCamera(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
+        camera = lens_of(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
         nothing = np.zeros((0, 3))
         write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.project import BROWN, LensModel, project, unproject
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import pinhole_view
 
 INTRINSICS = 900.0, 905.0, 655.0, 470.0
@@ -12,12 +11,12 @@ INTRINSICS = 900.0, 905.0, 655.0, 470.0
 
 def lens(k4=0.0, skew=0.0):
     params = (*INTRINSICS, 0.1, -0.05, 0.03, k4, 0.002, -0.001, skew)
-    return LensModel(BROWN, 1280, 960, params)
+    return lens_of("BROWN", 1280, 960, params)
 
 
 def test_the_skew_moves_points_to_the_right():
     ray = np.array([[0.1, 0.2, 1.0]])
-    straight, skewed = project(lens(), ray), project(lens(skew=0.01), ray)
+    straight, skewed = lens().project(ray), lens(skew=0.01).project(ray)
     assert skewed[0, 1] == straight[0, 1]
     expected = 0.01 * 900 * (straight[0, 1] - 470) / 905
     assert skewed[0, 0] - straight[0, 0] == pytest.approx(expected)
@@ -25,8 +24,8 @@ def test_the_skew_moves_points_to_the_right():
 
 def test_the_directions_of_pixels_are_found():
     pixels = np.random.default_rng(0).uniform(0, (1280, 960), (50, 2))
-    found = unproject(lens(-0.04, 0.01), pixels)
-    again = project(lens(-0.04, 0.01), np.column_stack([found, np.ones(50)]))
+    found = lens(-0.04, 0.01).unproject(pixels)
+    again = lens(-0.04, 0.01).project(np.column_stack([found, np.ones(50)]))
     assert np.abs(again - pixels).max() < 1e-6
 
 
@@ -42,15 +41,15 @@ def test_a_photo_is_undistorted():
 
 @pytest.mark.parametrize("k4", [0.0, 0.02, -0.04])
 def test_r8_is_nearly_a_model_of_colmap(k4):
-    made, error = as_colmap(lens(k4))
+    made, error = lens(k4).as_colmap()
     assert made.model == "FULL_OPENCV"
     assert error < 0.02
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 20), np.linspace(-0.45, 0.45, 20))
     rays = np.stack([x, y, np.ones_like(x)], -1)
-    assert np.abs(project(made, rays) - project(lens(k4), rays)).max() < 0.05
+    assert np.abs(made.project(rays) - lens(k4).project(rays)).max() < 0.05
 
 
 def test_the_error_without_the_skew_is_told():
-    assert as_colmap(lens(skew=0.01))[1] == pytest.approx(0.01 * 900 * 490 / 905, rel=0.1)
-    pinhole = LensModel("PINHOLE", 1280, 960, INTRINSICS)
+    assert lens(skew=0.01).as_colmap()[1] == pytest.approx(0.01 * 900 * 490 / 905, rel=0.1)
+    pinhole = lens_of("PINHOLE", 1280, 960, INTRINSICS)
     assert as_colmap(pinhole) == (pinhole, 0.0)

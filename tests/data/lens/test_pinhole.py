@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import LensView, pinhole_view
 
 LENSES = {
@@ -17,7 +17,7 @@ LENSES = {
 
 def pinhole_of(camera: pycolmap.Camera) -> LensView:
     size = camera.width, camera.height
-    return pinhole_view(LensModel(camera.model_name, *size, tuple(camera.params)))
+    return pinhole_view(lens_of(camera.model_name, *size, tuple(camera.params)))
 
 
 def nodes_of(view: LensView) -> np.ndarray:

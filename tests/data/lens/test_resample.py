@@ -7,8 +7,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.positions import Positions
-from snowsplat.data.lens.project import LensModel, project
 from snowsplat.data.lens.resample import resampled, undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, pinhole_view
 
@@ -22,7 +22,7 @@ LENSES = {
 
 def pinhole_of(camera: pycolmap.Camera) -> LensView:
     size = camera.width, camera.height
-    return pinhole_view(LensModel(camera.model_name, *size, tuple(camera.params)))
+    return pinhole_view(lens_of(camera.model_name, *size, tuple(camera.params)))
 
 
 def lens(model: str, params: list[float], width: int = 320, height: int = 240) -> pycolmap.Camera:
@@ -180,13 +180,13 @@ def test_positions_without_a_value_do_not_disturb_others():
 @pytest.mark.parametrize("name", LENSES)
 def test_positions_between_nodes_are_exact_to_a_hundredth_of_a_pixel(name):
     model, params = LENSES[name]
-    camera = LensModel(model, 1280, 960, (*(4 * np.array(params[: -4 if len(params) > 4 else 3])),))
-    camera = LensModel(model, 1280, 960, (*camera.params, *params[len(camera.params) :]))
+    camera = lens_of(model, 1280, 960, (*(4 * np.array(params[: -4 if len(params) > 4 else 3])),))
+    camera = lens_of(model, 1280, 960, (*camera.params, *params[len(camera.params) :]))
     pinhole = pinhole_view(camera)
     fx, fy, cx, cy = pinhole.params
     ((_, positions),) = pinhole.positions(pinhole.width, pinhole.height)
     for rows, found in positions.strips():
         x, y = np.arange(pinhole.width) + 0.5, np.arange(pinhole.height)[rows] + 0.5
         across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
-        true = project(camera, np.stack([across, down, np.ones_like(across)], -1))
+        true = camera.project(np.stack([across, down, np.ones_like(across)], -1))
         assert np.abs(found - true).max() < 0.011  # with the rounding to float32

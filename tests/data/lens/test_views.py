@@ -6,10 +6,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.data.colmap.types import CAMERA_MODELS
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.coverage import shown
-from snowsplat.data.lens.project import LensModel, project, unproject
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.models import COLMAP_LENSES, lens_of
 from snowsplat.data.lens.resample import nearest, resampled
 from snowsplat.data.lens.views import lens_views, look
 
@@ -18,17 +18,17 @@ COEFFICIENTS = {"omega": 0.9, "alpha": 0.6, "beta": 1.1, "k": -0.1, "k1": -0.03,
 COEFFICIENTS |= {"k0": 0.02, "k2": 0.01, "p0": -1e-3, "p2": 2e-3, "s1": 1e-3, "sx1": 1e-3}
 WIDE = {
     "half a sphere in the photo": (
-        LensModel("FISHEYE", 900, 900, (286.0, 286.0, 452.0, 447.0)),
+        lens_of("FISHEYE", 900, 900, (286.0, 286.0, 452.0, 447.0)),
         None,
     ),
-    "circle of 180°": (LensModel("FISHEYE", 900, 900, (286.0, 286.0, 452.0, 447.0)), 430.0),
-    "circle of 220°": (LensModel("SIMPLE_FISHEYE", 900, 900, (234.0, 450.0, 450.0)), 449.0),
+    "circle of 180°": (lens_of("FISHEYE", 900, 900, (286.0, 286.0, 452.0, 447.0)), 430.0),
+    "circle of 220°": (lens_of("SIMPLE_FISHEYE", 900, 900, (234.0, 450.0, 450.0)), 449.0),
     "action camera": (
-        LensModel("OPENCV_FISHEYE", 960, 540, (300.0, 301.0, 483.0, 268.0, 0.02, -0.01, 0.0, 0.0)),
+        lens_of("OPENCV_FISHEYE", 960, 540, (300.0, 301.0, 483.0, 268.0, 0.02, -0.01, 0.0, 0.0)),
         None,
     ),
-    "perspective": (LensModel("SIMPLE_DIVISION", 960, 540, (300.0, 480.0, 270.0, -0.5)), None),
-    "panorama": (LensModel("EQUIRECTANGULAR", 1200, 600, (1200.0, 600.0)), None),
+    "perspective": (lens_of("SIMPLE_DIVISION", 960, 540, (300.0, 480.0, 270.0, -0.5)), None),
+    "panorama": (lens_of("EQUIRECTANGULAR", 1200, 600, (1200.0, 600.0)), None),
 }
 
 
@@ -40,8 +40,8 @@ def colmap_camera(model: str) -> pycolmap.Camera:
     return camera
 
 
-def as_lens(camera: pycolmap.Camera) -> LensModel:
-    return LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
+def as_lens(camera: pycolmap.Camera) -> Lens:
+    return lens_of(camera.model_name, camera.width, camera.height, tuple(camera.params))
 
 
 def position_of(view, x, y):
@@ -49,7 +49,7 @@ def position_of(view, x, y):
     fx, fy, cx, cy = view.params
     u, v = np.meshgrid((x - cx) / fx, (y - cy) / fy)
     rays = np.stack([u, v, np.ones_like(u)], -1)
-    return project(view.lens, rays if view.rotation is None else rays @ np.array(view.rotation))
+    return view.lens.project(rays if view.rotation is None else rays @ np.array(view.rotation))
 
 
 def test_all_models_of_colmap_are_known_with_their_numbers():
@@ -58,32 +58,32 @@ def test_all_models_of_colmap_are_known_with_their_numbers():
     }
     theirs = {number: name for number, name in theirs.items() if number >= 0}
     theirs[0] = "SIMPLE_PINHOLE"
-    assert [theirs[number] for number in sorted(theirs)] == [name for name, _ in CAMERA_MODELS]
-    for name, count in CAMERA_MODELS:
-        assert len(colmap_camera(name).params) == count
+    assert [theirs[number] for number in sorted(theirs)] == [lens.model for lens in COLMAP_LENSES]
+    for lens in COLMAP_LENSES:
+        assert len(colmap_camera(lens.model).params) == len(lens.parameters)
 
 
-@pytest.mark.parametrize("model", [name for name, _ in CAMERA_MODELS])
+@pytest.mark.parametrize("model", [lens.model for lens in COLMAP_LENSES])
 def test_projections_are_those_of_colmap(model):
     camera = colmap_camera(model)
     rays = np.random.default_rng(0).normal(size=(2000, 3))
     rays[:, 2] = np.abs(rays[:, 2]) + 0.3
-    found = project(as_lens(camera), rays)
+    found = as_lens(camera).project(rays)
     np.testing.assert_allclose(found, camera.img_from_cam(rays), rtol=0, atol=1e-8)
     if model != "EQUIRECTANGULAR":
         pixels = np.random.default_rng(1).uniform((300, 250), (700, 550), (50, 2))
         np.testing.assert_allclose(
-            unproject(as_lens(camera), pixels), camera.cam_from_img(pixels), atol=1e-6
+            as_lens(camera).unproject(pixels), camera.cam_from_img(pixels), atol=1e-6
         )
 
 
 @pytest.mark.parametrize("width", [64, 128, 300, 2000])
 def test_positions_of_panoramas_of_any_size_are_exact(width):
     """Also those of a view that one cell of nodes would fill, and whose errors cancel out there."""
-    for view in lens_views(LensModel("EQUIRECTANGULAR", width, width // 2, (width, width / 2.0))):
+    for view in lens_views(lens_of("EQUIRECTANGULAR", width, width // 2, (width, width / 2.0))):
         found = np.concatenate([rows for _, rows in view.strips(view.width, view.height)])
         x, y = np.arange(view.width) + 0.5, np.arange(view.height) + 0.5
-        difference = found - project(view.lens, view.rays(x, y))
+        difference = found - view.lens.project(view.rays(x, y))
         difference[..., 0] -= width * np.round(difference[..., 0] / width)
         assert np.abs(difference).max() < 0.05
 
@@ -124,7 +124,7 @@ def test_several_views_cover_the_photo_and_each_pixel_has_its_ray(name):
 
 @pytest.mark.parametrize("width", [896, 1200, 3840])
 def test_all_pixels_of_a_panorama_are_used(width):
-    views = lens_views(LensModel("EQUIRECTANGULAR", width, width // 2, (width, width // 2)))
+    views = lens_views(lens_of("EQUIRECTANGULAR", width, width // 2, (width, width // 2)))
     assert not any(view.partial for view in views)
 
 
@@ -179,14 +179,14 @@ def test_colours_of_a_wide_view_encode_its_rays(name):
 
 
 def test_an_ordinary_lens_is_one_view_with_the_same_axis():
-    (view,) = lens_views(LensModel("OPENCV", 400, 300, (300, 300, 200, 150, -0.1, 0.02, 0, 0)))
+    (view,) = lens_views(lens_of("OPENCV", 400, 300, (300, 300, 200, 150, -0.1, 0.02, 0, 0)))
     assert (view.name, view.rotation, view.partial) == ("", None, False)
     assert view.params[:2] == (300, 300)
     assert view.width > 400  # the borders are stretched
 
 
 def test_the_circle_of_a_fisheye_is_one_view_if_it_is_small():
-    lens = LensModel("FISHEYE", 400, 300, (145.0, 145.0, 200.0, 150.0))
+    lens = lens_of("FISHEYE", 400, 300, (145.0, 145.0, 200.0, 150.0))
     (view,) = lens_views(lens, 145.0)  # 57° to each side
     assert view.name == ""
     assert view.partial
@@ -195,13 +195,13 @@ def test_the_circle_of_a_fisheye_is_one_view_if_it_is_small():
 @pytest.mark.parametrize(
     "lens",
     [
-        LensModel("SIMPLE_RADIAL", 400, 300, (300, 200, 150, -90.0)),
-        LensModel("SIMPLE_RADIAL", 400, 300, (300, 200, 150, float("nan"))),
-        LensModel("OPENCV_FISHEYE", 400, 300, (300, 300, 200, 150, -90.0, 0, 0, 0)),
-        LensModel("FISHEYE", 400, 300, (1e8, 1e8, 200, 150)),
-        LensModel("FISHEYE", 400, 300, (1e-8, 1e-8, 200, 150)),
-        LensModel("OPENCV", 400, 300, (300, 300, 1e8, -1e8, 0.1, 0, 0, 0)),
-        LensModel("EUCM", 400, 300, (300, 300, 200, 150, 0.5, -3.0)),
+        lens_of("SIMPLE_RADIAL", 400, 300, (300, 200, 150, -90.0)),
+        lens_of("SIMPLE_RADIAL", 400, 300, (300, 200, 150, float("nan"))),
+        lens_of("OPENCV_FISHEYE", 400, 300, (300, 300, 200, 150, -90.0, 0, 0, 0)),
+        lens_of("FISHEYE", 400, 300, (1e8, 1e8, 200, 150)),
+        lens_of("FISHEYE", 400, 300, (1e-8, 1e-8, 200, 150)),
+        lens_of("OPENCV", 400, 300, (300, 300, 1e8, -1e8, 0.1, 0, 0, 0)),
+        lens_of("EUCM", 400, 300, (300, 300, 200, 150, 0.5, -3.0)),
     ],
 )
 def test_impossible_coefficients_are_errors_not_large_images(lens):
@@ -215,10 +215,11 @@ def test_impossible_coefficients_are_errors_not_large_images(lens):
 def test_random_coefficients_make_views_of_bounded_size_or_a_value_error():
     random = np.random.default_rng(5)
     for _ in range(60):
-        name, count = CAMERA_MODELS[random.integers(len(CAMERA_MODELS))]
+        model = COLMAP_LENSES[random.integers(len(COLMAP_LENSES))]
+        count = len(model.parameters)
         params = random.normal(size=count) * 10.0 ** random.uniform(-4, 4, count)
         params[:4] = np.abs(params[:4]) if random.random() < 0.8 else params[:4]
-        lens = LensModel(name, *random.integers(1, 500, 2).tolist(), tuple(params.tolist()))
+        lens = model(*random.integers(1, 500, 2).tolist(), tuple(params.tolist()))
         try:
             views = lens_views(lens)
         except ValueError:
@@ -234,7 +235,7 @@ def test_a_view_turns_right_and_up():
 
 
 def test_the_image_circle_is_found_where_all_photos_are_black():
-    lens = LensModel("FISHEYE", 800, 600, (250.0, 250.0, 410.0, 300.0))
+    lens = lens_of("FISHEYE", 800, 600, (250.0, 250.0, 410.0, 300.0))
     x, y = np.meshgrid(np.arange(400) + 0.5, np.arange(300) + 0.5)
     inside = np.hypot(2 * x - 410, 2 * y - 300) < 280
     random = np.random.default_rng(0)
@@ -249,7 +250,7 @@ def test_the_image_circle_is_found_where_all_photos_are_black():
 
 
 def test_depth_is_not_mixed_at_an_edge():
-    lens = LensModel("OPENCV", 400, 300, (300, 300, 200, 150, -0.1, 0.02, 0, 0))
+    lens = lens_of("OPENCV", 400, 300, (300, 300, 200, 150, -0.1, 0.02, 0, 0))
     (view,) = lens_views(lens)
     depth = np.where(np.arange(200) < 100, 1.0, 9.0) * np.ones((150, 1), np.float32)
     depth[:40] = 0.0  # unknown

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, ImageSource, View
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import lens_views
 from snowsplat.data.photos.decode import load_image, load_mask, load_views, resize_area
 from snowsplat.data.photos.image_loader import available_memory
@@ -198,7 +198,7 @@ def test_a_photo_of_several_views_is_decoded_for_those_that_stay(tmp_path, monke
     mask = ImageSource(tmp_path / "mask.png", 60, 60)
     Image.fromarray(pixels[..., 0]).save(mask.path)
     views = []
-    for part in lens_views(LensModel("FISHEYE", 60, 60, (20.0, 20.0, 30.0, 30.0))):
+    for part in lens_views(lens_of("FISHEYE", 60, 60, (20.0, 20.0, 30.0, 30.0))):
         size = {"width": part.width, "height": part.height, "view": part}
         shown = dataclasses.replace(photo.image, **size), dataclasses.replace(mask, **size)
         views.append(View(part.name, photo.camera, *shown))

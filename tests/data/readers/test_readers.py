@@ -9,7 +9,6 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.lens.project import BROWN, project
 from snowsplat.data.load import NoPosesError, load_dataset
 from snowsplat.data.readers import find_export, read_export
 from snowsplat.pipeline.describe import describe
@@ -37,8 +36,8 @@ def pixels(image):
         model, params = image.lens.model, image.lens.params
         assert (image.lens.width, image.lens.height) == (camera.width, camera.height)
         assert params[:4] == (camera.fx, camera.fy, camera.cx, camera.cy)
-    if model == BROWN:  # COLMAP does not have it
-        return project(image.lens, cam)
+    if model == "BROWN":  # COLMAP does not have it
+        return image.lens.project(cam)
     lens = pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
     return np.asarray(lens.img_from_cam(cam))
 

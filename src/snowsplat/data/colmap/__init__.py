@@ -3,10 +3,9 @@
 from snowsplat.data.colmap.model import count_images, read_model, read_points, write_model
 from snowsplat.data.colmap.places import find_models, find_models_below
 from snowsplat.data.colmap.reader import posed_camera, read_colmap
-from snowsplat.data.colmap.types import ColmapCamera, ColmapImage, ColmapModel
+from snowsplat.data.colmap.types import ColmapImage, ColmapModel
 
 __all__ = [
-    "ColmapCamera",
     "ColmapImage",
     "ColmapModel",
     "count_images",

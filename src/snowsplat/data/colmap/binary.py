@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.colmap.types import (
-    CAMERA_MODELS,
     TRACKS,
-    ColmapCamera,
     ColmapImage,
     PointFile,
     check_count,
@@ -23,11 +21,13 @@ from snowsplat.data.colmap.types import (
     damaged,
     track_rows,
 )
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.models import COLMAP_LENSES
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading
 
 _COUNT = struct.Struct("<Q")
-# Id, index into CAMERA_MODELS, width, height. The parameters (doubles) follow.
+# Id, index into COLMAP_LENSES, width, height. The parameters (doubles) follow.
 _CAMERA_HEAD = struct.Struct("<IiQQ")
 _SMALLEST_CAMERA = _CAMERA_HEAD.size + 2 * 8
 # Id, quaternion (w, x, y, z), translation, camera id. The name, ended by a zero byte, and the
@@ -95,7 +95,7 @@ def count_images(path: Path) -> int:
     return min(_COUNT.unpack(head)[0], path.stat().st_size // _SMALLEST_IMAGE)
 
 
-def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+def read_cameras(path: Path) -> dict[int, Lens]:
     """Read a cameras.bin: cameras by id.
 
     Raises:
@@ -106,15 +106,15 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     cameras = {}
     for _ in range(cursor.count):
         camera_id, number, width, height = cursor.take(_CAMERA_HEAD)
-        if not 0 <= number < len(CAMERA_MODELS):
+        if not 0 <= number < len(COLMAP_LENSES):
             raise UserError(
                 "{path}: unknown camera model {number}; undistort the images with the program "
                 "that made it, or copy the file again if it is damaged",
                 path=path,
                 number=number,
             )
-        model, count = CAMERA_MODELS[number]
-        params = cursor.take(struct.Struct(f"<{count}d"))
+        model = COLMAP_LENSES[number]
+        params = cursor.take(struct.Struct(f"<{len(model.parameters)}d"))
         cameras[camera_id] = checked_camera(path, model, width, height, params)
     cursor.finish()
     return cameras
@@ -221,16 +221,15 @@ def read_points(path: Path) -> PointFile:
 
 def write_model(
     folder: Path,
-    cameras: Mapping[int, ColmapCamera],
+    cameras: Mapping[int, Lens],
     images: Sequence[ColmapImage],
     xyz: np.ndarray,
     rgb: np.ndarray,
     tracks: Sequence[Sequence[tuple[int, int]]],
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin; see `model.write_model` for the arguments."""
-    model_numbers = {name: number for number, (name, _) in enumerate(CAMERA_MODELS)}
     camera_records = [
-        _CAMERA_HEAD.pack(key, model_numbers[camera.model], camera.width, camera.height)
+        _CAMERA_HEAD.pack(key, COLMAP_LENSES.index(type(camera)), camera.width, camera.height)
         + struct.pack(f"<{len(camera.params)}d", *camera.params)
         for key, camera in cameras.items()
     ]

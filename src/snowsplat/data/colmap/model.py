@@ -14,12 +14,12 @@ import numpy as np
 from snowsplat.data.colmap import binary as binary_files
 from snowsplat.data.colmap import text as text_files
 from snowsplat.data.colmap.types import (
-    ColmapCamera,
     ColmapImage,
     ColmapModel,
     PointFile,
 )
 from snowsplat.data.dataset import Points, usable_points
+from snowsplat.data.lens.lens import Lens
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ def read_observations(
 
 def write_model(
     folder: Path,
-    cameras: Mapping[int, ColmapCamera],
+    cameras: Mapping[int, Lens],
     images: Sequence[ColmapImage],
     xyz: np.ndarray,
     rgb: np.ndarray,

@@ -15,11 +15,9 @@ import torch
 from snowsplat.data.colmap.model import count_images, read_model
 from snowsplat.data.colmap.places import workspace_of
 from snowsplat.data.colmap.tracks import points_with_tracks
-from snowsplat.data.colmap.types import ColmapImage, ColmapModel, lens_of
+from snowsplat.data.colmap.types import ColmapImage, ColmapModel
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, photos_below, warn_of_missing
-from snowsplat.data.lens.pinhole import is_pinhole
-from snowsplat.data.lens.project import intrinsics
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
@@ -103,7 +101,7 @@ def _images_on_disk(
             missing.append(image.name)
             continue
         where, file, name = places[image.name]
-        camera, lens = posed_camera(model, image), lens_of(model.cameras[image.camera_id])
+        camera, lens = posed_camera(model, image), model.cameras[image.camera_id]
         frame = model.frames.get(image.number)
         names[image.number] = safe_name(name)
         posed.append(
@@ -113,7 +111,7 @@ def _images_on_disk(
                 where,
                 file,
                 frame=None if frame is None else str(frame),
-                lens=None if is_pinhole(lens) else lens,
+                lens=None if lens.is_pinhole else lens,
             )
         )
     warn_of_missing(folder, missing, len(model.images))
@@ -158,7 +156,7 @@ def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
             name=image.name[:80],
             camera_id=image.camera_id,
         )
-    fx, fy, cx, cy, _ = intrinsics(lens_of(colmap))
+    fx, fy, cx, cy = colmap.intrinsics
     numbers = (fx, fy, cx, cy, *colmap.params)
     if min(fx, fy) <= 0 or not all(abs(number) < 1e9 for number in numbers):
         raise UserError(

@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.colmap.types import (
-    CAMERA_MODELS,
     TRACKS,
-    ColmapCamera,
     ColmapImage,
     PointFile,
     check_count,
@@ -22,6 +20,8 @@ from snowsplat.data.colmap.types import (
     damaged,
     track_rows,
 )
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.models import COLMAP_LENSES
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading, shown
 
@@ -75,13 +75,13 @@ def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
         )
 
 
-def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+def read_cameras(path: Path) -> dict[int, Lens]:
     """Read a cameras.txt: cameras by id.
 
     Raises:
         UserError: the file is unreadable or damaged.
     """
-    counts = dict(CAMERA_MODELS)
+    models = {lens.model: lens for lens in COLMAP_LENSES}
     cameras = {}
     for line in filter(None, _lines(path)):
         words = line.split(maxsplit=_MAX_CAMERA_WORDS)
@@ -90,16 +90,16 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             raise damaged(path, f"not a camera: line {shown(line[:60])!r}") from None
-        if model not in counts:
+        if model not in models:
             raise UserError(
                 "{path}: unknown camera model {model!r}; undistort the images with the program "
                 "that made it",
                 path=path,
                 model=shown(model[:40]),
             )
-        if len(params) != counts[model]:
+        if len(params) != len(models[model].parameters):
             raise damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
-        cameras[camera_id] = checked_camera(path, model, width, height, params)
+        cameras[camera_id] = checked_camera(path, models[model], width, height, params)
         check_count(path, "cameras", len(cameras))
     _warn_if_fewer(path, "cameras", len(cameras))
     return cameras
@@ -252,7 +252,7 @@ def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
 
 def write_model(
     folder: Path,
-    cameras: Mapping[int, ColmapCamera],
+    cameras: Mapping[int, Lens],
     images: Sequence[ColmapImage],
     xyz: np.ndarray,
     rgb: np.ndarray,

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from snowsplat.data.colmap.model import read_observations, read_point_file
-from snowsplat.data.colmap.types import ColmapModel, PointFile, lens_of
+from snowsplat.data.colmap.types import ColmapModel, PointFile
 from snowsplat.data.dataset import Points, Tracks, usable_points
-from snowsplat.data.lens.project import unproject
 
 # Images whose observations are read, spread over the model.
 _MOST_IMAGES = 100
@@ -52,7 +51,7 @@ def _tracks(model: ColmapModel, names: Mapping[int, str], file: PointFile) -> Tr
         found = observed[image]
         known = found[:, 2] == file.ids[track[:, 0]]
         valid += int(known.sum())
-        ray = unproject(lens_of(cameras[image]), found[known, :2])
+        ray = cameras[image].unproject(found[known, :2])
         rays.append(ray)
         points.append(track[known, 0])
         photos.append(np.full(len(ray), number))

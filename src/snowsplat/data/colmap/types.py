@@ -8,30 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.util.errors import UserError
-
-#: Name and number of parameters of each camera model; the index is its number in binary files.
-CAMERA_MODELS = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    ("SIMPLE_DIVISION", 4),
-    ("DIVISION", 5),
-    ("SIMPLE_FISHEYE", 3),
-    ("FISHEYE", 4),
-    ("EUCM", 6),
-    ("EQUIRECTANGULAR", 2),
-)
 
 # Width or height of a camera in pixels. A larger value means a damaged file.
 _MAX_SIDE = 1_000_000
@@ -39,16 +17,6 @@ _MAX_SIDE = 1_000_000
 _MAX_RECORDS = 200_000
 #: Number of points whose tracks are read: enough for about 100 observations in each of 250 photos.
 TRACKS = 4000
-
-
-@dataclass(frozen=True)
-class ColmapCamera:
-    """Intrinsics shared by one or more images."""
-
-    model: str  # a name in `CAMERA_MODELS`
-    width: int  # pixels
-    height: int  # pixels
-    params: tuple[float, ...]  # in COLMAP's order for ``model``; focal lengths and centre in pixels
 
 
 @dataclass(frozen=True)
@@ -67,7 +35,7 @@ class ColmapModel:
 
     folder: Path
     text: bool  # read from .txt files, not from .bin
-    cameras: Mapping[int, ColmapCamera]  # by camera id
+    cameras: Mapping[int, Lens]  # by camera id; images may share one
     images: Sequence[ColmapImage]  # sorted by name
     # Image id -> frame id, of images that were taken at one time by the cameras of a rig.
     frames: Mapping[int, int] = field(default_factory=dict)
@@ -87,11 +55,6 @@ def track_rows(pairs: Mapping[int, np.ndarray]) -> np.ndarray:
     """`PointFile.tracks` from the pairs (image id, observation index) of points, by their row."""
     rows = [np.column_stack([np.full(len(p), row), p]) for row, p in pairs.items()]
     return np.concatenate([np.empty((0, 3), np.int64), *rows]).astype(np.int64)
-
-
-def lens_of(camera: ColmapCamera) -> LensModel:
-    """The lens of a camera."""
-    return LensModel(camera.model, camera.width, camera.height, camera.params)
 
 
 def damaged(path: Path, problem: str) -> UserError:
@@ -114,8 +77,10 @@ def check_count(path: Path, kind: str, count: int) -> None:
         )
 
 
-def checked_camera(path: Path, model: str, width: int, height: int, params: tuple) -> ColmapCamera:
+def checked_camera(
+    path: Path, model: type[Lens], width: int, height: int, params: tuple[float, ...]
+) -> Lens:
     """A camera whose image size is plausible; otherwise raise `UserError`."""
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
         raise damaged(path, f"a camera has the size {width}x{height}")
-    return ColmapCamera(model, width, height, params)
+    return model(width, height, params)

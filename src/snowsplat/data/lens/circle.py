@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snowsplat.data.lens.project import LensModel, intrinsics
+from snowsplat.data.lens.lens import Lens
 
 # Of 255: outside of the circle no photo is brighter, except for JPEG artefacts and noise.
 _BLACK = 24
@@ -19,7 +19,7 @@ _RIM = 0.01
 _RINGS = 256
 
 
-def image_circle(lens: LensModel, photos: Sequence[np.ndarray]) -> float | None:
+def image_circle(lens: Lens, photos: Sequence[np.ndarray]) -> float | None:
     """The radius of the image circle around the principal point, in pixels of the lens.
 
     The corners are black in all photos. None: the circle is larger than the photo.
@@ -32,7 +32,7 @@ def image_circle(lens: LensModel, photos: Sequence[np.ndarray]) -> float | None:
         return None
     brightest = np.max([photo[:3].max(0) for photo in photos], axis=0)
     height, width = brightest.shape
-    _, _, cx, cy, _ = intrinsics(lens)
+    _, _, cx, cy = lens.intrinsics
     x = (np.arange(width) + 0.5) * (lens.width / width) - cx
     y = (np.arange(height) + 0.5) * (lens.height / height) - cy
     radius = np.hypot(x, y[:, None])

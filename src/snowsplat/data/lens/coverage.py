@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from snowsplat.data.lens.positions import Positions
-from snowsplat.data.lens.project import intrinsics
 from snowsplat.data.lens.views import LensView
 
 _SAMPLES = 2  # of a pixel along each axis
@@ -40,7 +39,7 @@ def _sides(view: LensView, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size = view.lens.width, view.lens.height
     outside = ~((high >= 0) & (low <= size)).all(-1)
     if view.circle is not None:
-        centre = np.array(intrinsics(view.lens)[2:4])
+        centre = np.array(view.lens.intrinsics[2:])
         outside |= np.linalg.norm(centre.clip(low, high) - centre, axis=-1) > view.circle
     return inside, outside
 

@@ -10,25 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.positions import node_grid
-from snowsplat.data.lens.project import BROWN, LensModel, intrinsics, project, unproject
 
 _CROPPED = 0.95  # of width and height; without blank borders, an image shows more of the photo
 _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle
-# Models that are pinhole cameras if their coefficients are 0.
-_PINHOLES = frozenset(
-    {
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "FULL_OPENCV",
-        BROWN,
-        "SIMPLE_DIVISION",
-        "DIVISION",
-    }
-)
 _MIN_FRACTION = 0.2  # of width and height: if less can be undistorted, the calibration is wrong
 
 
@@ -42,18 +28,13 @@ class Pinhole:
     cropped: bool = False  # the outer part is cut off, because the calibration is invalid there
 
 
-def is_pinhole(lens: LensModel) -> bool:
-    """Whether a lens has no distortion. A fisheye without coefficients has: it is no pinhole."""
-    return lens.model in _PINHOLES and not any(intrinsics(lens)[4])
-
-
-def pinhole_of(lens: LensModel) -> Pinhole:
+def pinhole_of(lens: Lens) -> Pinhole:
     """The pinhole camera for a distorted one: the same focal lengths, no blank borders.
 
     Raises: ValueError: the calibration is valid only for a small part of the photo.
     """
-    fx, fy, cx, cy, _ = intrinsics(lens)
-    if is_pinhole(lens):
+    fx, fy, cx, cy = lens.intrinsics
+    if lens.is_pinhole:
         return Pinhole(lens.width, lens.height, (fx, fy, cx, cy))
     made = _without_blank_borders(lens)
     if not _is_valid(lens, made):
@@ -77,14 +58,14 @@ def pinhole_of(lens: LensModel) -> Pinhole:
     return replace(made, cropped=bool(used.min() < _CROPPED))
 
 
-def _without_blank_borders(lens: LensModel) -> Pinhole:
+def _without_blank_borders(lens: Lens) -> Pinhole:
     """The image of 0.2 to 2 times the size of the photo that has no blank borders, as in COLMAP.
 
     The border of the photo is mapped to the pinhole camera of the same parameters. On each side,
     the innermost position is the border of the new image, which keeps the shares of the principal
     point.
     """
-    fx, fy, cx, cy, _ = intrinsics(lens)
+    fx, fy, cx, cy = lens.intrinsics
     sides = []
     for size, other, centre, focal, axis in (
         (lens.width, lens.height, cx, fx, 0),
@@ -92,7 +73,7 @@ def _without_blank_borders(lens: LensModel) -> Pinhole:
     ):
         along = np.linspace(0.5, other - 0.5, min(other, _BORDER_SAMPLES))
         near, far = (
-            unproject(lens, np.stack([across, along] if axis == 0 else [along, across], -1))
+            lens.unproject(np.stack([across, along] if axis == 0 else [along, across], -1))
             for across in (np.full_like(along, 0.5), np.full_like(along, size - 0.5))
         )
         inner = -focal * near[:, axis].max(), focal * far[:, axis].min()
@@ -105,12 +86,12 @@ def _without_blank_borders(lens: LensModel) -> Pinhole:
     return Pinhole(width, height, params)
 
 
-def _to_photo(lens: LensModel, pinhole: Pinhole, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _to_photo(lens: Lens, pinhole: Pinhole, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(len(y), len(x), 2): positions of undistorted pixels in the photo, in pixels. NaN where the
     lens model is undefined."""
     fx, fy, cx, cy = pinhole.params
     across, down = np.meshgrid((x - cx) / fx, (y - cy) / fy)
-    return project(lens, np.stack([across, down, np.ones_like(across)], -1))
+    return lens.project(np.stack([across, down, np.ones_like(across)], -1))
 
 
 def _shrunk(pinhole: Pinhole, factor: float) -> Pinhole | None:
@@ -123,7 +104,7 @@ def _shrunk(pinhole: Pinhole, factor: float) -> Pinhole | None:
     return Pinhole(width, height, params)
 
 
-def _is_valid(lens: LensModel, pinhole: Pinhole) -> bool:
+def _is_valid(lens: Lens, pinhole: Pinhole) -> bool:
     """Whether every pixel of the undistorted image is in the photo, without folds or gaps."""
     x, y = (np.linspace(0, size, 65) for size in (pinhole.width, pinhole.height))
     source = _to_photo(lens, pinhole, x, y)

@@ -3,7 +3,7 @@
 One view of the same focal length is enough for most lenses. A lens with a field of view of more
 than 120°, and a panorama, become several views, which overlap and look in different directions:
 
-    for view in lens_views(LensModel("FISHEYE", 4000, 4000, (1270, 1270, 2000, 2000))):
+    for view in lens_views(Fisheye(4000, 4000, (1270, 1270, 2000, 2000))):
         view.name, view.rotation                # "front", "left" …; view_from_lens
         pixels = undistort_image(photo, view)   # see `resample`
 """
@@ -18,9 +18,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from snowsplat.data.lens.pinhole import is_pinhole, pinhole_of
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.pinhole import pinhole_of
 from snowsplat.data.lens.positions import Positions, node_grid
-from snowsplat.data.lens.project import LensModel, intrinsics, project
 
 # Radians: a pinhole image of a wider field has too many pixels near its border.
 _WIDEST = math.radians(120.0)
@@ -56,7 +56,7 @@ class LensView:
         cropped: the model is valid only near the centre, so the outer part is cut off.
     """
 
-    lens: LensModel
+    lens: Lens
     name: str
     width: int
     height: int
@@ -69,12 +69,12 @@ class LensView:
     @property
     def is_photo(self) -> bool:
         """Whether the view is the whole photo, as the lens has no distortion."""
-        return self.rotation is None and is_pinhole(self.lens)
+        return self.rotation is None and self.lens.is_pinhole
 
     @property
     def wraps(self) -> bool:
         """Whether the left border of the photo continues at its right border."""
-        return self.lens.model == "EQUIRECTANGULAR"
+        return self.lens.panoramic
 
     def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
         """Rows of this view at the size ``width`` × ``height``, and the positions of their pixels
@@ -92,7 +92,7 @@ class LensView:
             y = (np.arange(*rows.indices(height), dtype=np.float32) + 0.5) * np.float32(
                 self.height / height
             )
-            yield rows, Positions.exact(project(self.lens, self.rays(x, y)))
+            yield rows, Positions.exact(self.lens.project(self.rays(x, y)))
 
     @property
     def _shows_pole(self) -> bool:
@@ -130,12 +130,12 @@ class LensView:
         least, right, bottom = -_POSITION_ERROR, self.lens.width, self.lens.height
         inside = (x >= least) & (x <= right - least) & (y >= least) & (y <= bottom - least)
         if self.circle is not None:
-            _, _, cx, cy, _ = intrinsics(self.lens)
+            _, _, cx, cy = self.lens.intrinsics
             inside &= (x - cx) ** 2 + (y - cy) ** 2 <= self.circle**2
         return inside
 
 
-def pinhole_view(lens: LensModel) -> LensView:
+def pinhole_view(lens: Lens) -> LensView:
     """The only view of a lens that is not wide; raises the errors of `pinhole_of`."""
     pinhole = pinhole_of(lens)
     size = pinhole.width, pinhole.height
@@ -155,7 +155,7 @@ def look(yaw: float, pitch: float) -> np.ndarray:
 
 
 def rotated_view(
-    lens: LensModel,
+    lens: Lens,
     name: str,
     rotation: np.ndarray,
     half_angles: tuple[float, float],
@@ -185,18 +185,18 @@ def rotated_view(
     return dataclasses.replace(view, partial=not view.covered(_positions(view, x, y)).all())
 
 
-def is_wide(lens: LensModel) -> bool:
+def is_wide(lens: Lens) -> bool:
     """Whether a lens may have an image circle within the photo: it is a fisheye.
 
     Also a lens of another model whose field of view is more than 120°.
     """
-    if lens.model == "EQUIRECTANGULAR" or not all(map(math.isfinite, lens.params)):
+    if lens.panoramic or not all(map(math.isfinite, lens.params)):
         return False
-    return "FISHEYE" in lens.model or 2 * float(_field(lens, None).reach.max()) > _WIDEST
+    return lens.angular or 2 * float(_field(lens, None).reach.max()) > _WIDEST
 
 
 @lru_cache(256)
-def lens_views(lens: LensModel, circle: float | None = None) -> tuple[LensView, ...]:
+def lens_views(lens: Lens, circle: float | None = None) -> tuple[LensView, ...]:
     """The pinhole views that show what a lens shows: one, or several of a wide lens.
 
     Args:
@@ -250,13 +250,13 @@ def _directions(angle: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(256)
-def _field(lens: LensModel, circle: float | None) -> _Field:
-    if lens.model == "EQUIRECTANGULAR":
+def _field(lens: Lens, circle: float | None) -> _Field:
+    if lens.panoramic:
         return _Field(math.pi, np.full(_DIRECTIONS, math.pi))
     angle = np.linspace(0, math.pi, _ANGLES + 1)
     turn = np.arange(_DIRECTIONS) * (2 * math.pi / _DIRECTIONS)
-    pixel = project(lens, _directions(np.broadcast_to(angle, (_DIRECTIONS, len(angle))), turn))
-    fx, fy, cx, cy, _ = intrinsics(lens)
+    pixel = lens.project(_directions(np.broadcast_to(angle, (_DIRECTIONS, len(angle))), turn))
+    fx, fy, cx, cy = lens.intrinsics
     radius = np.hypot((pixel[..., 0] - cx) / fx, (pixel[..., 1] - cy) / fy)
     growing = np.diff(radius) > _FOLD * radius[:, 1:2]
     # The first angle at which a direction ends; all directions end there, because a model that
@@ -271,11 +271,11 @@ def _field(lens: LensModel, circle: float | None) -> _Field:
     return _Field(float(angle[limit]), angle[np.clip(last, 0, limit)])
 
 
-def _central_scale(lens: LensModel) -> float:
+def _central_scale(lens: Lens) -> float:
     """Pixels per radian at the centre of a photo; the larger one of both directions."""
     step = 1e-4
     rays = np.array([[step, 0.0, 1.0], [-step, 0.0, 1.0], [0.0, step, 1.0], [0.0, -step, 1.0]])
-    pixel = project(lens, rays)
+    pixel = lens.project(rays)
     scales = np.linalg.norm(pixel[::2] - pixel[1::2], axis=1) / (2 * step)
     scale = float(scales.max())
     if not 1.0 <= scale < 1e9:
@@ -337,11 +337,11 @@ def _share(rays: np.ndarray, turns: Sequence[_Turn], half: float) -> float:
 def _positions(view: LensView, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(len(y), len(x), 2): positions in the photo of pixels of a view; NaN where there are none."""
     rays = view.rays(x, y)
-    position = project(view.lens, rays)
+    position = view.lens.project(rays)
     if view.wraps:
         # Longitudes without a seam in the view, and not negative.
         middle = view.rays(np.array(view.params[2:3]), np.array(view.params[3:]))
-        turn, axis = view.lens.width, project(view.lens, middle)[..., 0]
+        turn, axis = view.lens.width, view.lens.project(middle)[..., 0]
         position[..., 0] = axis + (position[..., 0] - axis + 0.5 * turn) % turn + 0.5 * turn
     elif view.partial:
         limit = _field(view.lens, view.circle).limit

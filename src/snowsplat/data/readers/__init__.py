@@ -14,8 +14,6 @@ import torch
 
 from snowsplat.data.dataset import Points, PosedImage, safe_name
 from snowsplat.data.files.photo_files import warn_of_missing
-from snowsplat.data.lens.pinhole import is_pinhole
-from snowsplat.data.lens.project import intrinsics
 from snowsplat.data.readers import (
     alicevision,
     bundler,
@@ -184,7 +182,7 @@ def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstructi
 def _posed(root: Path, shot: Shot) -> PosedImage:
     lens = shot.lens
     camera = Camera(
-        lens.width, lens.height, *intrinsics(lens)[:4], torch.from_numpy(shot.cam_from_world.copy())
+        lens.width, lens.height, *lens.intrinsics, torch.from_numpy(shot.cam_from_world.copy())
     )
     first, slash, _ = shot.photo.partition("/")
     folder = root / first if slash else root
@@ -196,5 +194,5 @@ def _posed(root: Path, shot: Shot) -> PosedImage:
         depth=shot.depth,
         depth_unit=shot.depth_unit,
         depth_confidence=shot.depth_confidence,
-        lens=None if is_pinhole(lens) else lens,
+        lens=None if lens.is_pinhole else lens,
     )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.data.dataset import usable_points
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
@@ -84,7 +84,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     return found
 
 
-def _lens(where: str, camera: dict[str, Any], version: tuple[float, ...]) -> LensModel:
+def _lens(where: str, camera: dict[str, Any], version: tuple[float, ...]) -> Lens:
     kind = str(camera.get("type", "pinhole")).lower()
     if kind == "pinhole":  # since version 1.2.6, the distortion is apart
         kind = str(camera.get("distortionType", kind)).lower()

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from snowsplat.data.lens.project import BROWN, LensModel
+from snowsplat.data.lens.brown import Brown
+from snowsplat.data.lens.fisheye import Equirectangular, OpenCVFisheye, ThinPrismFisheye
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.perspective import FullOpenCV, OpenCV, Pinhole
 from snowsplat.data.readers.values import damaged, size_of
 
 #: fx, fy, cx, cy in pixels.
@@ -23,7 +26,7 @@ def perspective(
     radial: Sequence[float] = (),
     tangential: Sequence[float] = (0.0, 0.0),
     skew: float = 0.0,
-) -> LensModel:
+) -> Lens:
     """A lens of Brown's model: x (1 + k₁ r² + k₂ r⁴ + k₃ r⁶ + k₄ r⁸), with x = X / Z.
 
     Args:
@@ -38,13 +41,13 @@ def perspective(
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if not any((k1, k2, k3, k4, p1, p2, skew)):
-        return LensModel("PINHOLE", *size, intrinsics)
+        return Pinhole(*size, intrinsics)
     if k4 or skew:
         coefficients = (k1, k2, k3, k4, p1, p2, skew / intrinsics[0])
-        return LensModel(BROWN, *size, (*intrinsics, *coefficients))
+        return Brown(*size, (*intrinsics, *coefficients))
     if k3:
-        return LensModel("FULL_OPENCV", *size, (*intrinsics, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
-    return LensModel("OPENCV", *size, (*intrinsics, k1, k2, p1, p2))
+        return FullOpenCV(*size, (*intrinsics, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    return OpenCV(*size, (*intrinsics, k1, k2, p1, p2))
 
 
 def fisheye(
@@ -54,21 +57,21 @@ def fisheye(
     intrinsics: Intrinsics,
     radial: Sequence[float] = (),
     tangential: Sequence[float] = (0.0, 0.0),
-) -> LensModel:
+) -> Lens:
     """An equidistant lens: θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸); arguments of `perspective`."""
     size = _checked(where, width, height, intrinsics)
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if p1 or p2:
         params = (*intrinsics, k1, k2, p1, p2, k3, k4, 0.0, 0.0)
-        return LensModel("THIN_PRISM_FISHEYE", *size, params)
-    return LensModel("OPENCV_FISHEYE", *size, (*intrinsics, k1, k2, k3, k4))
+        return ThinPrismFisheye(*size, params)
+    return OpenCVFisheye(*size, (*intrinsics, k1, k2, k3, k4))
 
 
-def equirectangular(where: object, width: float, height: float) -> LensModel:
+def equirectangular(where: object, width: float, height: float) -> Lens:
     """A panorama of the whole sphere."""
     size = size_of(where, width, height)
-    return LensModel("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])))
+    return Equirectangular(*size, (float(size[0]), float(size[1])))
 
 
 def centred(width: float, height: float, focal: float) -> Intrinsics:

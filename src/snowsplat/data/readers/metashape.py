@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
@@ -76,13 +76,13 @@ def _read_chunk(
     sensors: dict[str | None, Element] = {
         sensor.get("id"): sensor for sensor in chunk.iter("sensor")
     }
-    lenses: dict[str | None, LensModel] = {}
+    lenses: dict[str | None, Lens] = {}
     worlds = {
         component.get("id"): _similarity(f"{path}: component", component.find("transform"))
         for component in chunk.iter("component")
     }
     whole = _similarity(f"{path}: chunk", chunk.find("transform"))
-    groups: dict[str | None, list[tuple[str, LensModel, np.ndarray]]] = {}
+    groups: dict[str | None, list[tuple[str, Lens, np.ndarray]]] = {}
     found = Reconstruction(total=len(cameras))
     for camera in cameras:
         label = str(camera.get("label"))
@@ -136,7 +136,7 @@ def _similarity(where: str, transform: Element | None) -> tuple[float, np.ndarra
 
 
 def _world(
-    given: tuple[float, np.ndarray] | None, cameras: list[tuple[str, LensModel, np.ndarray]]
+    given: tuple[float, np.ndarray] | None, cameras: list[tuple[str, Lens, np.ndarray]]
 ) -> tuple[float, np.ndarray]:
     """Scale and rigid part of world_from_chunk for training.
 
@@ -168,7 +168,7 @@ def _calibration(sensor: Element) -> Element | None:
     return next(iter(adjusted or calibrations), None)
 
 
-def _lens(where: str, sensor: Element) -> LensModel:
+def _lens(where: str, sensor: Element) -> Lens:
     kind = sensor.get("type", "frame")
     size = sensor.find("resolution")
     if kind == "spherical" and size is not None:

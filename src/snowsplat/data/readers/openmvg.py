@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.data.dataset import usable_points
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
@@ -89,7 +89,7 @@ def _data(where: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     )
 
 
-def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, LensModel]:
+def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, Lens]:
     names: dict[int, str] = {}
     lenses = {}
     for entry in objects(f"{path}: intrinsics", scene.get("intrinsics")):
@@ -105,7 +105,7 @@ def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, LensModel]:
     return lenses
 
 
-def _lens(where: str, kind: str, data: dict[str, Any]) -> LensModel:
+def _lens(where: str, kind: str, data: dict[str, Any]) -> Lens:
     if kind not in _DISTORTION:
         raise UserError(
             "{where}: the camera model {kind} is not supported; export the scene with "

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.data.dataset import usable_points
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
 from snowsplat.data.readers.values import (
@@ -61,7 +61,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             len(shots[largest]),
         )
     cameras = table(f"{path}: cameras", scenes[largest].get("cameras"))
-    lenses: dict[str, LensModel] = {}
+    lenses: dict[str, Lens] = {}
     found = Reconstruction(total=len(shots[largest]))
     for name, entry in shots[largest].items():
         where = f"{path}: shot {quoted(name)}"
@@ -99,7 +99,7 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def _lens(where: str, camera: dict[str, Any]) -> LensModel:
+def _lens(where: str, camera: dict[str, Any]) -> Lens:
     kind = camera.get("projection_type", "perspective")
     width, height = number(where, camera, "width"), number(where, camera, "height")
     if kind in _SPHERICAL:

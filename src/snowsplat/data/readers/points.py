@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.dataset import usable_points
-from snowsplat.data.lens.project import project
 from snowsplat.data.photos.decode import ImageSource, load_thumbnail, read_header
 from snowsplat.data.points_ply import read_points
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
@@ -82,7 +81,7 @@ def _share_seen(xyz: np.ndarray, shots: Sequence[Shot]) -> float:
 def _positions(xyz: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     """The indices (N,) of the points that a photo shows, and where (N, 2), relative to its size."""
     cam = xyz @ shot.cam_from_world[:, :3].T + shot.cam_from_world[:, 3]
-    where = project(shot.lens, cam) / (shot.lens.width, shot.lens.height)
+    where = shot.lens.project(cam) / (shot.lens.width, shot.lens.height)
     seen = ((where >= 0) & (where < 1)).all(1)
     return np.flatnonzero(seen), where[seen]
 

@@ -10,7 +10,7 @@ import numpy as np
 from snowsplat.data.dataset import Points, safe_name
 from snowsplat.data.files.listing import folded
 from snowsplat.data.files.photo_files import photos_below
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
@@ -115,7 +115,7 @@ class Shot:
     """A photo with a pose."""
 
     photo: str  # relative to the root of the `PhotoFolder`
-    lens: LensModel
+    lens: Lens
     cam_from_world: np.ndarray  # (3, 4) float64, OpenCV axes
     depth: Path | None = None
     depth_unit: float = 1.0  # as `PosedImage.depth_unit`

@@ -32,7 +32,6 @@ import torch
 from snowsplat.data.colmap import find_models, read_points
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, warn_of_missing
-from snowsplat.data.lens.pinhole import is_pinhole
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_of
@@ -191,7 +190,7 @@ def _posed_image(
         split,
         depth=_depth_map(root, values.maps[0]),
         depth_unit=number_of(where, values, "integer_depth_scale") or 1.0,
-        lens=None if is_pinhole(lens) else lens,
+        lens=None if lens.is_pinhole else lens,
     )
 
 

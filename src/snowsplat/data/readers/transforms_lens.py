@@ -1,4 +1,4 @@
-"""The lens of a frame of a transforms.json -> `LensModel`.
+"""The lens of a frame of a transforms.json -> `Lens`.
 
 instant-ngp and nerfstudio write the coefficients of OpenCV's models, ``k1`` … ``k6``, ``p1`` and
 ``p2``. In a fisheye, ``k1`` … ``k4`` are the coefficients of the angle. nerfstudio's ``k4`` of
@@ -10,36 +10,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.fisheye import AriaFisheye
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.models import LENSES
+from snowsplat.data.lens.perspective import FullOpenCV
 from snowsplat.data.readers.lenses import Intrinsics, equirectangular, fisheye, perspective
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PERSPECTIVE = frozenset(
-    {
-        "PINHOLE",
-        "SIMPLE_PINHOLE",
-        "PERSPECTIVE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "FULL_OPENCV",
-        "BROWN",
-    }
-)
-_FISHEYE = frozenset(
-    {
-        "FISHEYE",
-        "OPENCV_FISHEYE",
-        "SIMPLE_FISHEYE",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-        "THIN_PRISM_FISHEYE",
-    }
-)
-#: Project Aria's model, in nerfstudio's and in COLMAP's name; it has a list of coefficients.
-_ARIA = ("FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE")
+#: The models that are read, by their names here.
+_MODELS = {
+    name: lens
+    for lens in LENSES.values()
+    if lens.in_transforms is not None
+    for name in (lens.model, *lens.in_transforms)
+}
 _ARIA_COEFFICIENTS = 12
 
 
@@ -51,7 +37,7 @@ def is_panorama(values: Mapping[str, Any]) -> bool:
 
 def lens_of(
     where: str, values: Mapping[str, Any], width: int, height: int, intrinsics: Intrinsics
-) -> LensModel:
+) -> Lens:
     """The lens of a frame.
 
     Args:
@@ -67,10 +53,11 @@ def lens_of(
     model = _model(values)
     if any(key.startswith("ftheta_p") for key in values):
         model = "F-Theta"
-    if model in _ARIA:
+    kind = _MODELS.get(model)
+    if kind is AriaFisheye:
         numbers = _listed(where, values, _ARIA_COEFFICIENTS)
-        return LensModel("RAD_TAN_THIN_PRISM_FISHEYE", width, height, (*intrinsics, *numbers))
-    if model not in _PERSPECTIVE | _FISHEYE:
+        return AriaFisheye(width, height, (*intrinsics, *numbers))
+    if kind is None:
         raise UserError(
             "{where}: the camera model {model} is not known; undistort the photos with the "
             "program that made the file, or make a new dataset: snowsplat sfm PHOTOS -o DATASET",
@@ -85,11 +72,11 @@ def lens_of(
             number_of(where, values, key) or 0.0 for key in _COEFFICIENTS
         )
     radial = (k1, k2, k3, k4)
-    if model in _FISHEYE or values.get("is_fisheye") or values.get("fisheye"):
+    if kind.angular or values.get("is_fisheye") or values.get("fisheye"):
         return fisheye(where, width, height, intrinsics, radial, (p1, p2))
-    if k5 or k6 or (k4 and model == "FULL_OPENCV"):
+    if k5 or k6 or (k4 and kind is FullOpenCV):
         numbers = (k1, k2, p1, p2, k3, k4, k5, k6)
-        return LensModel("FULL_OPENCV", width, height, (*intrinsics, *numbers))
+        return FullOpenCV(width, height, (*intrinsics, *numbers))
     return perspective(where, width, height, intrinsics, radial, (p1, p2))
 
 

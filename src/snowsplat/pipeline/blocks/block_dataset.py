@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, write_model
+from snowsplat.data.colmap import ColmapImage, write_model
 from snowsplat.data.dataset import Points, PosedImage
-from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.project import LensModel
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.perspective import Pinhole
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import Origin, opposite
 
@@ -41,7 +41,7 @@ def write_block_dataset(
     Raises: OSError: a file cannot be written.
     """
     shutil.rmtree(folder, ignore_errors=True)
-    cameras: dict[ColmapCamera, int] = {}
+    cameras: dict[Lens, int] = {}
     images = []
     worst = 0.0
     for image in posed:
@@ -52,11 +52,10 @@ def write_block_dataset(
         camera, lens = image.camera, image.lens
         if lens is None:
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-            lens = LensModel("PINHOLE", camera.width, camera.height, intrinsics)
-        lens, error = as_colmap(lens)
+            lens = Pinhole(camera.width, camera.height, intrinsics)
+        lens, error = lens.as_colmap()
         worst = max(worst, error)
-        colmap = ColmapCamera(lens.model, lens.width, lens.height, lens.params)
-        number = cameras.setdefault(colmap, len(cameras) + 1)
+        number = cameras.setdefault(lens, len(cameras) + 1)
         pose = camera.seen_from(opposite(origin)).cam_from_world
         quat = quat_from_rotation(pose[:, :3]).tolist()
         images.append(ColmapImage(name, number, (*quat, *pose[:, 3].tolist())))

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data import Dataset, View
-from snowsplat.data.colmap import ColmapCamera, ColmapImage, posed_camera, read_model, write_model
+from snowsplat.data.colmap import ColmapImage, posed_camera, read_model, write_model
+from snowsplat.data.lens.perspective import Pinhole
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import opposite
 from snowsplat.util.errors import UserError
@@ -30,12 +31,12 @@ def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
     ``full``: the same dataset, with the photos at their full size.
     """
     sizes = {v.name: (v.camera.width, v.camera.height) for v in [*full.train, *full.test]}
-    numbers: dict[ColmapCamera, int] = {}
+    numbers: dict[Pinhole, int] = {}
     images = []
     for view in views:
         camera = view.camera.scaled(*sizes[view.name])
         params = camera.fx, camera.fy, camera.cx, camera.cy
-        pinhole = ColmapCamera("PINHOLE", camera.width, camera.height, params)
+        pinhole = Pinhole(camera.width, camera.height, params)
         number = numbers.setdefault(pinhole, len(numbers) + 1)
         pose = camera.seen_from(opposite(full.origin)).cam_from_world
         numbers_of_pose = (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist())

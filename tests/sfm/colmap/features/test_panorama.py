@@ -3,14 +3,14 @@
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.lens.project import LensModel, directions
+from snowsplat.data.lens.models import lens_of
 from snowsplat.sfm.colmap.features.panorama import detect_in_panorama
 from snowsplat.sfm.colmap.pairs.matching import match_descriptors
 
 from ....scenes.lenses import Equirectangular
 
 WIDTH = 640
-LENS = LensModel("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (float(WIDTH), WIDTH / 2))
+LENS = lens_of("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (float(WIDTH), WIDTH / 2))
 
 
 def turned(rotation: np.ndarray) -> Image.Image:
@@ -42,8 +42,8 @@ def test_a_turned_panorama_has_the_same_features(tmp_path):
     one, two = (detect_in_panorama(tmp_path / f"{n}.png", None, WIDTH, 3000) for n in "ab")
     matches = match_descriptors(one.descriptors, two.descriptors)
     assert len(matches) > 150
-    rays1 = directions(LENS, one.keypoints[matches[:, 0], :2])
-    rays2 = directions(LENS, two.keypoints[matches[:, 1], :2]) @ rotation.T
+    rays1 = LENS.directions(one.keypoints[matches[:, 0], :2])
+    rays2 = LENS.directions(two.keypoints[matches[:, 1], :2]) @ rotation.T
     angles = np.degrees(np.linalg.norm(rays1 - rays2, axis=1))
     pixel = 360 / WIDTH
     assert np.median(angles) < 0.3 * pixel

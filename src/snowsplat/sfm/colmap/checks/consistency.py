@@ -34,10 +34,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snowsplat.data.lens.project import directions
+from snowsplat.data.lens.models import lens_of
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
 from snowsplat.sfm.colmap.features.extraction import SEED
-from snowsplat.sfm.colmap.lenses.lens import is_fisheye, lens_of, pixels_per_radian
+from snowsplat.sfm.colmap.lenses.lens import is_fisheye, pixels_per_radian
 from snowsplat.sfm.colmap.mapping.view_graph import VerifiedPair, database_names, following_pairs
 from snowsplat.util.components import components
 
@@ -286,7 +286,7 @@ def _rays(camera: pycolmap.Camera, pixels: Floats) -> Floats:
     """
     if not (is_fisheye(camera.model_name) or camera.is_spherical()):
         return np.asarray(camera.cam_from_img(pixels))
-    return directions(lens_of(camera), pixels)
+    return lens_of(camera.model_name, camera.width, camera.height, camera.params).directions(pixels)
 
 
 def _point_ids(image: pycolmap.Image) -> NDArray[np.uint64]:

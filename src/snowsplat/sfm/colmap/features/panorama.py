@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.data.lens.project import LensModel, project
+from snowsplat.data.lens.fisheye import Equirectangular
 from snowsplat.data.lens.resample import resampled
 from snowsplat.data.lens.views import LensView, lens_views
 from snowsplat.sfm.colmap.features.sift import Features, detect_in_grey, read_grey, read_mask
-from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 
 # Radians. Nearer to a pole, an error of the position counts more than four times in the panorama.
 _MAX_LATITUDE = np.radians(76.0)
@@ -30,7 +29,7 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
     grey, (width, height) = read_grey(photo, image_size)
     allowed = None if mask is None else read_mask(mask, grey)
     rows, columns = grey.shape
-    lens = LensModel(PANORAMA_MODEL, columns, rows, (float(columns), float(rows)))
+    lens = Equirectangular(columns, rows, (float(columns), float(rows)))
     parts = []
     for view in lens_views(lens):
         seen = _seen(grey, view)
@@ -87,4 +86,4 @@ def _positions(view: LensView, pixels: NDArray[np.float64]) -> NDArray[np.float6
     """(N, 2) in the panorama, of ``pixels`` (N, 2) of a view."""
     fx, fy, cx, cy = view.params
     rays = np.column_stack([(pixels - (cx, cy)) / (fx, fy), np.ones(len(pixels))])
-    return project(view.lens, rays @ np.array(view.rotation))
+    return view.lens.project(rays @ np.array(view.rotation))

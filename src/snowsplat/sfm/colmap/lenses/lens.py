@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from snowsplat.data.judge.finding import Finding
 from snowsplat.data.judge.lens_check import lens_findings
-from snowsplat.data.lens.project import LensModel
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.ingest.photo import Photo
 
@@ -106,11 +105,6 @@ class Lens:
 def is_fisheye(model: str) -> bool:
     """Whether a camera model of COLMAP measures angles: its pixels may be at 90° to the axis."""
     return model.endswith("FISHEYE")
-
-
-def lens_of(camera: pycolmap.Camera) -> LensModel:
-    """The lens of a camera of COLMAP."""
-    return LensModel(camera.model_name, camera.width, camera.height, tuple(camera.params))
 
 
 def camera_ids(photos: Sequence[Photo]) -> list[int]:
