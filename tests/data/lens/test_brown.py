@@ -52,4 +52,4 @@ def test_r8_is_nearly_a_model_of_colmap(k4):
 def test_the_error_without_the_skew_is_told():
     assert lens(skew=0.01).as_colmap()[1] == pytest.approx(0.01 * 900 * 490 / 905, rel=0.1)
     pinhole = lens_of("PINHOLE", 1280, 960, INTRINSICS)
-    assert as_colmap(pinhole) == (pinhole, 0.0)
+    assert pinhole.as_colmap() == (pinhole, 0.0)

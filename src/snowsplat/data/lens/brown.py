@@ -13,12 +13,10 @@ _SAMPLES = 400  # radii at which a lens is fitted
 _GRID = 33  # pixels of the photo along each side, at which the error is measured
 
 
-class Brown(Perspective):
+class Brown(Perspective, model="BROWN", parameters="fx fy cx cy k1 k2 k3 k4 p1 p2 skew"):
     """With r⁸, and the skew divided by fx; COLMAP has neither."""
 
-    model = "BROWN"
-    parameters = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "skew")
-    in_transforms = ()
+    in_transforms = True
 
     def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         k1, k2, k3, k4, p1, p2, skew = self.coefficients

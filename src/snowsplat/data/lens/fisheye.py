@@ -9,13 +9,11 @@ import numpy as np
 from snowsplat.data.lens.lens import TINY, Image, Lens, tangential
 
 
-class OpenCVFisheye(Lens):
+class OpenCVFisheye(Lens, model="OPENCV_FISHEYE", parameters="fx fy cx cy k1 k2 k3 k4"):
     """θ (1 + k₁ θ² + k₂ θ⁴ + …), Kannala and Brandt 2006; the other fisheyes add to it."""
 
-    model = "OPENCV_FISHEYE"
-    parameters: tuple[str, ...] = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
     angular = True
-    in_transforms = ()
+    in_transforms = True
 
     def image_of(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
         sine = np.hypot(x, y)
@@ -31,34 +29,26 @@ class OpenCVFisheye(Lens):
         return u + u * factor, v + v * factor
 
 
-class RadialFisheye(OpenCVFisheye):
-    model = "RADIAL_FISHEYE"
-    parameters = ("f", "cx", "cy", "k1", "k2")
+class RadialFisheye(OpenCVFisheye, model="RADIAL_FISHEYE", parameters="f cx cy k1 k2"):
+    """Two coefficients."""
 
 
-class SimpleRadialFisheye(OpenCVFisheye):
-    model = "SIMPLE_RADIAL_FISHEYE"
-    parameters = ("f", "cx", "cy", "k1")
+class SimpleRadialFisheye(OpenCVFisheye, model="SIMPLE_RADIAL_FISHEYE", parameters="f cx cy k1"):
+    """One coefficient."""
 
 
-class Fisheye(OpenCVFisheye):
-    model = "FISHEYE"
-    parameters = ("fx", "fy", "cx", "cy")
+class Fisheye(OpenCVFisheye, model="FISHEYE", parameters="fx fy cx cy"):
+    """Equidistant."""
 
 
-class SimpleFisheye(OpenCVFisheye):
-    model = "SIMPLE_FISHEYE"
-    parameters = ("f", "cx", "cy")
+class SimpleFisheye(OpenCVFisheye, model="SIMPLE_FISHEYE", parameters="f cx cy"):
+    """Equidistant, with square pixels."""
 
 
-class ThinPrismFisheye(OpenCVFisheye):
+class ThinPrismFisheye(
+    OpenCVFisheye, model="THIN_PRISM_FISHEYE", parameters="fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2"
+):
     """Weng et al. 1992, on the angle."""
-
-    model = "THIN_PRISM_FISHEYE"
-    parameters = (
-        *("fx", "fy", "cx", "cy"),
-        *("k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2"),
-    )
 
     def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         k1, k2, p1, p2, k3, k4, s1, s2 = self.coefficients
@@ -67,15 +57,13 @@ class ThinPrismFisheye(OpenCVFisheye):
         return u + u * radial + du + s1 * r2, v + v * radial + dv + s2 * r2
 
 
-class AriaFisheye(OpenCVFisheye):
+class AriaFisheye(
+    OpenCVFisheye,
+    model="RAD_TAN_THIN_PRISM_FISHEYE",
+    parameters="fx fy cx cy k1 k2 k3 k4 k5 k6 p0 p1 s0 s1 s2 s3",
+    other_names="FISHEYE624",
+):
     """Fisheye624 of Project Aria: six radial, two tangential and four thin prism coefficients."""
-
-    model = "RAD_TAN_THIN_PRISM_FISHEYE"
-    parameters = (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6"),
-        *("p0", "p1", "s0", "s1", "s2", "s3"),
-    )
-    in_transforms = ("FISHEYE624",)
 
     def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         u, v = super().distorted(u, v, r2)
@@ -85,13 +73,11 @@ class AriaFisheye(OpenCVFisheye):
         return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
 
 
-class Equirectangular(Lens):
+class Equirectangular(Lens, model="EQUIRECTANGULAR", parameters="width height"):
     """A panorama: longitude and latitude. Its parameters are its width and height."""
 
-    model = "EQUIRECTANGULAR"
-    parameters = ("width", "height")
     panoramic = True
-    in_transforms = ()
+    in_transforms = True
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:

@@ -32,10 +32,11 @@ class Lens(ABC):
         model: the name of the model in COLMAP; in capitals, also if COLMAP does not have it.
         parameters: their names, in the order of COLMAP. Models with "f" instead of "fx" and "fy"
             have one focal length. Coefficients are called as in OpenCV.
+        other_names: of the model in transforms.json.
+        in_transforms: transforms.json may have the model.
         angular: a fisheye: the angle to the optical axis is distorted, and not its tangent.
         straight: without coefficients, it is a pinhole camera.
         panoramic: shows all directions; the left border of a photo continues at its right border.
-        in_transforms: other names in transforms.json; None: it is not written there.
     """
 
     width: int
@@ -44,10 +45,19 @@ class Lens(ABC):
 
     model: ClassVar[str]
     parameters: ClassVar[tuple[str, ...]]
+    other_names: ClassVar[tuple[str, ...]] = ()
+    in_transforms: ClassVar[bool] = False
     angular: ClassVar[bool] = False
     straight: ClassVar[bool] = False
     panoramic: ClassVar[bool] = False
-    in_transforms: ClassVar[tuple[str, ...] | None] = None
+
+    def __init_subclass__(
+        cls, model: str = "", parameters: str = "", other_names: str = ""
+    ) -> None:
+        """A model is declared by the arguments of its class, with spaces between names."""
+        if model:
+            cls.model, cls.parameters = model, tuple(parameters.split())
+            cls.other_names = tuple(other_names.split())
 
     @abstractmethod
     def image_of(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:

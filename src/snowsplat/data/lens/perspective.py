@@ -25,12 +25,12 @@ class Perspective(Lens):
         """Where the lens moves the position (u, v), with r² = u² + v²."""
 
 
-class FullOpenCV(Perspective):
+class FullOpenCV(
+    Perspective, model="FULL_OPENCV", parameters="fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"
+):
     """The rational model of OpenCV; the next models have some of its coefficients."""
 
-    model = "FULL_OPENCV"
-    parameters = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    in_transforms = ()
+    in_transforms = True
 
     def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         k1, k2, k3, k4, k5, k6 = self.named("k1", "k2", "k3", "k4", "k5", "k6")
@@ -42,37 +42,29 @@ class FullOpenCV(Perspective):
         return u * factor + du, v * factor + dv
 
 
-class OpenCV(FullOpenCV):
-    model = "OPENCV"
-    parameters = FullOpenCV.parameters[:8]
+class OpenCV(FullOpenCV, model="OPENCV", parameters="fx fy cx cy k1 k2 p1 p2"):
+    """Two radial and two tangential coefficients."""
 
 
-class Radial(FullOpenCV):
-    model = "RADIAL"
-    parameters = ("f", "cx", "cy", "k1", "k2")
+class Radial(FullOpenCV, model="RADIAL", parameters="f cx cy k1 k2"):
+    """Two radial coefficients."""
 
 
-class SimpleRadial(FullOpenCV):
-    model = "SIMPLE_RADIAL"
-    parameters = ("f", "cx", "cy", "k1")
+class SimpleRadial(FullOpenCV, model="SIMPLE_RADIAL", parameters="f cx cy k1"):
+    """One radial coefficient."""
 
 
-class Pinhole(FullOpenCV):
-    model = "PINHOLE"
-    parameters = ("fx", "fy", "cx", "cy")
-    in_transforms = ("PERSPECTIVE",)
+class Pinhole(FullOpenCV, model="PINHOLE", parameters="fx fy cx cy", other_names="PERSPECTIVE"):
+    """No distortion."""
 
 
-class SimplePinhole(FullOpenCV):
-    model = "SIMPLE_PINHOLE"
-    parameters = ("f", "cx", "cy")
+class SimplePinhole(FullOpenCV, model="SIMPLE_PINHOLE", parameters="f cx cy"):
+    """No distortion, and square pixels."""
 
 
-class FieldOfView(Perspective):
+class FieldOfView(Perspective, model="FOV", parameters="fx fy cx cy omega"):
     """Devernay and Faugeras 2001."""
 
-    model = "FOV"
-    parameters = ("fx", "fy", "cx", "cy", "omega")
     straight = False
 
     def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
@@ -84,11 +76,9 @@ class FieldOfView(Perspective):
         return u * factor, v * factor
 
 
-class Division(Lens):
+class Division(Lens, model="DIVISION", parameters="fx fy cx cy k"):
     """Fitzgibbon 2001."""
 
-    model = "DIVISION"
-    parameters = ("fx", "fy", "cx", "cy", "k")
     straight = True
 
     def image_of(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
@@ -98,16 +88,12 @@ class Division(Lens):
         return x / depth, y / depth
 
 
-class SimpleDivision(Division):
-    model = "SIMPLE_DIVISION"
-    parameters = ("f", "cx", "cy", "k")
+class SimpleDivision(Division, model="SIMPLE_DIVISION", parameters="f cx cy k"):
+    """`Division` with square pixels."""
 
 
-class EnhancedUnified(Lens):
+class EnhancedUnified(Lens, model="EUCM", parameters="fx fy cx cy alpha beta"):
     """The enhanced unified camera model; Khomutenko et al. 2016."""
-
-    model = "EUCM"
-    parameters = ("fx", "fy", "cx", "cy", "alpha", "beta")
 
     def image_of(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
         alpha, beta = self.coefficients

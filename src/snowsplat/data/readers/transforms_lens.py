@@ -21,10 +21,7 @@ from snowsplat.util.safe_json import quoted
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: The models that are read, by their names here.
 _MODELS = {
-    name: lens
-    for lens in LENSES.values()
-    if lens.in_transforms is not None
-    for name in (lens.model, *lens.in_transforms)
+    name: lens for lens in LENSES if lens.in_transforms for name in (lens.model, *lens.other_names)
 }
 _ARIA_COEFFICIENTS = 12
 
