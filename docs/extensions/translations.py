@@ -39,9 +39,7 @@ TRANSLATED = (
     "guides/studio.md",
     "guides/training.md",
     "guides/troubleshooting.md",
-    "guides/video.md",
     "guides/viewers.md",
-    "guides/what-you-can-bring.md",
     "learn/*.md",
 )
 #: Pages of `docs/zh/` that are not translations.
