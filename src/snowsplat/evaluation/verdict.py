@@ -101,7 +101,7 @@ class Verdict:
         return [
             str(self.head(what)),
             *(f"  {mark}{why}" for mark, why in zip(marks, self.why(), strict=True)),
-            *(f"  {message('next time: {advice}', advice=advice)}" for advice in self.advice),
+            *("  " + str(message("next time: {advice}", advice=each)) for each in self.advice),
         ]
 
     def html(self, what: Message) -> str:

@@ -11,33 +11,33 @@ from snowsplat.ops.cuda import availability
 from snowsplat.ops.native import get_num_threads, isa
 from snowsplat.util.errors import UserError
 from snowsplat.util.machine import processor_name
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 
 
-def default_device(note: Callable[[str], None] | None = None) -> torch.device:
+def default_device(note: Callable[[Message], None] | None = None) -> torch.device:
     """The GPU, or the CPU if there is no usable GPU.
 
     Args:
-        note: called with a line of text if there is a GPU but it cannot be used.
+        note: called with a message if there is a GPU but it cannot be used.
     """
     index = _current_index()
     why = availability.why_unusable(index)
     if why is None:
         return torch.device("cuda", index)
     if note is not None and availability.has_gpu():
-        note(str(message("the GPU cannot be used: {why}; computing on the CPU", why=why)))
+        note(message("the GPU cannot be used: {why}; computing on the CPU", why=why))
     return torch.device("cpu")
 
 
 def resolve_device(
-    text: str | None = None, note: Callable[[str], None] | None = None
+    text: str | None = None, note: Callable[[Message], None] | None = None
 ) -> torch.device:
     """The device that a user chose: "cpu", "cuda" or "cuda:1"; None: the best available device.
 
     If `text` is None, the environment variable SNOWSPLAT_DEVICE is used.
 
     Args:
-        note: called with a line of text if a GPU cannot be used and no device was requested.
+        note: called with a message if a GPU cannot be used and no device was requested.
 
     Raises:
         UserError: the device is unsupported, missing or cannot be used.
