@@ -115,7 +115,7 @@ def _copy_bandwidth() -> float:
 def _multiply_add_rate() -> float:
     """Multiply-adds per second, by gpu_rate.cu."""
     import torch
-    from gpu_step import RateParams, gpu_times
+    from gpu_step import gpu_times
 
     from snowsplat.ops.cuda import driver, nvrtc
     from snowsplat.ops.cuda.kernels import Kernel
@@ -132,10 +132,10 @@ def _multiply_add_rate() -> float:
     blocks, loops = 64 * card.multi_processor_count, 400
     numbers = torch.tensor([0.999, 0.001], device="cuda")
     out = torch.empty(blocks * threads, device="cuda")
-    kernel = Kernel("gpu_rate", RateParams, threads=threads, items=1)
+    kernel = Kernel("gpu_rate", threads=threads, items=1)
 
     def work() -> None:
-        driver.run(kernel, name, blocks, RateParams(n=loops, numbers=numbers, out=out))
+        driver.run(kernel, name, blocks, {"n": loops, "numbers": numbers, "out": out})
 
     for _ in range(3):
         work()

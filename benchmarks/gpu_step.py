@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from snowsplat.training.settings.rates import LearningRates
 from snowsplat.training.step.batch import BatchView
 from snowsplat.training.step.optim import Adam
 from snowsplat.training.step.step_runner import INITIAL_INSTANCES_PER_GAUSSIAN, StepRunner
-from snowsplat.util.native_layout import Params
+from snowsplat.util.native_layout import Fields
 
 GPU = torch.device("cuda")
 EXTENT = 4.0
@@ -165,13 +165,13 @@ class KernelClock:
         finally:
             LAUNCHERS[device] = before
 
-    def _launch(self, function: str, params: Params) -> int:
-        def marked(kernel: Kernel, name: str, blocks: int, kernel_params: Params) -> None:
+    def _launch(self, function: str, fields: Fields) -> int:
+        def marked(kernel: Kernel, name: str, blocks: int, of_kernel: Fields) -> None:
             before = self._mark()
-            self._execute(kernel, name, blocks, kernel_params)
+            self._execute(kernel, name, blocks, of_kernel)
             self.laps.append((function, name, before, self._mark()))
 
-        return launch_by(marked, function, params)
+        return launch_by(marked, function, fields)
 
 
 def kernel_times(
@@ -197,15 +197,6 @@ def medians(repeats: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[st
 
 
 # ----------------------------------------------------------------------------------------- on a GPU
-
-
-@dataclass(slots=True, kw_only=True)
-class RateParams(Params):
-    """The parameters of gpu_rate.cu."""
-
-    n: int
-    numbers: Tensor
-    out: Tensor
 
 
 def event() -> torch.cuda.Event:

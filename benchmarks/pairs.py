@@ -40,9 +40,9 @@ def frame_of(image: Tensor) -> Any:
 
 def count_steps(frame: Any) -> dict[str, int]:
     """Number of instances, of those visited by blending, and of its vector steps (one pass)."""
-    start, end = _numbers(frame.params.tile_start), _numbers(frame.params.tile_end)
-    bits_each = 8 * frame.params.instance_blocks.numel() // max(1, frame.instances)
-    bits = np.unpackbits(frame.params.instance_blocks.numpy()).reshape(-1, bits_each).sum(axis=1)
+    start, end = _numbers(frame.params["tile_start"]), _numbers(frame.params["tile_end"])
+    bits_each = 8 * frame.params["instance_blocks"].numel() // max(1, frame.instances)
+    bits = np.unpackbits(frame.params["instance_blocks"].numpy()).reshape(-1, bits_each).sum(axis=1)
     before = np.concatenate([[0], np.cumsum(bits)])  # bits beyond a tile's end are undefined
     return {
         "instances": int(frame.instances),
@@ -53,8 +53,8 @@ def count_steps(frame: Any) -> dict[str, int]:
 
 def count_pairs(splats: Splats2D, frame: Any, width: int, height: int) -> int:
     """Number of blended (pixel, splat) pairs, by the definition, from the frame's tile lists."""
-    start, end = _numbers(frame.params.tile_start), _numbers(frame.params.tile_end)
-    splat_of = frame.params.instance_splat.long()
+    start, end = _numbers(frame.params["tile_start"]), _numbers(frame.params["tile_end"])
+    splat_of = frame.params["instance_splat"].long()
     rows = splats.packed.detach()[:, :6]
     tiles_x = -(-width // TILE)
     pairs = 0

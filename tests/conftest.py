@@ -79,11 +79,11 @@ def pytest_sessionstart() -> None:
     """With SNOWSPLAT_NEON, the kernels for Arm replace those of this machine: `make neon`."""
     if os.environ.get("SNOWSPLAT_NEON"):
         from snowsplat.ops.native import LAUNCHERS
-        from snowsplat.util import array_kernels
+        from snowsplat.util import native_library
 
         from .ops import neon
 
-        LAUNCHERS["cpu"] = array_kernels.call = neon.launch
+        LAUNCHERS["cpu"] = native_library.call = neon.launch
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

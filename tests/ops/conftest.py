@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from snowsplat.ops.native import LAUNCHERS
-from snowsplat.util.native_layout import Params
+from snowsplat.util.native_layout import Fields
 
 from .engines import launcher
 from .scenes import (
@@ -41,7 +41,7 @@ def _isa_is_marked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
     if exempt or "recorder" in request.fixturenames:  # the recorder is not a kernel
         return
 
-    def unmarked(name: str, params: Params) -> int:
+    def unmarked(name: str, fields: Fields) -> int:
         pytest.fail(f"runs the kernel {name} of the CPU; mark the test `isa`")
 
     monkeypatch.setitem(LAUNCHERS, "cpu", unmarked)

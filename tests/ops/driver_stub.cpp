@@ -10,7 +10,7 @@ uint64_t recorded_values[4];
 void *recorded_function, *recorded_stream, *recorded_context;
 char recorded_code[4], recorded_name[64];
 int pushed, fail_next;
-uint64_t layout;
+char layout[1024];
 
 static char context, library, kernel, function;
 static void* current;
@@ -32,7 +32,7 @@ int cuLibraryGetKernel(void** found, void*, const char* name) {
   return *found = &kernel, 0;
 }
 int cuLibraryGetGlobal(void** found, size_t* size, void*, const char* name) {
-  *found = std::strstr(name, "_kernel_layout") ? &layout : nullptr;
+  *found = std::strstr(name, "_kernel_fields") ? layout : nullptr;
   return *size = sizeof layout, 0;
 }
 int cuMemcpyDtoH_v2(void* target, const void* source, size_t size) {

@@ -17,12 +17,15 @@ struct RecordParams {
   SNOW_FIELDS(n, out, nothing, first, second, whole, last)
 };
 
-SNOW_ENTRY(record, RecordParams) {
+template <class Params>
+int64_t record_all(const Params& p) {
   const double all[] = {p.first.a,          double(p.first.b), p.second.a,
                         double(p.second.b), double(p.whole),   double(*p.last)};
   for (int64_t i = 0; i < p.n; i++) p.out[i] = all[i];
   return p.nothing ? 0 : (int64_t(1) << 40) + p.n;
 }
+
+SNOW_ENTRY(record, RecordParams) { return record_all(p); }
 
 // As many fields as SNOW_FIELDS takes.
 struct ManyParams {
@@ -36,7 +39,7 @@ struct ManyParams {
 
 SNOW_ENTRY(record_many, ManyParams) { return p.f20 + p.f39; }
 
-// A layout that differs from what Python expects.
+// The same fields in another order.
 struct SwappedParams {
   int64_t n;
   const float* nothing;
@@ -47,6 +50,6 @@ struct SwappedParams {
   SNOW_FIELDS(n, nothing, out, first, second, whole, last)
 };
 
-SNOW_ENTRY(record_swapped, SwappedParams) { return p.n; }
+SNOW_ENTRY(record_swapped, SwappedParams) { return record_all(p); }
 
 SNOW_EXPORT int64_t set_num_threads(int64_t) { return 0; }

@@ -1,20 +1,17 @@
 import functools
 import os
 import subprocess
-import time
-from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import snowsplat
 from snowsplat.ops import native
-from snowsplat.ops.params import SizeQueryParams, SplatsReduceParams
 from snowsplat.util import native_layout as layout
 from snowsplat.util import native_library
 from snowsplat.util.errors import UserError
-from snowsplat.util.native_layout import Params
 
 from .. import fork_server
 
@@ -24,30 +21,10 @@ def fresh(monkeypatch):
     """Resets the loader to the state before the first launch, also after the test."""
     monkeypatch.delenv("SNOWSPLAT_ISA", raising=False)
     monkeypatch.delenv("SNOWSPLAT_THREADS", raising=False)
-    for module, name in (
-        (native_library, "available_isas"),
-        (native_library, "library"),
-        (native, "_library"),
-    ):
-        monkeypatch.setattr(module, name, functools.cache(getattr(module, name).__wrapped__))
-    monkeypatch.setattr(native, "_functions", {})
-
-
-@dataclass(slots=True, kw_only=True)
-class Nested(Params):
-    a: float
-    b: int
-
-
-@dataclass(slots=True, kw_only=True)
-class RecordParams(Params):
-    n: int
-    out: torch.Tensor
-    nothing: torch.Tensor | None
-    first: Nested
-    second: Nested
-    whole: int
-    last: torch.Tensor
+    for name in ("available_isas", "library"):
+        plain = getattr(native_library, name).__wrapped__
+        monkeypatch.setattr(native_library, name, functools.cache(plain))
+    monkeypatch.setattr(native_library, "_functions", {})
 
 
 @pytest.fixture(scope="module")
@@ -67,71 +44,49 @@ def recorder(tmp_path_factory):
 def recording(fresh, recorder, monkeypatch):
     monkeypatch.setattr(native_library, "_LIBRARIES", recorder.parent)
     monkeypatch.setattr(native_library, "_choose", lambda: "recorder")
-    monkeypatch.setattr(native, "ENTRIES", {"record": RecordParams})
 
 
-def record_params(**changes) -> RecordParams:
-    params = RecordParams(
-        n=6,
-        out=torch.zeros(6, dtype=torch.float64),
-        nothing=None,
-        first=Nested(a=0.1, b=-(2**40)),
-        second=Nested(a=-1e300, b=2**62),
-        whole=True,
-        last=torch.tensor([7], dtype=torch.int32),
-    )
-    return replace(params, **changes)
+def record(name: str = "record", **changes) -> int:
+    fields = {
+        "n": 6,
+        "out": torch.zeros(6, dtype=torch.float64),
+        "nothing": None,
+        "first": {"a": 0.1, "b": -(2**40)},
+        "second": {"a": -1e300, "b": 2**62},
+        "whole": True,
+        "last": torch.tensor([7], dtype=torch.int32),
+    }
+    return native.launch(name, **fields | changes)
 
 
-def test_parameters_arrive_in_order_and_at_full_width(recording):
-    params = record_params()
-    assert native.launch("record", params) == 2**40 + 6
-    assert params.out.tolist() == [0.1, -(2.0**40), -1e300, 2.0**62, 1.0, 7.0]
+@pytest.mark.parametrize("name", ["record", "record_swapped"])
+def test_parameters_arrive_by_name_and_at_full_width(recording, name):
+    """Wherever they are in the struct."""
+    out = torch.zeros(6, dtype=torch.float64)
+    assert record(name, out=out) == 2**40 + 6
+    assert out.tolist() == [0.1, -(2.0**40), -1e300, 2.0**62, 1.0, 7.0]
 
 
 def test_torch_parameters_and_n_zero(recording):
-    params = record_params(out=torch.nn.Parameter(torch.zeros(6, dtype=torch.float64)), n=0)
-    assert native.launch("record", params) == 2**40
-    assert params.out.abs().max() == 0
+    out = torch.nn.Parameter(torch.zeros(6, dtype=torch.float64))
+    assert record(out=out, n=0) == 2**40
+    assert out.abs().max() == 0
 
 
-ManyParams = make_dataclass(
-    "ManyParams",
-    [("n", int), *((f"f{i}", int) for i in range(1, 40))],
-    bases=(Params,),
-    slots=True,
-    kw_only=True,
-)
-
-
-def test_a_struct_of_40_fields(recording, monkeypatch):
+def test_a_struct_of_40_fields(recording):
     """The limit of `SNOW_FIELDS`; the largest struct of the operations has half of them."""
-    monkeypatch.setattr(native, "ENTRIES", {"record_many": ManyParams})
-    params = ManyParams(n=0, **{f"f{i}": i for i in range(1, 40)})
-    assert native.launch("record_many", params, device=torch.device("cpu")) == 20 + 39
-
-
-def test_launch_costs_little(recording):
-    params = record_params(n=0)
-
-    def batch() -> float:
-        start = time.thread_time()
-        for _ in range(200):
-            native.launch("record", params)
-        return (time.thread_time() - start) / 200
-
-    assert min(batch() for _ in range(10)) < 30e-6  # 3 µs on an idle machine
+    fields = {"n": 0} | {f"f{i}": i for i in range(1, 40)}
+    assert native.launch("record_many", **fields) == 20 + 39
 
 
 def test_tensors_must_be_contiguous_on_one_device_with_kernels(recording):
     x = torch.zeros(4, 4)
     with pytest.raises(ValueError, match="record: out of shape .4, 4. is not contiguous"):
-        native.launch("record", record_params(out=x.t()))
-    everywhere = record_params(out=x.to("meta"), last=x.to("meta"))
+        record(out=x.t())
     with pytest.raises(UserError, match="no kernels for device meta; use device cpu"):
-        native.launch("record", everywhere)
+        record(out=x.to("meta"), last=x.to("meta"))
     with pytest.raises(ValueError, match="record: last is on meta, other tensors are on cpu"):
-        native.launch("record", record_params(last=x.to("meta")))
+        record(last=x.to("meta"))
 
 
 @pytest.mark.parametrize(
@@ -139,84 +94,38 @@ def test_tensors_must_be_contiguous_on_one_device_with_kernels(recording):
     [
         ({"out": "text"}, "record: out must be a tensor or None, got str"),
         ({"nothing": 3}, "record: nothing must be a tensor or None, got int"),
-        ({"whole": 1.5}, "RecordParams: whole must be an int, got float"),
-        ({"first": Nested(a=None, b=1)}, "RecordParams: first.a must be a float, got NoneType"),
-        ({"whole": 2**64}, "RecordParams: an integer has more than 64 bits"),
+        ({"whole": 1.5}, "record: whole must be an int, got float"),
+        ({"first": {"a": None, "b": 1}}, "record: first.a must be a float, got NoneType"),
+        ({"whole": 2**64}, "record: an integer has more than 64 bits"),
     ],
 )
 def test_fields_have_their_kinds(recording, changes, found):
     with pytest.raises(TypeError, match=f"^{found}$"):
-        native.launch("record", record_params(**changes))
+        record(**changes)
 
 
-def test_a_struct_of_another_function_is_rejected(recording):
-    with pytest.raises(TypeError, match="record takes RecordParams, not Nested"):
-        native.launch("record", Nested(a=1.0, b=2))
+OUTDATED = (
+    r"^the native library for recorder does not match the Python files \(record\); rebuild it"
+)
 
 
-def test_every_field_has_to_be_given():
-    with pytest.raises(TypeError, match="missing 1 required keyword-only argument: 'last'"):
-        RecordParams(n=1, out=None, nothing=None, first=None, second=None, whole=1)
-
-
-# A field is missing, or has another name, kind or offset, or a constant is different.
-@dataclass(slots=True, kw_only=True)
-class Shorter(Params):
-    n: int
-    out: torch.Tensor
-    nothing: torch.Tensor | None
-    first: Nested
-    second: Nested
-    whole: int
-
-
-@dataclass(slots=True, kw_only=True)
-class Renamed(Shorter):
-    final: torch.Tensor
-
-
-@dataclass(slots=True, kw_only=True)
-class OtherKind(Shorter):
-    last: float
-
-
-OUTDATED = "the native library for recorder does not match the Python files"
-
-
-@pytest.mark.parametrize("params", [Shorter, Renamed, OtherKind, Nested])
-def test_another_layout_is_detected_when_the_library_is_loaded(recording, monkeypatch, params):
-    monkeypatch.setattr(native, "ENTRIES", {"record": params})
-    with pytest.raises(UserError, match=rf"^{OUTDATED} \(record\); rebuild it: .*make native"):
-        native.isa()
-
-
-def test_fields_in_another_order_are_detected(recording, monkeypatch):
-    monkeypatch.setattr(native, "ENTRIES", {"record_swapped": RecordParams})
-    with pytest.raises(UserError, match=rf"^{OUTDATED} \(record_swapped\); rebuild it"):
-        native.isa()
+@pytest.mark.parametrize(
+    "changes", [{"more": 1}, {"first": {"a": 1.0}}, {"second": {"a": 1.0, "b": 1, "c": 1}}]
+)
+def test_other_fields_than_those_of_the_struct_are_a_one_line_error(recording, changes):
+    with pytest.raises(UserError, match=f"{OUTDATED}: .*make native"):
+        record(**changes)
 
 
 def test_another_constant_is_detected(recording, monkeypatch):
-    assert native.isa() == "recorder"
-    native._library.cache_clear()
-    monkeypatch.setitem(layout._CONSTANTS, "tile", 32)
-    monkeypatch.setattr(layout, "_layouts", {})
+    monkeypatch.setattr(layout, "_CONSTANTS", layout._CONSTANTS.replace("tile=16", "tile=32"))
     with pytest.raises(UserError, match=OUTDATED):
-        native.isa()
+        record()
 
 
-def reduce_params(slots: torch.Tensor, grad_packed: torch.Tensor) -> SplatsReduceParams:
-    same = dict.fromkeys(("slot_range", "packed", "columns"), slots)
-    return SplatsReduceParams(
-        n=1,
-        slots=slots,
-        **same,
-        stride=1,
-        channels=1,
-        add=False,
-        grad_packed=grad_packed,
-        abs_grad=None,
-    )
+def test_arrays_must_be_contiguous():
+    with pytest.raises(ValueError, match=r"an array of shape \(4, 3\) is not contiguous"):
+        native_library.call_with_arrays("resample", nodes=np.zeros((3, 4)).T)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
@@ -225,12 +134,10 @@ def test_cuda_without_a_gpu_is_an_error_with_the_reason():
         device = torch.device("cuda", 0)
 
     x = torch.empty(3).as_subclass(OnGpu)
-    with pytest.raises(
-        ValueError, match="grad_packed is on cpu, other tensors are on cuda:0; move"
-    ):
-        native.launch("splats_reduce", reduce_params(x, torch.empty(3)))
+    with pytest.raises(ValueError, match="image is on cpu, other tensors are on cuda:0; move"):
+        native.launch("rasterize_fwd", n=1, background=x, image=torch.empty(3))
     with pytest.raises(UserError, match="^cuda:0: (there is no NVIDIA|this PyTorch|PyTorch|the )"):
-        native.launch("splats_reduce", reduce_params(x, x))
+        native.launch("rasterize_fwd", n=1, background=x, image=x)
 
 
 @pytest.mark.isa
@@ -238,7 +145,7 @@ def test_unknown_function_names_the_remedy(fresh):
     with pytest.raises(
         UserError, match=r"does not match the Python files .nonsense.; .*make native"
     ):
-        native.launch("nonsense", SizeQueryParams())
+        native.query_size("nonsense", torch.device("cpu"))
 
 
 def test_missing_library_names_the_remedy(fresh, tmp_path, monkeypatch):
@@ -260,9 +167,8 @@ def test_the_best_isa_is_selected_and_every_available_one_can_be_forced(fresh, m
     for name in native.available_isas():
         monkeypatch.setenv("SNOWSPLAT_ISA", name)
         native_library.library.cache_clear()
-        native._library.cache_clear()
         assert native.isa() == name
-        library = native._library()[1]
+        library = native_library.library()[1]
         assert native.ISAS[library.built_isa()] == name
 
 
@@ -325,7 +231,8 @@ def test_importing_loads_no_library_and_the_environment_reaches_it():
     # In a fork of a process that has only imported all modules.
     code = (
         "import os, snowsplat; from snowsplat.ops import native;"
-        "print(native._library.cache_info().currsize);"
+        "from snowsplat.util.native_library import library;"
+        "print(library.cache_info().currsize);"
         "os.environ['SNOWSPLAT_ISA'] = 'baseline'; print(native.isa(), native.get_num_threads())"
     )
     clean = {k: v for k, v in os.environ.items() if not k.startswith("SNOWSPLAT_")}

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -13,18 +14,8 @@ from torch import Tensor
 
 from snowsplat.ops import native as natives
 from snowsplat.ops.cuda import sorting
-from snowsplat.ops.cuda.kernels import Run
-from snowsplat.ops.cuda.launches import KERNELS
-from snowsplat.ops.params import (
-    SizeQueryParams,
-    SplatsPrepareParams,
-    SplatsReduceParams,
-    SplatsSortParams,
-    TileBinning,
-    TilesCountParams,
-    TilesFillParams,
-)
-from snowsplat.util.native_layout import TILE, Params
+from snowsplat.ops.cuda.kernels import KERNELS, Run
+from snowsplat.util.native_layout import TILE, Fields
 
 from . import emulation
 from .conftest import variants
@@ -52,9 +43,11 @@ def run(request: pytest.FixtureRequest) -> Run:
         pytest.skip("needs a GPU that torch can use")
     execute = emulation.execute if variant.engine == "emulated" else execute_on_gpu
 
-    def queue(name: str, blocks: int, params: Params) -> None:
-        if blocks > 0:
-            execute(KERNELS[name.removesuffix("_f64")], name, blocks, params)
+    def queue(name: str, fields: Fields, blocks: int | None = None) -> None:
+        kernel = KERNELS[name.removesuffix("_f64")]
+        count = kernel.blocks(fields["n"]) if blocks is None else blocks
+        if count > 0:
+            execute(kernel, name, count, fields)
 
     return queue
 
@@ -203,60 +196,55 @@ def bin_splats(
         guarded.append((tensor, size))
         return tensor
 
-    def launch(name: str, params: Params) -> int:
-        return natives.launch(name + suffix, params)
+    def launch(name: str, **fields: Any) -> int:
+        return natives.launch(name + suffix, **fields)
 
     columns = torch.tensor([8, 9, 10, -1])
     key = torch.int32 if native.dtype == torch.float32 else torch.int64
     keys, keys2, order, order2 = empty(m, key), empty(m, key), empty(m), empty(m)
-    records = empty(m * launch("splat_record_bytes", SizeQueryParams()), torch.uint8)
+    records = empty(
+        m * natives.query_size("splat_record_bytes" + suffix, packed.device), torch.uint8
+    )
     launch(
         "splats_prepare",
-        SplatsPrepareParams(
-            n=m,
-            packed=packed,
-            stride=stride,
-            width=width,
-            height=height,
-            columns=columns,
-            records=records,
-            keys=keys,
-        ),
-    )
-    launch("splats_sort", SplatsSortParams(n=m, keys=keys, keys2=keys2, order=order, order2=order2))
-    assert sorted(order[:m].tolist()) == list(range(m))
-    parts = natives.launch("tiles_parts", SizeQueryParams(n=m))
-    query = SizeQueryParams(n=m, tiles=tiles, parts=parts)
-    size = natives.launch("tiles_workspace_bytes", query)
-    workspace, tile_start = torch.empty(size, dtype=torch.uint8), empty(tiles + 1)
-    needed = torch.full((1,), -5)
-    binning = TileBinning(
-        order=order,
+        n=m,
         packed=packed,
         stride=stride,
+        width=width,
+        height=height,
+        columns=columns,
         records=records,
-        tiles_x=tiles_x,
-        tiles_y=tiles_y,
-        parts=parts,
-        workspace=workspace,
-        tile_start=tile_start,
+        keys=keys,
     )
-    count = launch(
-        "tiles_count", TilesCountParams(n=m, binning=binning, capacity=capacity, required=needed)
-    )
+    launch("splats_sort", n=m, keys=keys, keys2=keys2, order=order, order2=order2)
+    assert sorted(order[:m].tolist()) == list(range(m))
+    parts = natives.query_size("tiles_parts", packed.device, m)
+    size = natives.query_size("tiles_workspace_bytes", packed.device, m, tiles, parts)
+    workspace, tile_start = torch.empty(size, dtype=torch.uint8), empty(tiles + 1)
+    needed = torch.full((1,), -5)
+    binning = {
+        "order": order,
+        "packed": packed,
+        "stride": stride,
+        "records": records,
+        "tiles_x": tiles_x,
+        "tiles_y": tiles_y,
+        "parts": parts,
+        "workspace": workspace,
+        "tile_start": tile_start,
+    }
+    count = launch("tiles_count", n=m, binning=binning, capacity=capacity, required=needed)
     if native.engine != "native" and capacity >= 0:
         assert count == capacity
     instance_splat, instance_slot, slot_range = empty(count), empty(count), empty(2 * m)
     launch(
         "tiles_fill",
-        TilesFillParams(
-            n=m,
-            binning=binning,
-            capacity=count,
-            instance_splat=instance_splat,
-            instance_slot=instance_slot if with_slots else None,
-            slot_range=slot_range if with_slots else None,
-        ),
+        n=m,
+        binning=binning,
+        capacity=count,
+        instance_splat=instance_splat,
+        instance_slot=instance_slot if with_slots else None,
+        slot_range=slot_range if with_slots else None,
     )
     for tensor, length in guarded:
         assert (tensor[length:] == 99).all()
@@ -493,18 +481,16 @@ def test_reduce(native: Variant, absolute: bool, count: int, channels: int, add:
     abs_grad = abs_before.to(dtype, copy=True)
     natives.launch(
         f"splats_reduce{suffix}",
-        SplatsReduceParams(
-            n=count,
-            slots=slots.to(dtype),
-            slot_range=torch.stack([starts, ends], dim=1).int(),
-            packed=packed,
-            stride=stride,
-            channels=channels,
-            columns=columns,
-            add=add,
-            grad_packed=grad,
-            abs_grad=abs_grad if absolute else None,
-        ),
+        n=count,
+        slots=slots.to(dtype),
+        slot_range=torch.stack([starts, ends], dim=1).int(),
+        packed=packed,
+        stride=stride,
+        channels=channels,
+        columns=columns,
+        add=add,
+        grad_packed=grad,
+        abs_grad=abs_grad if absolute else None,
     )
     assert (grad[count:] == 99).all()
     wanted = before if add else torch.zeros(count, stride, dtype=torch.float64)

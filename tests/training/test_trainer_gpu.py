@@ -20,7 +20,7 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.step.finite import Diverged
-from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.util.native_layout import Fields
 
 from ..ops.engines import launcher
 from .test_trainer import BUSY, BUSY_MCMC, dataset, every_density_control
@@ -103,14 +103,13 @@ def test_a_step_waits_for_nothing_and_mixes_no_devices(
     """With fake tensors, which have a device but no values: reading one is an error."""
     seen: list[str] = []
 
-    def record(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
-        layout = layout_of(kernel.params)
-        tensors = [layout.values(params)[i] for i in layout.pointers]
-        assert all(tensor.device.type == "cuda" for tensor in tensors if tensor is not None), name
+    def record(kernel: Kernel, name: str, blocks: int, fields: Fields) -> None:
+        tensors = [value for value in fields.values() if isinstance(value, Tensor)]
+        assert all(tensor.device.type == "cuda" for tensor in tensors), name
         seen.append(name)
 
-    def launch(name: str, params: Params) -> int:
-        return launch_by(record, name, params)
+    def launch(name: str, fields: Fields) -> int:
+        return launch_by(record, name, fields)
 
     trainer = Trainer(dataset, replace(config, batch=batch))
     view = trainer.queue.take(0, 1)[0]

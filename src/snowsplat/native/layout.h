@@ -1,16 +1,16 @@
-// The layout of a struct of parameters as one number. Python fills these structs (ops/params.py)
-// and computes the number of its own definition. When it loads a library, it compares the two
-// numbers.
+// The layout of a struct of parameters as a text, from which Python learns how to fill the struct
+// (util/native_layout.py): the structs are defined here only.
 //
 //   struct ExampleParams {
 //     int64_t n;
 //     const float* values;
-//     SNOW_FIELDS(n, values)  // every member, in order
+//     CameraParams<float> camera;
+//     SNOW_FIELDS(n, values, camera)  // every member, in order
 //   };
 //
-// layout_of<ExampleParams>() is a hash of the text "n:i@0;values:p@8;#16": for each field the name,
-// the kind (p: pointer, i: int64_t, d: double, {…}: nested struct) and the offset in bytes, and at
-// the end the size of the struct. The text begins with the constants that Python and C++ share.
+// layout_of<ExampleParams>() is "tile=16;…|n:i;values:p;camera{width:d;…}": the constants that
+// Python and C++ share, then the name and the kind of each field (p: pointer, i: int64_t, d: double,
+// {…}: nested struct). Every field has 8 bytes; the compiler checks that the list is complete.
 #pragma once
 
 #include "portable.h"
@@ -28,57 +28,78 @@ constexpr int kAlignmentRadius = 7;  // of the window of `align_patches`, in pix
 constexpr int kMaxSweepSources = 8;  // of `plane_sweep`
 constexpr int kMaxSweepRadius = 7;   // of the window of `plane_sweep`, in pixels
 
-class LayoutHash {
- public:
-  constexpr void text(const char* characters) {
-    for (; *characters; characters++)
-      value = (value ^ uint64_t(*characters)) * 1099511628211ull;  // FNV-1a
+// A text that ends with a zero, of a struct with `fields` fields.
+template <int Capacity>
+struct LayoutText {
+  char characters[Capacity] = {};
+  int size = 0;
+  int fields = 0;
+  bool is_complete = true;
+
+  constexpr void text(const char* more) {
+    for (; *more; more++) characters[size++] = *more;
   }
-  constexpr void number(int64_t n) {
+  constexpr void number(int n) {
     if (n >= 10) number(n / 10);
-    const char digit[2] = {char('0' + n % 10), 0};
-    text(digit);
+    characters[size++] = char('0' + n % 10);
   }
   constexpr void constant(const char* name, int n) { text(name), text("="), number(n), text(";"); }
-
-  uint64_t value = 14695981039346656037ull;
+  constexpr void field(const char* kind) { text(kind), fields++; }
 };
 
 // The kind of a nested struct; the specialisations are for single fields.
 template <class Field>
 struct FieldKind {
-  static constexpr void describe(LayoutHash& hash) {
-    hash.text("{"), Field::template describe<Field>(hash), hash.text("}");
+  template <class Text>
+  static constexpr void describe(Text& layout) {
+    layout.text("{"), Field::template describe<Field>(layout), layout.text("}");
   }
 };
 template <class Pointee>
 struct FieldKind<Pointee*> {
-  static constexpr void describe(LayoutHash& hash) { hash.text("p"); }
+  template <class Text>
+  static constexpr void describe(Text& layout) {
+    layout.field(":p;");
+  }
 };
 template <>
 struct FieldKind<int64_t> {
-  static constexpr void describe(LayoutHash& hash) { hash.text("i"); }
+  template <class Text>
+  static constexpr void describe(Text& layout) {
+    layout.field(":i;");
+  }
 };
 template <>
 struct FieldKind<double> {
-  static constexpr void describe(LayoutHash& hash) { hash.text("d"); }
+  template <class Text>
+  static constexpr void describe(Text& layout) {
+    layout.field(":d;");
+  }
 };
 
+template <class Params, int Capacity>
+constexpr LayoutText<Capacity> layout_in() {
+  LayoutText<Capacity> layout;
+  layout.constant("tile", kTile);
+  layout.constant("group_channels", kGroupChannels);
+  layout.constant("slot_width", kSlotWidth);
+  layout.constant("packed_header", kPackedHeader);
+  layout.constant("packed_stride", kPackedStride);
+  layout.constant("pose_sums", kPoseSums);
+  layout.constant("max_neighbours", kMaxNeighbours);
+  layout.constant("alignment_radius", kAlignmentRadius);
+  layout.constant("max_sweep_sources", kMaxSweepSources);
+  layout.constant("max_sweep_radius", kMaxSweepRadius);
+  layout.text("|");
+  Params::template describe<Params>(layout);
+  return layout;
+}
+
 template <class Params>
-constexpr uint64_t layout_of() {
-  LayoutHash hash;
-  hash.constant("tile", kTile);
-  hash.constant("group_channels", kGroupChannels);
-  hash.constant("slot_width", kSlotWidth);
-  hash.constant("packed_header", kPackedHeader);
-  hash.constant("packed_stride", kPackedStride);
-  hash.constant("pose_sums", kPoseSums);
-  hash.constant("max_neighbours", kMaxNeighbours);
-  hash.constant("alignment_radius", kAlignmentRadius);
-  hash.constant("max_sweep_sources", kMaxSweepSources);
-  hash.constant("max_sweep_radius", kMaxSweepRadius);
-  Params::template describe<Params>(hash);
-  return hash.value;
+constexpr auto layout_of() {
+  constexpr int kSize = layout_in<Params, 4096>().size;
+  static_assert(layout_in<Params, 4096>().is_complete, "SNOW_FIELDS lists every member, in order");
+  return layout_in<Params, kSize + 1>();
 }
 
 }  // namespace snow
@@ -90,16 +111,17 @@ constexpr uint64_t layout_of() {
 #endif
 
 // Used within a struct: lists its members, in order.
-#define SNOW_FIELDS(...)                                   \
-  template <class Self>                                    \
-  static constexpr void describe(snow::LayoutHash& hash) { \
-    SNOW_FOR_EACH(SNOW_DESCRIBE_FIELD, __VA_ARGS__)        \
-    hash.text("#"), hash.number(int64_t(sizeof(Self)));    \
+#define SNOW_FIELDS(...)                                                     \
+  template <class Self, class Text>                                          \
+  static constexpr void describe(Text& layout) {                             \
+    const int first = layout.fields;                                         \
+    SNOW_FOR_EACH(SNOW_DESCRIBE_FIELD, __VA_ARGS__)                          \
+    layout.is_complete &= sizeof(Self) == 8 * size_t(layout.fields - first); \
   }
-#define SNOW_DESCRIBE_FIELD(NAME)                        \
-  hash.text(#NAME), hash.text(":");                      \
-  snow::FieldKind<decltype(Self::NAME)>::describe(hash); \
-  hash.text("@"), hash.number(int64_t(SNOW_OFFSET_OF(Self, NAME))), hash.text(";");
+#define SNOW_DESCRIBE_FIELD(NAME)                                                        \
+  layout.is_complete &= SNOW_OFFSET_OF(Self, NAME) == 8 * size_t(layout.fields - first); \
+  layout.text(#NAME);                                                                    \
+  snow::FieldKind<decltype(Self::NAME)>::describe(layout);
 
 // MACRO(a) MACRO(b) … for up to 40 arguments.
 #define SNOW_FOR_EACH(MACRO, ...)                                                                  \

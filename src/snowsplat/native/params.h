@@ -1,6 +1,6 @@
-// The parameters of every operation: one struct for each. Python fills the structs by name
-// (ops/params.py) and passes them to the kernels: to a CPU entry by pointer, to a CUDA kernel by
-// value. layout.h describes how the definitions in Python and C++ are compared.
+// The parameters of every operation: one struct for each. Python fills the structs by the names of
+// their fields (ops/native.py; layout.h tells how it knows them) and passes them to the kernels: to a
+// CPU entry by pointer, to a CUDA kernel by value.
 //
 // Every field has 8 bytes. The first field is `n`, the number of items that the operation
 // processes. T is float or double. Pointers marked "or null" are optional. Shapes are row-major.

@@ -11,8 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, check_tensor
-from snowsplat.ops.params import CameraParams, GaussianGradients, GaussianTensors
-from snowsplat.ops.projection import project_vjp, visible_splats
+from snowsplat.ops.gaussian_parameters import PARAMETERS
+from snowsplat.ops.native import Struct
+from snowsplat.ops.projection import pose_gradient, project_vjp, visible_splats
 from snowsplat.ops.splats import COLORS, DEPTHS, MEANS2D, OPACITIES, RADII, Splats2D, packed_width
 from snowsplat.ops.view import View, camera_params
 
@@ -73,7 +74,7 @@ def project_activated(
         view.sh_degree,
         limits,
         camera,
-        camera.cam_from_world,
+        camera["cam_from_world"],
         means,
         scales,
         quats,
@@ -109,7 +110,7 @@ class _ProjectActivated(torch.autograd.Function):
         ctx: Any,
         sh_degree: int,
         limits: tuple[float, float],
-        camera: CameraParams,
+        camera: Struct,
         cam_from_world: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -127,7 +128,7 @@ class _ProjectActivated(torch.autograd.Function):
         ctx.save_for_backward(cam_from_world, means, scales, quats, opacities, colors, ids)
         ctx.gaussians, ctx.camera = gaussians, camera
         # The mip filter multiplies the opacity of a Gaussian.
-        ctx.factors = packed[:, OPACITIES] / opacities[ids] if camera.antialiased else None
+        ctx.factors = packed[:, OPACITIES] / opacities[ids] if camera["antialiased"] else None
         ctx.set_materialize_grads(False)
         return packed, packed[:, MEANS2D], ids
 
@@ -151,21 +152,17 @@ class _ProjectActivated(torch.autograd.Function):
         )
         # Without harmonics, the kernel's gradients of the colours are not used.
         d_dc, d_rest = _harmonics(d_colors) if harmonics else (scratch.empty_like(means), d_colors)
-        d_pose = project_vjp(
+        grads = (d_means, d_log_scales, d_quats, d_logits, d_dc, d_rest)
+        sums = project_vjp(
+            "project_activated",
             ctx.gaussians,
-            replace(ctx.camera, cam_from_world=cam_from_world),
+            ctx.camera | {"cam_from_world": cam_from_world},
             ids,
             grad_packed[:, : packed_width(3)],
-            GaussianGradients(
-                means=d_means,
-                log_scales=d_log_scales,
-                quats=d_quats,
-                opacity_logits=d_logits,
-                sh_dc=d_dc,
-                sh_rest=d_rest,
-            ),
+            dict(zip(PARAMETERS, grads, strict=True)),
             with_pose=ctx.needs_input_grad[3],
         )
+        d_pose = pose_gradient(sums, cam_from_world)
         if not harmonics:
             found = grad_packed[:, COLORS : COLORS + colors.shape[1]]
             d_colors.index_copy_(0, ids.long(), found)
@@ -183,7 +180,7 @@ def _tensors(
     opacities: Tensor,
     colors: Tensor,
     sh_degree: int,
-) -> GaussianTensors:
+) -> Struct:
     """The parameters that the native functions read.
 
     Without harmonics, the constants can be any numbers, because the colours that are computed from
@@ -192,17 +189,17 @@ def _tensors(
     harmonics = colors.dim() == 3
     sh_dc, sh_rest = _harmonics(colors) if harmonics else (means, colors)
     rows = colors.shape[1] if harmonics else 1
-    return GaussianTensors(
-        means=means,
-        log_scales=torch.log(scales, out=scratch.empty_like(scales)),
-        quats=quats,
-        opacity_logits=torch.logit(opacities, out=scratch.empty_like(opacities)),
-        sh_dc=sh_dc,
-        sh_rest=sh_rest,
-        sh_rest_rows=rows,
-        sh_degree=sh_degree if harmonics else 0,
-        sh_dc_rows=rows,
-    )
+    return {
+        "means": means,
+        "log_scales": torch.log(scales, out=scratch.empty_like(scales)),
+        "quats": quats,
+        "opacity_logits": torch.logit(opacities, out=scratch.empty_like(opacities)),
+        "sh_dc": sh_dc,
+        "sh_rest": sh_rest,
+        "sh_rest_rows": rows,
+        "sh_degree": sh_degree if harmonics else 0,
+        "sh_dc_rows": rows,
+    }
 
 
 def _harmonics(colors: Tensor) -> tuple[Tensor, Tensor]:

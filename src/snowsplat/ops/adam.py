@@ -16,7 +16,6 @@ from snowsplat.ops.gaussian_parameters import (
     checked_parameters,
 )
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import AdamStepParams, AdamTensor
 from snowsplat.ops.projection import rows_expected
 from snowsplat.ops.splats import SplatGradient
 from snowsplat.ops.view import View, camera_params
@@ -112,34 +111,32 @@ def adam_step(
             )
     beta1, beta2 = rates.betas
     updated = {
-        name: AdamTensor(
-            value=value.detach(),
-            m=moments.exp_avg[name],
-            v=moments.exp_avg_sq[name],
-            extra=None if value.grad is None else value.grad.contiguous(),
-            rate=float(rates.lr[name]) / (1 - beta1**rates.step),
-        )
+        name: {
+            "value": value.detach(),
+            "m": moments.exp_avg[name],
+            "v": moments.exp_avg_sq[name],
+            "extra": None if value.grad is None else value.grad.contiguous(),
+            "rate": float(rates.lr[name]) / (1 - beta1**rates.step),
+        }
         for name, value in tensors.items()
     }
     done = launch(
         variant("adam_step", means),
-        AdamStepParams(
-            n=len(means),
-            splats=len(ids),
-            ids=ids,
-            grad_packed=grad_packed,
-            camera=camera_params(view, means),
-            sh_rest_rows=tensors["sh_rest"].shape[1],
-            sh_degree=view.sh_degree,
-            **updated,
-            beta1=float(beta1),
-            beta2=float(beta2),
-            inv_correction2=1 / (1 - beta2**rates.step),
-            eps2=float(rates.eps) * float(rates.eps),
-            visible_only=visible_only,
-            valid=valid,
-            nonfinite_rows=nonfinite_rows,
-        ),
+        n=len(means),
+        splats=len(ids),
+        ids=ids,
+        grad_packed=grad_packed,
+        camera=camera_params(view, means),
+        sh_rest_rows=tensors["sh_rest"].shape[1],
+        sh_degree=view.sh_degree,
+        **updated,
+        beta1=float(beta1),
+        beta2=float(beta2),
+        inv_correction2=1 / (1 - beta2**rates.step),
+        eps2=float(rates.eps) * float(rates.eps),
+        visible_only=visible_only,
+        valid=valid,
+        nonfinite_rows=nonfinite_rows,
     )
     if done < 0:
         raise rows_expected(op)

@@ -7,19 +7,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from snowsplat.ops.check import variant
 from snowsplat.ops.gaussian_parameters import (
+    PARAMETERS,
     GaussianParameters,
     checked_parameters,
     gaussian_tensors,
 )
-from snowsplat.ops.native import launch
-from snowsplat.ops.params import GaussianGradients, ProjectBackwardParams, SizeQueryParams
-from snowsplat.ops.projection import pose_gradient, rows_expected
+from snowsplat.ops.projection import pose_gradient, project_vjp
 from snowsplat.ops.splats import SplatGradient
-from snowsplat.ops.sums import sum_of_rows
 from snowsplat.ops.view import View, camera_params
-from snowsplat.util.native_layout import POSE_SUMS
 
 #: In double, (t + _ROUNDING) − _ROUNDING is t rounded to a multiple of 2⁻⁴⁰. Sums of such numbers
 #: below 2¹³ are exact, so they do not depend on the order.
@@ -62,24 +58,19 @@ def camera_gradient(
     means, ids = tensors["means"], gradient.ids
     grad_packed = gradient.checked(op, means)
     camera = camera_params(view, means)
-    blocks = launch("project_pose_blocks", SizeQueryParams(n=len(ids)), device=ids.device)
-    sums = torch.empty(blocks, POSE_SUMS, dtype=torch.float64, device=ids.device)
-    done = launch(
-        variant("project_bwd", means),
-        ProjectBackwardParams(
-            n=len(ids),
-            ids=ids,
-            gaussians=gaussian_tensors(tensors, view.sh_degree),
-            camera=camera,
-            grad_packed=grad_packed,
-            grads=GaussianGradients(),
-            pose=sums,
-            rounding=_ROUNDING,
-        ),
+    total = project_vjp(
+        op,
+        gaussian_tensors(tensors, view.sh_degree),
+        camera,
+        ids,
+        grad_packed,
+        dict.fromkeys(PARAMETERS),
+        with_pose=True,
+        rounding=_ROUNDING,
     )
-    if done < 0:
-        raise rows_expected(op)
-    total = sum_of_rows(sums)
+    assert total is not None
     if over_processes is not None:
         total = over_processes(total)
-    return pose_gradient(total, camera.cam_from_world.double()), total[15]
+    gradient_of_pose = pose_gradient(total, camera["cam_from_world"].double())
+    assert gradient_of_pose is not None
+    return gradient_of_pose, total[15]

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import PointsInFrustaParams
 
 
 @dataclass(frozen=True)
@@ -63,16 +62,14 @@ def points_in_frusta(points: Tensor, frusta: Frusta) -> tuple[Tensor, Tensor]:
     counts, rates = points.new_empty(2, len(points)).unbind()
     launch(
         variant(op, points),
-        PointsInFrustaParams(
-            n=len(points),
-            points=points.detach().contiguous(),
-            views=views,
-            to_image=frusta.to_image.contiguous(),
-            size=frusta.size.contiguous(),
-            depths=frusta.depths.contiguous(),
-            focal=frusta.focal.contiguous(),
-            counts=counts,
-            rates=rates,
-        ),
+        n=len(points),
+        points=points.detach().contiguous(),
+        views=views,
+        to_image=frusta.to_image.contiguous(),
+        size=frusta.size.contiguous(),
+        depths=frusta.depths.contiguous(),
+        focal=frusta.focal.contiguous(),
+        counts=counts,
+        rates=rates,
     )
     return counts, rates

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import FuseDepthParams
 
 
 @torch.no_grad()
@@ -68,19 +67,17 @@ def fuse_depth(
         raise ValueError(f"{op}: truncation must be positive, got {truncation:g}")
     launch(
         variant(op, sums),
-        FuseDepthParams(
-            n=cubes * side**3,
-            side=side,
-            spacing=float(spacing),
-            origins=origins.contiguous(),
-            to_image=to_image.contiguous(),
-            width=width,
-            height=height,
-            depth=depth.contiguous(),
-            weight=weight.contiguous(),
-            channels=channels,
-            image=None if image is None else image.contiguous(),
-            truncation=float(truncation),
-            sums=sums,
-        ),
+        n=cubes * side**3,
+        side=side,
+        spacing=float(spacing),
+        origins=origins.contiguous(),
+        to_image=to_image.contiguous(),
+        width=width,
+        height=height,
+        depth=depth.contiguous(),
+        weight=weight.contiguous(),
+        channels=channels,
+        image=None if image is None else image.contiguous(),
+        truncation=float(truncation),
+        sums=sums,
     )

@@ -8,7 +8,7 @@ from typing import Protocol
 from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_tensor
-from snowsplat.ops.params import GaussianTensors
+from snowsplat.ops.native import Struct
 
 #: Their names, in the order of the native functions.
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
@@ -55,12 +55,8 @@ def check_each(
         check_tensor(op, f"{what}[{name!r}]", given[name], tuple(tensor.shape), tensor)
 
 
-def gaussian_tensors(tensors: Mapping[str, Tensor], sh_degree: int) -> GaussianTensors:
+def gaussian_tensors(tensors: Mapping[str, Tensor], sh_degree: int) -> Struct:
     """The parameters, contiguous, as a parameter of native functions."""
     contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
-    return GaussianTensors(
-        **contiguous,
-        sh_rest_rows=tensors["sh_rest"].shape[1],
-        sh_degree=sh_degree,
-        sh_dc_rows=1,
-    )
+    rows = {"sh_rest_rows": tensors["sh_rest"].shape[1], "sh_degree": sh_degree, "sh_dc_rows": 1}
+    return contiguous | rows

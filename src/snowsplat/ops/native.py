@@ -6,46 +6,33 @@ set. A GPU has the same entries: see `ops/cuda`.
 
 from __future__ import annotations
 
-import ctypes
-import functools
-import threading
 from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from snowsplat.ops import cuda
-from snowsplat.ops.params import ENTRIES
 from snowsplat.util import native_library
 from snowsplat.util.errors import UserError
-from snowsplat.util.native_layout import LARGEST_PARAMS, Params, layout_of
-from snowsplat.util.native_library import ISAS, available_isas, outdated, set_num_threads
-
-# The functions that have been launched, and their structs.
-_functions: dict[str, tuple[Callable[[Any], int], type[Params]]] = {}
-_int = ctypes.c_int64
+from snowsplat.util.native_layout import Fields
+from snowsplat.util.native_library import ISAS, available_isas, set_num_threads
 
 __all__ = [
     "ISAS",
     "LAUNCHERS",
+    "Struct",
     "available_isas",
     "get_num_threads",
     "isa",
     "launch",
+    "query_size",
     "set_num_threads",
 ]
 
 
-@functools.cache
-def _library() -> tuple[str, ctypes.CDLL]:
-    isa, library = native_library.library()
-    native_library.check_layouts(ENTRIES)
-    return isa, library
-
-
 def isa() -> str:
-    """The instruction set of the library in use: "avx512", "avx2" or "baseline" (NEON on Arm)."""
-    return _library()[0]
+    """The instruction set in use: "avx512", "avx2" or "baseline" (NEON on Arm)."""
+    return native_library.library()[0]
 
 
 def get_num_threads() -> int:
@@ -53,81 +40,60 @@ def get_num_threads() -> int:
 
     Initially SNOWSPLAT_THREADS, or else the number of processors that this process may use.
     """
-    return int(_library()[1].get_num_threads())
+    return int(native_library.library()[1].get_num_threads())
 
 
-def _function(name: str) -> tuple[Callable[[Any], int], type[Params]]:
-    isa, library = _library()
-    params = ENTRIES.get(name.removesuffix("_f64"))
-    function = getattr(library, name, None)
-    if params is None or function is None:
-        raise outdated(isa, name)
-    function.restype, function.argtypes = _int, (ctypes.c_void_p,)
-    _functions[name] = function, params
-    return _functions[name]
+#: The fields of a nested struct of `native/params.h`.
+Struct = dict[str, Any]
 
 
-def launch(name: str, params: Params, *, device: torch.device | None = None) -> int:
-    """Calls the native function `name` with a struct of parameters, and returns its int64 result.
+def launch(name: str, /, *, device: torch.device | None = None, **fields: Any) -> int:
+    """Calls the native function `name` with its parameters, and returns its int64 result.
 
-    The tensors of the struct must be contiguous and on one device; the function runs on this
-    device. `device` is needed if there is no tensor. Element types are not checked here: the
-    function for float64 tensors has the suffix `_f64`. On the CPU the interpreter lock is released
-    during the call; on a GPU the call is queued on torch's current stream.
+    `native/params.h` documents the parameters: a tensor or None, a number, or a dict with the
+    fields of a nested struct. The tensors must be contiguous and on one device; the function runs
+    on this device. `device` is needed if there is no tensor. Element types are not checked here:
+    the function for float64 tensors has the suffix `_f64`. On the CPU the interpreter lock is
+    released during the call; on a GPU the call is queued on torch's current stream.
 
-    Raises UserError for a device without kernels; ValueError for tensors that are not contiguous or
-    not on one device; TypeError for the struct of another function or a field of another type.
+    Raises:
+        UserError: a device without kernels, or the library does not have these parameters.
+        ValueError: tensors that are not contiguous or not on one device.
+        TypeError: a parameter of another type.
     """
-    layout = layout_of(type(params))
-    values = layout.values(params)
-    for i in layout.pointers:
-        tensor = values[i]
-        if tensor is None:
+    flat: dict[str, Any] = {}
+    for field, value in fields.items():
+        if isinstance(value, dict):
+            flat.update((f"{field}.{inner}", each) for inner, each in value.items())
+        else:
+            flat[field] = value
+    for field, value in flat.items():
+        if not isinstance(value, torch.Tensor):
             continue
-        if not isinstance(tensor, torch.Tensor):
-            raise TypeError(
-                f"{name}: {layout.names[i]} must be a tensor or None, got {type(tensor).__name__}"
-            )
         if device is None:
-            device = tensor.device
-        elif tensor.device != device:
+            device = value.device
+        elif value.device != device:
             raise ValueError(
-                f"{name}: {layout.names[i]} is on {tensor.device}, other tensors are on {device}; "
+                f"{name}: {field} is on {value.device}, other tensors are on {device}; "
                 "move them to one device"
             )
-        if not tensor.is_contiguous():
-            raise ValueError(
-                f"{name}: {layout.names[i]} of shape {tuple(tensor.shape)} is not contiguous"
-            )
+        if not value.is_contiguous():
+            raise ValueError(f"{name}: {field} of shape {tuple(value.shape)} is not contiguous")
     launcher = LAUNCHERS.get("cpu" if device is None else device.type)
     if launcher is None:
         raise UserError(
             "there are no kernels for device {device}; use device cpu or cuda", device=device
         )
-    return launcher(name, params)
+    return launcher(name, flat)
 
 
-class _Buffer(threading.local):
-    """Memory for the struct of a launch; each thread has its own."""
-
-    def __init__(self) -> None:
-        self.bytes = ctypes.create_string_buffer(LARGEST_PARAMS)
-        self.address = ctypes.addressof(self.bytes)
+def query_size(name: str, device: torch.device, n: int = 0, tiles: int = 0, parts: int = 0) -> int:
+    """The result of a function that returns a size, such as that of a scratch tensor."""
+    return launch(name, device=device, n=n, tiles=tiles, parts=parts)
 
 
-_buffer = _Buffer()
-
-
-def _launch_cpu(name: str, params: Params) -> int:
-    function, expected = _functions.get(name) or _function(name)
-    if type(params) is not expected:
-        raise TypeError(f"{name} takes {expected.__name__}, not {type(params).__name__}")
-    buffer = _buffer
-    layout_of(expected).pack_into(buffer.bytes, params)
-    return function(buffer.address)
-
-
-LAUNCHERS: dict[str, Callable[[str, Params], int]] = {
-    "cpu": _launch_cpu,
+#: For each type of device, calls a function with the fields of its struct; see `native_layout`.
+LAUNCHERS: dict[str, Callable[[str, Fields], int]] = {
+    "cpu": native_library.call,
     "cuda": cuda.launch,
 }

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import NeighboursParams
 from snowsplat.util.native_layout import MAX_NEIGHBOURS
 
 
@@ -31,6 +30,9 @@ def neighbours(points: Tensor, k: int = 3) -> Tensor:
     distances = points.new_empty(len(points), k)
     launch(
         variant("neighbours", points),
-        NeighboursParams(n=len(points), points=points, k=k, distances=distances),
+        n=len(points),
+        points=points,
+        k=k,
+        distances=distances,
     )
     return distances

@@ -11,7 +11,6 @@ from torch.autograd.function import once_differentiable
 from snowsplat.ops import scratch
 from snowsplat.ops.check import check_float, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import PhotometricParams
 
 
 def photometric_loss(
@@ -77,18 +76,16 @@ class _Photometric(torch.autograd.Function):
         channels, height, width = planes.shape
         launch(
             variant(name, planes),
-            PhotometricParams(
-                n=channels,
-                width=width,
-                height=height,
-                image=planes,
-                target=target_planes,
-                l1_weight=weights[0],
-                ssim_weight=weights[1],
-                huber_weight=weights[2],
-                grad=grad,
-                means=means,
-            ),
+            n=channels,
+            width=width,
+            height=height,
+            image=planes,
+            target=target_planes,
+            l1_weight=weights[0],
+            ssim_weight=weights[1],
+            huber_weight=weights[2],
+            grad=grad,
+            means=means,
         )
         ctx.grad = grad
         # Tensors, because reading their values would wait for a GPU. Without Huber, its mean is not

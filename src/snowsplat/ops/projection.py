@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -19,16 +18,7 @@ from snowsplat.ops.gaussian_parameters import (
     checked_parameters,
     gaussian_tensors,
 )
-from snowsplat.ops.native import launch
-from snowsplat.ops.params import (
-    CameraParams,
-    GaussianGradients,
-    GaussianTensors,
-    ProjectBackwardParams,
-    ProjectCullParams,
-    ProjectForwardParams,
-    SizeQueryParams,
-)
+from snowsplat.ops.native import Struct, launch, query_size
 from snowsplat.ops.splats import SplatGradient, Splats2D, packed_width
 from snowsplat.ops.sums import sum_of_rows
 from snowsplat.ops.view import View, camera_params
@@ -60,7 +50,9 @@ def project(gaussians: GaussianParameters, view: View) -> Splats2D:
     """
     tensors = checked_parameters("project", gaussians, view.sh_degree)
     camera = camera_params(view, gaussians.means)
-    packed, ids = _Project.apply(view.sh_degree, camera, camera.cam_from_world, *tensors.values())
+    packed, ids = _Project.apply(
+        view.sh_degree, camera, camera["cam_from_world"], *tensors.values()
+    )
     return Splats2D(packed, ids, 3)
 
 
@@ -87,20 +79,14 @@ def add_project_gradients(
     tensors = checked_parameters(op, gaussians, view.sh_degree)
     check_each(op, "grads", grads, tensors)
     means = tensors["means"]
-    done = launch(
-        variant("project_bwd", means),
-        ProjectBackwardParams(
-            n=len(gradient.ids),
-            ids=gradient.ids,
-            gaussians=gaussian_tensors(tensors, view.sh_degree),
-            camera=camera_params(view, means),
-            grad_packed=gradient.checked(op, means),
-            grads=GaussianGradients(**{name: grads[name] for name in PARAMETERS}),
-            pose=None,
-        ),
+    project_vjp(
+        op,
+        gaussian_tensors(tensors, view.sh_degree),
+        camera_params(view, means),
+        gradient.ids,
+        gradient.checked(op, means),
+        grads,
     )
-    if done < 0:
-        raise rows_expected(op)
 
 
 def rows_expected(op: str) -> ValueError:
@@ -115,7 +101,7 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any,
         sh_degree: int,
-        camera: CameraParams,
+        camera: Struct,
         cam_from_world: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -133,69 +119,76 @@ class _Project(torch.autograd.Function):
         ids, cam_from_world, *parameters = ctx.saved_tensors
         named = dict(zip(PARAMETERS, parameters, strict=True))
         grads = {name: torch.zeros_like(p) for name, p in named.items()}
-        d_pose = project_vjp(
+        sums = project_vjp(
+            "project",
             gaussian_tensors(named, ctx.sh_degree),
-            replace(ctx.camera, cam_from_world=cam_from_world),
+            ctx.camera | {"cam_from_world": cam_from_world},
             ids,
             grad_packed,
-            GaussianGradients(**grads),
+            grads,
             with_pose=ctx.needs_input_grad[2],
         )
-        return None, None, d_pose, *grads.values()
+        return None, None, pose_gradient(sums, cam_from_world), *grads.values()
 
 
-def visible_splats(gaussians: GaussianTensors, camera: CameraParams) -> tuple[Tensor, Tensor]:
+def visible_splats(gaussians: Struct, camera: Struct) -> tuple[Tensor, Tensor]:
     """`packed` (M, 16) and `ids` (M,) of the splats of the visible Gaussians; see `Splats2D`."""
-    means = gaussians.means
+    means = gaussians["means"]
+    inputs = {"gaussians": gaussians, "camera": camera}
     ids = scratch.empty((len(means),), torch.int32, means.device)
-    rows = launch(
-        variant("project_cull", means),
-        ProjectCullParams(n=len(means), gaussians=gaussians, camera=camera, ids=ids),
-    )
+    rows = launch(variant("project_cull", means), n=len(means), ids=ids, **inputs)
     ids = ids[:rows]
     packed = scratch.empty((rows, packed_width(3)), means.dtype, means.device)
-    launch(
-        variant("project_fwd", means),
-        ProjectForwardParams(n=rows, ids=ids, gaussians=gaussians, camera=camera, packed=packed),
-    )
+    launch(variant("project_fwd", means), n=rows, ids=ids, packed=packed, **inputs)
     return packed, ids
 
 
 def project_vjp(
-    gaussians: GaussianTensors,
-    camera: CameraParams,
+    op: str,
+    gaussians: Struct,
+    camera: Struct,
     ids: Tensor,
     grad_packed: Tensor,
-    grads: GaussianGradients,
+    grads: Mapping[str, Tensor | None],
     *,
-    with_pose: bool,
+    with_pose: bool = False,
+    rounding: float = 0.0,
 ) -> Tensor | None:
-    """Adds the gradients of the parameters to `grads`; returns that of the pose (3, 4), or None."""
+    """Adds the gradients of the parameters to `grads`, by name; None: it is not computed.
+
+    Returns the sums (16,) float64 for `pose_gradient`, or None. For `rounding` see
+    `native/params.h`.
+
+    Raises ValueError, which names `op`, if `ids` has the id -1 on the CPU.
+    """
     sums = None
     if with_pose:
-        blocks = launch("project_pose_blocks", SizeQueryParams(n=len(ids)), device=ids.device)
+        blocks = query_size("project_pose_blocks", ids.device, len(ids))
         sums = torch.empty(blocks, POSE_SUMS, dtype=torch.float64, device=ids.device)
-    launch(
-        variant("project_bwd", gaussians.means),
-        ProjectBackwardParams(
-            n=len(ids),
-            ids=ids,
-            gaussians=gaussians,
-            camera=camera,
-            grad_packed=grad_packed.contiguous(),
-            grads=grads,
-            pose=sums,
-        ),
+    done = launch(
+        variant("project_bwd", gaussians["means"]),
+        n=len(ids),
+        ids=ids,
+        gaussians=gaussians,
+        camera=camera,
+        grad_packed=grad_packed.contiguous(),
+        grads={name: grads[name] for name in PARAMETERS},
+        pose=sums,
+        rounding=rounding,
     )
-    return None if sums is None else pose_gradient(sum_of_rows(sums), camera.cam_from_world)
+    if done < 0:
+        raise rows_expected(op)
+    return None if sums is None else sum_of_rows(sums)
 
 
-def pose_gradient(sums: Tensor, cam_from_world: Tensor) -> Tensor:
-    """The gradient (3, 4) of a pose from the kernel's sums.
+def pose_gradient(sums: Tensor | None, cam_from_world: Tensor) -> Tensor | None:
+    """The gradient (3, 4) of a pose from the sums of `project_vjp`; None without them.
 
     ``sums``: (16,): 9 for R, 3 for t, 3 for the centre c = −Rᵀ t. The last one, for the focal
     length, is not used.
     """
+    if sums is None:
+        return None
     d_rotation, d_translation, d_centre = sums[:9].view(3, 3), sums[9:12], sums[12:15]
     rotation, translation = cam_from_world[:, :3].double(), cam_from_world[:, 3].double()
     d_rotation = d_rotation - torch.outer(translation, d_centre)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,22 +13,7 @@ from torch.autograd.function import once_differentiable
 from snowsplat.ops import scratch
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
-from snowsplat.ops.native import launch
-from snowsplat.ops.params import (
-    BackgroundBackwardParams,
-    FrameParams,
-    RasterizeBackwardParams,
-    RasterizeCountParams,
-    RasterizeForwardParams,
-    SizeQueryParams,
-    SplatsPrepareParams,
-    SplatsRecolorParams,
-    SplatsReduceParams,
-    SplatsSortParams,
-    TileBinning,
-    TilesCountParams,
-    TilesFillParams,
-)
+from snowsplat.ops.native import Struct, launch, query_size
 from snowsplat.ops.splats import COLORS, DEPTHS, Splats2D
 from snowsplat.ops.sums import sum_of_rows
 from snowsplat.util.native_layout import GROUP_CHANNELS, SLOT_WIDTH, TILE
@@ -104,7 +89,8 @@ def rasterize_median(splats: Splats2D, width: int, height: int) -> tuple[Tensor,
     frame = _bin_splats(packed, width, height, columns, False, None)
     planes = packed.new_empty(2, channels, height, width)
     alpha = packed.new_empty(height, width)
-    params = RasterizeForwardParams(
+    launch(
+        variant("rasterize_median", packed),
         n=frame.tiles,
         frame=frame.params,
         channels=channels,
@@ -112,7 +98,6 @@ def rasterize_median(splats: Splats2D, width: int, height: int) -> tuple[Tensor,
         image=planes,
         alpha=alpha,
     )
-    launch(variant("rasterize_median", packed), params)
     return planes[0].permute(1, 2, 0), planes[1].permute(1, 2, 0), alpha
 
 
@@ -131,10 +116,7 @@ def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
     columns = _channel_groups(1, False, packed.device)[0][1]
     frame = _bin_splats(packed, width, height, columns, False, None)
     counts = scratch.empty((height, width), packed.dtype, packed.device)
-    launch(
-        variant("rasterize_count", packed),
-        RasterizeCountParams(n=frame.tiles, frame=frame.params, counts=counts),
-    )
+    launch(variant("rasterize_count", packed), n=frame.tiles, frame=frame.params, counts=counts)
     return counts
 
 
@@ -142,7 +124,7 @@ def count_blended(splats: Splats2D, width: int, height: int) -> Tensor:
 class _Frame:
     """The splats of a frame, sorted into tiles: the input of the forward and the backward pass."""
 
-    params: FrameParams
+    params: Struct  # FrameParams in `native/params.h`
     tiles: int
     instances: int
     """Number of instances for which memory is allocated."""
@@ -172,62 +154,59 @@ def _bin_splats(
     def empty(size: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return scratch.empty((size,), dtype, device)
 
-    def query(name: str, n: int = 0, tiles: int = 0, parts: int = 0) -> int:
-        return launch(name, SizeQueryParams(n=n, tiles=tiles, parts=parts), device=device)
-
-    records = empty(n * query(variant("splat_record_bytes", packed)), torch.uint8)
+    records = empty(n * query_size(variant("splat_record_bytes", packed), device), torch.uint8)
     order = _sort_by_depth(packed, width, height, columns, records)
 
-    parts = query("tiles_parts", n)
-    binning = TileBinning(
-        order=order,
-        packed=packed,
-        stride=stride,
-        records=records,
-        tiles_x=tiles_x,
-        tiles_y=tiles_y,
-        parts=parts,
-        workspace=empty(query("tiles_workspace_bytes", n, tiles, parts), torch.uint8),
-        tile_start=empty(tiles + 1),
-    )
+    parts = query_size("tiles_parts", device, n)
+    workspace_bytes = query_size("tiles_workspace_bytes", device, n, tiles, parts)
+    binning = {
+        "order": order,
+        "packed": packed,
+        "stride": stride,
+        "records": records,
+        "tiles_x": tiles_x,
+        "tiles_y": tiles_y,
+        "parts": parts,
+        "workspace": empty(workspace_bytes, torch.uint8),
+        "tile_start": empty(tiles + 1),
+    }
     capacity = capacity or Capacity(-1, torch.empty(1, dtype=torch.int64, device=device))
     instances = launch(
         variant("tiles_count", packed),
-        TilesCountParams(
-            n=n, binning=binning, capacity=capacity.instances, required=capacity.required
-        ),
+        n=n,
+        binning=binning,
+        capacity=capacity.instances,
+        required=capacity.required,
     )
 
-    has_slots = query("rasterize_has_slots") == 1
+    has_slots = query_size("rasterize_has_slots", device) == 1
     instance_splat = empty(instances)
     instance_slot = empty(instances) if has_slots else None
     slot_range = empty(2 * n) if has_slots else None
     launch(
         variant("tiles_fill", packed),
-        TilesFillParams(
-            n=n,
-            binning=binning,
-            capacity=instances,
-            instance_splat=instance_splat,
-            instance_slot=instance_slot,
-            slot_range=slot_range,
-        ),
+        n=n,
+        binning=binning,
+        capacity=instances,
+        instance_splat=instance_splat,
+        instance_slot=instance_slot,
+        slot_range=slot_range,
     )
 
-    block_bytes = query(variant("rasterize_block_bytes", packed))
-    params = FrameParams(
-        width=width,
-        height=height,
-        packed=packed,
-        stride=stride,
-        columns=columns,
-        records=records,
-        tile_start=binning.tile_start,
-        tile_end=empty(tiles),
-        instance_splat=instance_splat,
-        instance_blocks=empty(instances * block_bytes, torch.uint8),
-        additive=additive,
-    )
+    block_bytes = query_size(variant("rasterize_block_bytes", packed), device)
+    params = {
+        "width": width,
+        "height": height,
+        "packed": packed,
+        "stride": stride,
+        "columns": columns,
+        "records": records,
+        "tile_start": binning["tile_start"],
+        "tile_end": empty(tiles),
+        "instance_splat": instance_splat,
+        "instance_blocks": empty(instances * block_bytes, torch.uint8),
+        "additive": additive,
+    }
     return _Frame(params, tiles, instances, instance_slot, slot_range)
 
 
@@ -241,36 +220,27 @@ def _sort_by_depth(
     order, order2 = (scratch.empty((n,), torch.int32, packed.device) for _ in range(2))
     launch(
         variant("splats_prepare", packed),
-        SplatsPrepareParams(
-            n=n,
-            packed=packed,
-            stride=stride,
-            width=width,
-            height=height,
-            columns=columns,
-            records=records,
-            keys=keys,
-        ),
+        n=n,
+        packed=packed,
+        stride=stride,
+        width=width,
+        height=height,
+        columns=columns,
+        records=records,
+        keys=keys,
     )
-    launch(
-        variant("splats_sort", packed),
-        SplatsSortParams(n=n, keys=keys, keys2=keys2, order=order, order2=order2),
-    )
+    launch(variant("splats_sort", packed), n=n, keys=keys, keys2=keys2, order=order, order2=order2)
     return order
 
 
-def _with_channels(frame: _Frame, columns: Tensor) -> FrameParams:
+def _with_channels(frame: _Frame, columns: Tensor) -> Struct:
     """The frame with other columns as its channels."""
-    params = frame.params = replace(frame.params, columns=columns)
+    params = frame.params = frame.params | {"columns": columns}
     launch(
-        variant("splats_recolor", params.packed),
-        SplatsRecolorParams(
-            n=len(params.packed),
-            packed=params.packed,
-            stride=params.stride,
-            columns=columns,
-            records=params.records,
-        ),
+        variant("splats_recolor", params["packed"]),
+        n=len(params["packed"]),
+        columns=columns,
+        **{name: params[name] for name in ("packed", "stride", "records")},
     )
     return params
 
@@ -314,14 +284,12 @@ class _Rasterize(torch.autograd.Function):
         for first, columns in groups:
             launch(
                 variant("rasterize_fwd", packed),
-                RasterizeForwardParams(
-                    n=frame.tiles,
-                    frame=frame.params if first == 0 else _with_channels(frame, columns),
-                    channels=min(GROUP_CHANNELS, count - first),
-                    background=background[first:],
-                    image=planes[first:],
-                    alpha=alpha if first == 0 else None,
-                ),
+                n=frame.tiles,
+                frame=frame.params if first == 0 else _with_channels(frame, columns),
+                channels=min(GROUP_CHANNELS, count - first),
+                background=background[first:],
+                image=planes[first:],
+                alpha=alpha if first == 0 else None,
             )
         ctx.save_for_backward(planes, alpha)
         ctx.frame, ctx.groups, ctx.channels = frame, groups, channels
@@ -338,7 +306,7 @@ class _Rasterize(torch.autograd.Function):
         if grad_planes is None:
             grad_planes = torch.zeros_like(planes)
         grad_planes = grad_planes.contiguous()
-        if ctx.frame.params.additive:
+        if ctx.frame.params["additive"]:
             grad_alpha = None  # alpha is always 0
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
         grad_packed = _grad_packed(
@@ -364,7 +332,7 @@ def _grad_packed(
     The CPU adds the gradients of a few tiles at a time, in a fixed order. A GPU adds them
     atomically. If their order must be fixed, it needs memory for all instances: the slots.
     """
-    packed, stride = frame.params.packed, frame.params.stride
+    packed, stride = frame.params["packed"], frame.params["stride"]
     grad_packed = scratch.empty_like(packed)
     slots = None
     if frame.slot_range is not None:
@@ -375,35 +343,31 @@ def _grad_packed(
         channels = min(GROUP_CHANNELS, len(planes) - first)
         launch(
             variant("rasterize_bwd", packed),
-            RasterizeBackwardParams(
-                n=frame.tiles,
-                frame=frame.params if len(groups) == 1 else _with_channels(frame, columns),
-                channels=channels,
-                instance_slot=frame.instance_slot,
-                image=planes[first:],
-                grad_image=grad_planes[first:],
-                alpha=alpha,
-                grad_alpha=grad_alpha if first == 0 else None,
-                slots=slots,
-                grad_packed=grad_packed,
-                abs_grad=abs_grad,
-            ),
+            n=frame.tiles,
+            frame=frame.params if len(groups) == 1 else _with_channels(frame, columns),
+            channels=channels,
+            instance_slot=frame.instance_slot,
+            image=planes[first:],
+            grad_image=grad_planes[first:],
+            alpha=alpha,
+            grad_alpha=grad_alpha if first == 0 else None,
+            slots=slots,
+            grad_packed=grad_packed,
+            abs_grad=abs_grad,
         )
         if slots is not None and frame.slot_range is not None:
             launch(
                 variant("splats_reduce", packed),
-                SplatsReduceParams(
-                    n=len(packed),
-                    slots=slots,
-                    slot_range=frame.slot_range,
-                    packed=packed,
-                    stride=stride,
-                    channels=channels,
-                    columns=columns,
-                    add=first > 0,
-                    grad_packed=grad_packed,
-                    abs_grad=abs_grad,
-                ),
+                n=len(packed),
+                slots=slots,
+                slot_range=frame.slot_range,
+                packed=packed,
+                stride=stride,
+                channels=channels,
+                columns=columns,
+                add=first > 0,
+                grad_packed=grad_packed,
+                abs_grad=abs_grad,
             )
     return grad_packed
 
@@ -414,13 +378,11 @@ def _grad_background(grad_image: Tensor, alpha: Tensor) -> Tensor:
     rows = torch.empty(height, channels, dtype=torch.float64, device=alpha.device)
     launch(
         variant("background_bwd", alpha),
-        BackgroundBackwardParams(
-            n=height,
-            width=width,
-            channels=channels,
-            grad_image=grad_image.contiguous(),
-            alpha=alpha,
-            rows=rows,
-        ),
+        n=height,
+        width=width,
+        channels=channels,
+        grad_image=grad_image.contiguous(),
+        alpha=alpha,
+        rows=rows,
     )
     return sum_of_rows(rows).to(alpha.dtype)

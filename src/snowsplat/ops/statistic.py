@@ -7,7 +7,6 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import ScreenStatisticsParams
 from snowsplat.ops.splats import Splats2D
 
 
@@ -49,18 +48,16 @@ def accumulate_screen_statistics(
         check_tensor(op, "max_radii", max_radii, (len(norm_sum),), packed)
     launch(
         variant(op, packed),
-        ScreenStatisticsParams(
-            n=len(packed),
-            ids=ids,
-            packed=packed.detach().contiguous(),
-            stride=packed.shape[1],
-            grad_means=grad.contiguous(),
-            grad_stride=grad.shape[1],
-            width=float(width),
-            height=float(height),
-            norm_sum=norm_sum,
-            views=views,
-            max_radii=max_radii,
-            valid=valid,
-        ),
+        n=len(packed),
+        ids=ids,
+        packed=packed.detach().contiguous(),
+        stride=packed.shape[1],
+        grad_means=grad.contiguous(),
+        grad_stride=grad.shape[1],
+        width=float(width),
+        height=float(height),
+        norm_sum=norm_sum,
+        views=views,
+        max_radii=max_radii,
+        valid=valid,
     )

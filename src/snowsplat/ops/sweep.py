@@ -9,7 +9,6 @@ from torch import Tensor
 
 from snowsplat.ops.check import check_float, check_size, check_tensor, variant
 from snowsplat.ops.native import launch
-from snowsplat.ops.params import PlaneSweepParams
 from snowsplat.util.native_layout import MAX_SWEEP_RADIUS, MAX_SWEEP_SOURCES
 
 
@@ -91,22 +90,20 @@ def plane_sweep(
     inverse_depth, score = image.new_empty(height, width), image.new_empty(height, width)
     launch(
         variant(op, image),
-        PlaneSweepParams(
-            n=count,
-            width=width,
-            height=height,
-            source_width=source_width,
-            source_height=source_height,
-            image=image.contiguous(),
-            sources=sources.contiguous(),
-            source_from_pixel=source_from_pixel.contiguous(),
-            centre=centre,
-            first=float(low),
-            step=(high - low) / (planes - 1),
-            planes=planes,
-            radius=radius,
-            inverse_depth=inverse_depth,
-            score=score,
-        ),
+        n=count,
+        width=width,
+        height=height,
+        source_width=source_width,
+        source_height=source_height,
+        image=image.contiguous(),
+        sources=sources.contiguous(),
+        source_from_pixel=source_from_pixel.contiguous(),
+        centre=centre,
+        first=float(low),
+        step=(high - low) / (planes - 1),
+        planes=planes,
+        radius=radius,
+        inverse_depth=inverse_depth,
+        score=score,
     )
     return inverse_depth, score

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from snowsplat.ops.check import check_size
-from snowsplat.ops.params import CameraParams
+from snowsplat.ops.native import Struct
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,17 +62,9 @@ class View:
             raise ValueError(f"View: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}")
 
 
-def camera_params(view: View, like: Tensor) -> CameraParams:
+def camera_params(view: View, like: Tensor) -> Struct:
     """The camera as a parameter of native functions, its pose in the dtype of `like`."""
     pose = view.cam_from_world.to(like.device, like.dtype, non_blocking=True)
-    return CameraParams(
-        cam_from_world=pose.contiguous(),
-        width=float(view.width),
-        height=float(view.height),
-        fx=float(view.fx),
-        fy=float(view.fy),
-        cx=float(view.cx),
-        cy=float(view.cy),
-        near=float(view.near),
-        antialiased=view.antialiased,
-    )
+    names = ("width", "height", "fx", "fy", "cx", "cy", "near")
+    numbers = {name: float(getattr(view, name)) for name in names}
+    return {"cam_from_world": pose.contiguous(), **numbers, "antialiased": view.antialiased}

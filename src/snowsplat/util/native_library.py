@@ -14,15 +14,16 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.util.errors import UserError
 from snowsplat.util.machine import processor_count
-from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.util.native_layout import LARGEST_STRUCT, Fields, Layout, Mismatch
 
 # Worst to best. The index of a name is its number in native/cpu/isa.cpp.
 ISAS = ("baseline", "avx2", "avx512")
@@ -30,20 +31,6 @@ ISAS = ("baseline", "avx2", "avx512")
 _LIBRARIES = Path(__file__).resolve().parent.parent / "_lib"
 _SUFFIX = ".dll" if sys.platform == "win32" else ".so"  # on macOS, too
 _lock = threading.RLock()
-
-
-class ArrayPointer:
-    """A NumPy array as a pointer in a struct of parameters, which otherwise are tensors."""
-
-    __slots__ = ("array",)
-
-    def __init__(self, array: NDArray[Any]) -> None:
-        if not array.flags.c_contiguous:
-            raise ValueError(f"an array of shape {array.shape} is not contiguous")
-        self.array = array
-
-    def data_ptr(self) -> int:
-        return int(self.array.ctypes.data)
 
 
 def _path(isa: str) -> Path:
@@ -99,7 +86,7 @@ def _choose() -> str:
 
 @functools.cache
 def library() -> tuple[str, ctypes.CDLL]:
-    """The instruction set in use, and its library. The structs must be checked before a call.
+    """The instruction set in use, and its library.
 
     Raises UserError if the library is missing, or SNOWSPLAT_ISA or SNOWSPLAT_THREADS is invalid.
     """
@@ -110,30 +97,87 @@ def library() -> tuple[str, ctypes.CDLL]:
         return isa, found
 
 
-def check_layouts(entries: Mapping[str, type[Params]]) -> None:
-    """Raises UserError unless the library has these entries, with the structs of Python."""
-    isa, found = library()
-    for entry, params in entries.items():
-        for name in (entry, entry + "_f64"):
-            try:
-                layout = getattr(found, name + "_layout")
-            except AttributeError:
-                if name != entry:
-                    continue  # has no variant for float64
-                raise outdated(isa, name) from None
-            layout.restype = ctypes.c_uint64
-            if layout() != layout_of(params).hash:
-                raise outdated(isa, name)
+class _Function(NamedTuple):
+    call: Callable[[int], int]
+    layout: Layout
 
 
-def outdated(isa: str, name: str) -> UserError:
-    """The error for a library that does not match the Python files."""
-    return UserError(
-        "the native library for {isa} does not match the Python files ({name}); rebuild it: "
-        "`make native` in a checkout, `pip install .` elsewhere",
-        isa=isa,
-        name=name,
+class _Buffer(threading.local):
+    """Memory for the struct of a call; each thread has its own."""
+
+    def __init__(self) -> None:
+        self.bytes = ctypes.create_string_buffer(LARGEST_STRUCT)
+        self.address = ctypes.addressof(self.bytes)
+
+
+_functions: dict[str, _Function] = {}  # those that have been called
+_buffer = _Buffer()
+
+
+def call(name: str, fields: Fields) -> int:
+    """Call a function with the parameters `fields`; C++ does not check their values.
+
+    Tensors, and other objects with `data_ptr`, must be contiguous, and in the memory of the CPU.
+
+    Raises:
+        UserError: as `library`; or the library does not match the Python files.
+        TypeError: a field of the wrong type.
+    """
+    buffer = _buffer
+    try:
+        function = _functions.get(name) or _function(name)
+        function.layout.pack_into(buffer.bytes, name, fields)
+    except Mismatch:
+        raise UserError(
+            "the native library for {library} does not match the Python files ({name}); rebuild "
+            "it: `make native` in a checkout, `pip install .` elsewhere",
+            library=library()[0],
+            name=name,
+        ) from None
+    return function.call(buffer.address)
+
+
+def call_with_arrays(name: str, **fields: NDArray[Any] | float | None) -> int:
+    """`call` with NumPy arrays, for programs that do not import torch.
+
+    Raises ValueError if an array is not contiguous.
+    """
+    return call(
+        name,
+        {
+            field: _ArrayPointer(value) if isinstance(value, np.ndarray) else value
+            for field, value in fields.items()
+        },
     )
+
+
+class _ArrayPointer:
+    __slots__ = ("array",)
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        if not array.flags.c_contiguous:
+            raise ValueError(f"an array of shape {array.shape} is not contiguous")
+        self.array = array
+
+    def data_ptr(self) -> int:
+        return int(self.array.ctypes.data)
+
+
+def layout_of(name: str) -> Layout:
+    """The layout of the struct of a function. Raises: Mismatch: the library does not have it."""
+    return (_functions.get(name) or _function(name)).layout
+
+
+def _function(name: str) -> _Function:
+    try:
+        describe = getattr(library()[1], f"{name}_fields")
+        function = getattr(library()[1], name)
+    except AttributeError:
+        raise Mismatch(f"no {name}") from None
+    describe.restype = ctypes.c_char_p
+    function.restype, function.argtypes = ctypes.c_int64, (ctypes.c_void_p,)
+    _functions[name] = _Function(function, Layout(describe().decode()))
+    return _functions[name]
 
 
 def set_num_threads(threads: int) -> None:

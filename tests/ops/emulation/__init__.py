@@ -15,9 +15,11 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+
 from snowsplat.ops.cuda import nvrtc
 from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.util.native_layout import Fields, Layout
 
 _HERE = Path(__file__).parent
 _ROOT = _HERE.parents[2]
@@ -69,26 +71,23 @@ def library(file: str, float64: bool) -> ctypes.CDLL:
     return loaded
 
 
-def execute(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
+def execute(kernel: Kernel, name: str, blocks: int, fields: Fields) -> None:
     """Runs a kernel on CPU tensors until it ends.
 
     Raises:
         RuntimeError: a divergent barrier, or another fault that the emulation detects.
-        AssertionError: threads or parameters do not match the kernel.
+        AssertionError: threads do not match the kernel.
     """
     loaded = library(kernel.file, name.endswith("_f64"))
     built = getattr(loaded, f"{name}_threads")()
     assert built == kernel.threads, f"{name} has {built} threads, its Kernel says {kernel.threads}"
-    layout = layout_of(kernel.params)
-    find_layout = getattr(loaded, f"{name}_layout")
-    find_layout.restype = ctypes.c_uint64
-    assert find_layout() == layout.hash, f"{name} does not take {layout.name}"
-    assert type(params) is kernel.params, f"{name} takes {layout.name}, got {type(params).__name__}"
-    for i in layout.pointers:
-        tensor = layout.values(params)[i]
-        assert tensor is None or tensor.device.type == "cpu"
+    describe = getattr(loaded, f"{name}_fields")
+    describe.restype = ctypes.c_char_p
+    layout = Layout(describe().decode())
+    for value in fields.values():
+        assert not isinstance(value, torch.Tensor) or value.device.type == "cpu"
     struct = ctypes.create_string_buffer(layout.size)
-    layout.pack_into(struct, params)
+    layout.pack_into(struct, name, fields)
     pointers = (ctypes.c_void_p * 1)(ctypes.addressof(struct))
     call = getattr(loaded, f"{name}_call")
     wrong = loaded.emulate(call, ctypes.c_int64(blocks), ctypes.c_int64(kernel.threads), pointers)

@@ -108,16 +108,19 @@ constexpr bool is_built(const char (&name)[kLength]) {
 
 #define SNOW_EMULATION_EXPORT extern "C" __attribute__((visibility("default")))
 // A kernel is called with pointers to its parameters, as by the driver of a GPU; there is one.
-#define SNOW_KERNEL(NAME, THREADS, ...)                                                     \
-  static void NAME(const __VA_ARGS__& p);                                                   \
-  SNOW_EMULATION_EXPORT void NAME##_call(void** parameters) {                               \
-    if constexpr (emulation::is_built(#NAME))                                               \
-      NAME(*static_cast<const __VA_ARGS__*>(parameters[0]));                                \
-    else                                                                                    \
-      __builtin_trap();                                                                     \
-  }                                                                                         \
-  SNOW_EMULATION_EXPORT int NAME##_threads() { return THREADS; }                            \
-  SNOW_EMULATION_EXPORT uint64_t NAME##_layout() { return snow::layout_of<__VA_ARGS__>(); } \
+#define SNOW_KERNEL(NAME, THREADS, ...)                            \
+  static void NAME(const __VA_ARGS__& p);                          \
+  SNOW_EMULATION_EXPORT void NAME##_call(void** parameters) {      \
+    if constexpr (emulation::is_built(#NAME))                      \
+      NAME(*static_cast<const __VA_ARGS__*>(parameters[0]));       \
+    else                                                           \
+      __builtin_trap();                                            \
+  }                                                                \
+  SNOW_EMULATION_EXPORT int NAME##_threads() { return THREADS; }   \
+  SNOW_EMULATION_EXPORT const char* NAME##_fields() {              \
+    static constexpr auto layout = snow::layout_of<__VA_ARGS__>(); \
+    return layout.characters;                                      \
+  }                                                                \
   static void NAME([[maybe_unused]] const __VA_ARGS__& p)
 #define SNOW_KERNEL_OF(NAME, THREADS, BLOCKS, ...) SNOW_KERNEL(NAME, THREADS, __VA_ARGS__)
 #define SNOW_SHARED(TYPE, NAME, COUNT) \

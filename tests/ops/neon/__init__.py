@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.util import native_library
-from snowsplat.util.native_layout import Params, layout_of
+from snowsplat.util.native_layout import Fields
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
 _SYSTEM = Path("/usr/aarch64-linux-gnu")  # of Debian's cross compiler
@@ -33,27 +33,32 @@ _BUILD = _ROOT / "build" / "neon"
 _ONE_CALL = threading.Lock()  # tests call from several threads
 
 
-def launch(name: str, params: Params) -> int:
-    """Calls a function of the library; for tensors and `ArrayPointer`s in this process."""
-    layout = layout_of(type(params))
+def launch(name: str, fields: Fields) -> int:
+    """Calls a function of the library; for tensors and arrays in this process.
+
+    The struct is packed for the library of this machine. The program compares both descriptions.
+    """
+    layout = native_library.layout_of(name)
     words = ctypes.create_string_buffer(layout.size)
-    layout.pack_into(words, params)
-    values = layout.values(params)
-    memory = {i: _span(values[i]) for i in layout.pointers if values[i] is not None}
+    layout.pack_into(words, name, fields)
+    values = [fields[field] for field in layout.names]
+    memory = {i: _span(v) for i, v in enumerate(values) if hasattr(v, "data_ptr")}
     blocks = _merged(memory.values())
     pointers = []
     for i, span in memory.items():
         number, block = next((k, b) for k, b in enumerate(blocks) if span.within(b))
         pointers += [i, number, span.start - block.start]
 
-    text = name.encode()
-    numbers = [layout.hash, native_library.library()[1].get_num_threads(), layout.size // 8]
+    text, description = name.encode(), layout.text.encode()
+    numbers = [native_library.library()[1].get_num_threads(), layout.size // 8]
     sizes = [number for block in blocks for number in (block.size, block.start % 64)]
     with _ONE_CALL:
         process = _server()
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(_packed(len(text)) + text + _packed(*numbers) + words.raw)
+        process.stdin.write(_packed(len(text)) + text)
+        process.stdin.write(_packed(len(description)) + description)
+        process.stdin.write(_packed(*numbers) + words.raw)
         process.stdin.write(_packed(len(blocks), *sizes, len(pointers) // 3, *pointers))
         for block in blocks:
             process.stdin.write(ctypes.string_at(block.start, block.size))
@@ -83,7 +88,7 @@ class _Span:
 
 
 def _span(value: Any) -> _Span:
-    array = getattr(value, "array", value)  # of an `ArrayPointer`
+    array = getattr(value, "array", value)  # of an `_ArrayPointer`
     return _Span(value.data_ptr(), array.nbytes)
 
 

@@ -58,8 +58,10 @@ int main(int, char** arguments) {
     std::ungetc(first, stdin);
     std::string name(number(), 0);
     read(&name[0], name.size());
-    auto layout = reinterpret_cast<uint64_t (*)()>(find(name + "_layout"));
-    if (layout() != number()) fail(name + " takes another struct");
+    std::string layout(number(), 0);
+    read(&layout[0], layout.size());
+    auto fields = reinterpret_cast<const char* (*)()>(find(name + "_fields"));
+    if (layout != fields()) fail(name + " takes another struct");
     set_num_threads(int64_t(number()));
     std::vector<uint64_t> words(number());
     read(words.data(), 8 * words.size());

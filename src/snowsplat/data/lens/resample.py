@@ -10,8 +10,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.lens.views import LensView
-from snowsplat.util import array_kernels
-from snowsplat.util.native_library import ArrayPointer
+from snowsplat.util.native_library import call_with_arrays
 
 
 def undistort_image(image: Image.Image, view: LensView) -> Image.Image:
@@ -40,28 +39,28 @@ def resampled(
     the photo get the colour of its border.
     """
     made: np.ndarray = np.empty((len(planes), height, width), np.uint8)
-    source = ArrayPointer(np.ascontiguousarray(planes))
+    source = np.ascontiguousarray(planes)
     for rows, positions in view.positions(width, height):
         nodes = positions.nodes * np.array(scale, np.float32)
-        params = array_kernels.ResampleParams(
+        call_with_arrays(
+            "resample",
             channels=len(planes),
             source_width=planes.shape[2],
             source_height=planes.shape[1],
             source=source,
             wraps=view.wraps,
             columns=nodes.shape[1],
-            nodes=ArrayPointer(nodes),
-            column=ArrayPointer(positions.column),
-            across=ArrayPointer(positions.across),
-            row=ArrayPointer(positions.row),
-            down=ArrayPointer(positions.down),
+            nodes=nodes,
+            column=positions.column,
+            across=positions.across,
+            row=positions.row,
+            down=positions.down,
             width=width,
             height=height,
             first=rows.start,
             count=rows.stop - rows.start,
-            made=ArrayPointer(made),
+            made=made,
         )
-        array_kernels.call("resample", params)
     return made
 
 

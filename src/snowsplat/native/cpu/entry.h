@@ -2,8 +2,8 @@
 //
 //   SNOW_ENTRY(name, Params) { … }
 //
-// defines int64_t name(const Params& p), and name_layout(). With the latter, Python checks that its
-// struct has the layout of `Params` (see layout.h).
+// defines int64_t name(const Params& p), and name_fields(): the text from which Python learns the
+// layout of `Params` (see layout.h).
 #pragma once
 
 #include "params.h"
@@ -14,9 +14,9 @@
 #define SNOW_EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
-#define SNOW_ENTRY(NAME, ...)                                   \
-  SNOW_EXPORT uint64_t NAME##_layout() {                        \
-    constexpr uint64_t layout = snow::layout_of<__VA_ARGS__>(); \
-    return layout;                                              \
-  }                                                             \
+#define SNOW_ENTRY(NAME, ...)                                      \
+  SNOW_EXPORT const char* NAME##_fields() {                        \
+    static constexpr auto layout = snow::layout_of<__VA_ARGS__>(); \
+    return layout.characters;                                      \
+  }                                                                \
   SNOW_EXPORT int64_t NAME(const __VA_ARGS__& p)

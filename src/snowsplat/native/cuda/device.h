@@ -8,9 +8,9 @@
 //   SNOW_SHARED(type, name, count);                      an array in shared memory
 //
 // A kernel has one parameter, `p`: a struct from params.h, or from the same file if only the GPU
-// needs it. For each kernel `name` there is a variable `name_layout`: the layout of its struct
-// (layout.h). The loader compares it with the layout in Python. Blocks and threads are
-// one-dimensional; ops/cuda determines the number of blocks. Kernels use only intrinsics and these
+// needs it. For each kernel `name` there is a variable `name_fields`: the layout of its struct
+// (layout.h), which the loader reads. Blocks and threads are one-dimensional; ops/cuda determines the
+// number of blocks. Kernels use only intrinsics and these
 // headers, so that NVRTC compiles them quickly and the emulation can implement all intrinsics.
 #pragma once
 
@@ -18,8 +18,8 @@
 #include "cuda_emulation.h"
 #else
 
-#define SNOW_KERNEL_WITH(NAME, BOUNDS, ...)                                      \
-  extern "C" __device__ uint64_t NAME##_layout = snow::layout_of<__VA_ARGS__>(); \
+#define SNOW_KERNEL_WITH(NAME, BOUNDS, ...)                                  \
+  extern "C" __device__ auto NAME##_fields = snow::layout_of<__VA_ARGS__>(); \
   extern "C" __global__ void __launch_bounds__ BOUNDS NAME(const __VA_ARGS__ p)
 #define SNOW_KERNEL(NAME, THREADS, ...) SNOW_KERNEL_WITH(NAME, (THREADS), __VA_ARGS__)
 #define SNOW_KERNEL_OF(NAME, THREADS, BLOCKS, ...) \

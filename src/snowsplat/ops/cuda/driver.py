@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import functools
 import importlib
-import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -20,7 +19,7 @@ from snowsplat.ops.cuda import cubins
 from snowsplat.ops.cuda.availability import why_unusable
 from snowsplat.ops.cuda.kernels import Kernel
 from snowsplat.util.errors import UserError
-from snowsplat.util.native_layout import LARGEST_PARAMS, Params, layout_of
+from snowsplat.util.native_layout import LARGEST_STRUCT, Fields, Layout, Mismatch
 
 # Errors of the driver. If the code is for another GPU, the next candidate is tried.
 _OUT_OF_MEMORY = 2
@@ -33,7 +32,7 @@ class _Buffer(threading.local):
     """The memory from which the driver copies the struct during a launch."""
 
     def __init__(self) -> None:
-        self.struct = ctypes.create_string_buffer(LARGEST_PARAMS)
+        self.struct = ctypes.create_string_buffer(LARGEST_STRUCT)
         self._pointer = ctypes.c_void_p(ctypes.addressof(self.struct))
         #: Address of an array with one element: the pointer to the struct.
         self.address = ctypes.addressof(self._pointer)
@@ -44,16 +43,22 @@ _gpus: dict[int, _Gpu] = {}
 _lock = threading.Lock()
 
 
-def run(kernel: Kernel, name: str, blocks: int, params: Params) -> None:
+def run(kernel: Kernel, name: str, blocks: int, fields: Fields) -> None:
     """Queues a kernel on torch's current stream of the device of the tensors.
 
     Raises:
         UserError: the GPU cannot be used, the kernels are outdated, or the driver reports an error.
     """
     buffer = _buffer
-    index = layout_of(kernel.params).pack_into(buffer.struct, params).device.index
+    index = next(x for x in fields.values() if isinstance(x, torch.Tensor)).device.index
     gpu = _gpus.get(index) or _gpu(index)
-    function = gpu.functions.get(name) or gpu.load(kernel, name)
+    try:
+        function, layout = gpu.functions.get(name) or gpu.load(kernel, name)
+        layout.pack_into(buffer.struct, name, fields)
+    except Mismatch:
+        raise UserError(
+            "cuda:{index}: {name}: {outdated}", index=index, name=name, outdated=_OUTDATED
+        ) from None
     # torch.cuda.current_stream takes longer than the launch.
     stream = torch._C._cuda_getCurrentRawStream(index)
     cuda = gpu.cuda
@@ -97,7 +102,8 @@ class _Gpu:
         device = self._check(self.cuda.cuDeviceGet(index))
         self._context = self._check(self.cuda.cuDevicePrimaryCtxRetain(device))
         self.context = int(self._context)
-        self.functions: dict[str, Any] = {}
+        #: By name: the function of the driver, and the layout of its struct.
+        self.functions: dict[str, tuple[Any, Layout]] = {}
         self._libraries: dict[str, Any] = {}
         self._loading = threading.Lock()
 
@@ -110,8 +116,11 @@ class _Gpu:
         finally:
             self._check(self.cuda.cuCtxPopCurrent())
 
-    def load(self, kernel: Kernel, name: str) -> Any:
-        """Loads the function `name` on this device and stores it in `functions`."""
+    def load(self, kernel: Kernel, name: str) -> tuple[Any, Layout]:
+        """Loads the function `name` on this device, and stores it in `functions`.
+
+        Raises: Mismatch: it was built for other constants, or by an older version.
+        """
         with self._loading, self.current():
             if name not in self.functions:
                 if kernel.file in self._libraries:
@@ -120,23 +129,21 @@ class _Gpu:
                     error, function = self._first_function(kernel.file, name)
                 if error != 0:
                     self.fail(error, name)
-                self._check_layout(kernel, name)
-                self.functions[name] = function
+                self.functions[name] = function, self._layout(kernel, name)
             return self.functions[name]
 
-    def _check_layout(self, kernel: Kernel, name: str) -> None:
-        """Raises UserError unless the kernel takes the struct that `run` passes."""
-        found = bytearray(8)
+    def _layout(self, kernel: Kernel, name: str) -> Layout:
+        """The layout of the struct that the kernel takes, which is in the code beside it."""
         library = self._libraries[kernel.file]
-        error, address, _ = self.cuda.cuLibraryGetGlobal(library, f"{name}_layout".encode())
+        error, address, size = self.cuda.cuLibraryGetGlobal(library, f"{name}_fields".encode())
+        if error == _NOT_FOUND:
+            raise Mismatch(name)
+        found = bytearray(size)
         if error == 0:
-            (error,) = self.cuda.cuMemcpyDtoH(found, address, len(found))
-        if error not in (0, _NOT_FOUND):
+            (error,) = self.cuda.cuMemcpyDtoH(found, address, size)
+        if error != 0:
             self.fail(error, name)
-        if error or int.from_bytes(found, sys.byteorder) != layout_of(kernel.params).hash:
-            raise UserError(
-                "cuda:{index}: {name}: {outdated}", index=self._index, name=name, outdated=_OUTDATED
-            )
+        return Layout(found.partition(b"\0")[0].decode())
 
     def _first_function(self, file: str, name: str) -> tuple[int, Any]:
         error, function = 0, None

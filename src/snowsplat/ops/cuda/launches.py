@@ -1,74 +1,105 @@
-"""The native functions on a GPU and their kernels.
-
-Most native functions are one kernel with the same name and parameters; a few are a sequence of
-kernels. Each module (`projection`, `tiling`, …) declares its own:
-
-KERNELS    name → `Kernel`: its file, struct of parameters, and block size.
-SEQUENCES  name → a function `(run, suffix, params) -> int` that runs several kernels. `suffix` is
-           "" or "_f64": the suffix of the kernels that exist in both variants.
-"""
+"""The native functions on a GPU: one kernel each, or a sequence of kernels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
-from snowsplat.ops.cuda import (
-    adam,
-    driver,
-    frusta,
-    fusion,
-    nearest_neighbours,
-    photometric,
-    projection,
-    rasterizer,
-    sorting,
-    sweep,
-    tiling,
-)
-from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.util.native_layout import Params
+import torch
 
-_PARTS = (
-    projection,
-    adam,
-    sorting,
-    tiling,
-    rasterizer,
-    photometric,
-    nearest_neighbours,
-    sweep,
-    frusta,
-    fusion,
-)
-KERNELS: dict[str, Kernel] = {n: k for part in _PARTS for n, k in part.KERNELS.items()}
-SEQUENCES: dict[str, Callable[..., int]] = {
-    name: sequence for part in _PARTS for name, sequence in part.SEQUENCES.items()
-}
+from snowsplat.ops.cuda import driver
+from snowsplat.ops.cuda.kernels import KERNELS, SWEEP_EDGE, Kernel, Run
+from snowsplat.ops.cuda.nearest_neighbours import neighbours
+from snowsplat.ops.cuda.photometric import photometric
+from snowsplat.ops.cuda.tiling import splats_sort, tiles_count, tiles_fill, workspace_bytes
+from snowsplat.util.native_layout import POSE_SUMS, Fields
 
-Execute = Callable[[Kernel, str, int, Params], None]
+Execute = Callable[[Kernel, str, int, Fields], None]
 """Runs a kernel. Arguments: the kernel, its full name, the number of blocks, the parameters."""
 
 
-def launch(name: str, params: Params) -> int:
+def launch(name: str, fields: Fields) -> int:
     """`native.launch` for tensors on a GPU: queues the kernels on torch's current stream.
 
     Raises: UserError: the GPU cannot be used; the message says why.
     """
-    return launch_by(driver.run, name, params)
+    return launch_by(driver.run, name, fields)
 
 
-def launch_by(execute: Execute, name: str, params: Any) -> int:
+def launch_by(execute: Execute, name: str, fields: Fields) -> int:
     """As `launch`, with `execute` instead of the GPU's driver."""
 
-    def run(kernel_name: str, blocks: int, kernel_params: Params) -> None:
-        if blocks > 0:
-            kernel = KERNELS[kernel_name.removesuffix("_f64")]
-            execute(kernel, kernel_name, blocks, kernel_params)
+    def run(kernel_name: str, of_kernel: Fields, blocks: int | None = None) -> None:
+        kernel = KERNELS[kernel_name.removesuffix("_f64")]
+        count = kernel.blocks(of_kernel["n"]) if blocks is None else blocks
+        if count > 0:
+            execute(kernel, kernel_name, count, of_kernel)
 
     base = name.removesuffix("_f64")
-    suffix = name[len(base) :]
     if base in SEQUENCES:
-        return SEQUENCES[base](run, suffix, params)
-    run(name, KERNELS[base].blocks(params.n), params)
+        return SEQUENCES[base](run, name[len(base) :], fields)
+    run(name, fields)
     return 0
+
+
+def _project_cull(run: Run, suffix: str, p: Fields) -> int:
+    """Returns the number of all rows; the id of a Gaussian that is not visible is −1."""
+    run("project_cull" + suffix, p)
+    return int(p["n"])
+
+
+def _project_bwd(run: Run, suffix: str, p: Fields) -> int:
+    pose = p["pose"]
+    if pose is None:
+        run("project_bwd" + suffix, p)
+        return 0
+    blocks = KERNELS["project_bwd"].blocks(p["n"])
+    sums = torch.empty(blocks, POSE_SUMS, dtype=torch.float64, device=pose.device)
+    run("project_bwd" + suffix, {**p, "pose": sums})
+    run("project_pose_sum", {"n": blocks, "sums": sums, "pose": pose}, min(blocks, 1))
+    return 0
+
+
+def _adam_step(run: Run, suffix: str, p: Fields) -> int:
+    # If `project` returned all rows, the ids have a row for each Gaussian: −1 if it is not visible.
+    n, splats, ids = p["n"], p["splats"], p["ids"]
+    splat_of = ids
+    if splats != n:
+        splat_of = torch.full((n,), -1, dtype=torch.int32, device=ids.device)
+        run("adam_splat_of", {"n": splats, "ids": ids, "gaussians": n, "splat_of": splat_of})
+    run("adam_update" + suffix, {**p, "ids": splat_of})
+    return 0
+
+
+def _has_slots(run: Run, suffix: str, p: Fields) -> int:
+    """Sums in a fixed order need memory and time, so they are used only if torch is set to it."""
+    return int(torch.are_deterministic_algorithms_enabled())
+
+
+def _plane_sweep(run: Run, suffix: str, p: Fields) -> int:
+    blocks = -(-p["width"] // SWEEP_EDGE) * -(-p["height"] // SWEEP_EDGE)
+    run("plane_sweep" + suffix, p, blocks)
+    return 0
+
+
+#: The functions that are not one kernel. `suffix` is "" or "_f64": that of the kernels that exist
+#: in both variants.
+SEQUENCES: dict[str, Callable[[Run, str, Fields], int]] = {
+    "project_cull": _project_cull,
+    "project_pose_blocks": lambda run, suffix, p: min(p["n"], 1),
+    "project_bwd": _project_bwd,
+    "adam_step": _adam_step,
+    "splat_record_bytes": lambda run, suffix, p: 0,  # the GPU reads the packed rows
+    "splats_recolor": lambda run, suffix, p: 0,
+    "splats_sort": splats_sort,
+    "tiles_parts": lambda run, suffix, p: 0,
+    "tiles_workspace_bytes": workspace_bytes,
+    "tiles_count": tiles_count,
+    "tiles_fill": tiles_fill,
+    "rasterize_block_bytes": lambda run, suffix, p: 1,  # a bit for each of the 8 warps of a tile
+    "rasterize_has_slots": _has_slots,
+    "photometric": partial(photometric, ""),
+    "photometric_u8": partial(photometric, "_u8"),
+    "neighbours": neighbours,
+    "plane_sweep": _plane_sweep,
+}

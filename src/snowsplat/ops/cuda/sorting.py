@@ -6,61 +6,10 @@ the actual number. These functions do not wait for the GPU.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
-from snowsplat.ops.cuda.kernels import Kernel, Run
-from snowsplat.util.native_layout import Params
-
-
-@dataclass(slots=True, kw_only=True)
-class ScanParams(Params):
-    n: int
-    values: Tensor | None = None
-    sums: Tensor
-    out: Tensor | None = None
-    total: Tensor | None = None
-
-
-@dataclass(slots=True, kw_only=True)
-class SortPassParams(Params):
-    n: int
-    keys: Tensor
-    values: Tensor | None
-    keys_out: Tensor
-    values_out: Tensor
-    shift: int
-    bits: int
-    blocks: int
-    counts: Tensor
-    totals: Tensor
-    count: Tensor | None
-
-
-@dataclass(slots=True, kw_only=True)
-class SortOffsetsParams(Params):
-    n: int
-    counts: Tensor
-    totals: Tensor
-
-
-KERNELS: dict[str, Kernel] = {
-    "scan_sums": Kernel("sort", ScanParams, threads=256, items=1024),
-    "scan_of_sums": Kernel("sort", ScanParams, threads=256, items=256),
-    "scan_apply": Kernel("sort", ScanParams, threads=256, items=1024),
-    "sort_offsets": Kernel("sort", SortOffsetsParams, threads=256, items=1024),
-    "sort_count_u16": Kernel("sort", SortPassParams, threads=256, items=4096),
-    "sort_count_u32": Kernel("sort", SortPassParams, threads=256, items=4096),
-    "sort_count_u64": Kernel("sort", SortPassParams, threads=256, items=2048),
-    "sort_scatter_u16": Kernel("sort", SortPassParams, threads=256, items=4096),
-    "sort_scatter_u32": Kernel("sort", SortPassParams, threads=256, items=4096),
-    "sort_scatter_u64": Kernel("sort", SortPassParams, threads=256, items=2048),
-}
-
-SEQUENCES: dict[str, Callable[..., int]] = {}
+from snowsplat.ops.cuda.kernels import KERNELS, Run
 
 _DIGIT_BITS = 8
 _KEYS = {torch.int16: "u16", torch.int32: "u32", torch.int64: "u64"}
@@ -74,9 +23,10 @@ def exclusive_scan(run: Run, n: int, values: Tensor, out: Tensor, total: Tensor)
     """
     blocks = KERNELS["scan_sums"].blocks(n)
     sums = torch.empty(blocks, dtype=torch.int64, device=values.device)
-    run("scan_sums", blocks, ScanParams(n=n, values=values, sums=sums))
-    run("scan_of_sums", 1, ScanParams(n=blocks, sums=sums, total=total))
-    run("scan_apply", blocks, ScanParams(n=n, values=values, sums=sums, out=out))
+    scan = {"n": n, "values": values, "sums": sums, "out": out, "total": total}
+    run("scan_sums", scan)
+    run("scan_of_sums", {**scan, "n": blocks}, 1)
+    run("scan_apply", scan)
 
 
 def sort_passes(bits: int) -> int:
@@ -116,26 +66,22 @@ def sort_pairs(
     for i in range(passes):
         shift = begin + (end - begin) * i // passes
         width = begin + (end - begin) * (i + 1) // passes - shift
-        sort_pass = SortPassParams(
-            n=n,
-            keys=keys,
-            values=None if rows and i == 0 else values,
-            keys_out=keys2,
-            values_out=values2,
-            shift=shift,
-            bits=width,
-            blocks=blocks,
-            counts=counts,
-            totals=totals,
-            count=count,
-        )
-        run(f"sort_count_{name}", blocks, sort_pass)
+        sort_pass = {
+            "n": n,
+            "keys": keys,
+            "values": None if rows and i == 0 else values,
+            "keys_out": keys2,
+            "values_out": values2,
+            "shift": shift,
+            "bits": width,
+            "blocks": blocks,
+            "counts": counts,
+            "totals": totals,
+            "count": count,
+        }
+        run(f"sort_count_{name}", sort_pass)
         if blocks > 1:
-            run(
-                "sort_offsets",
-                1 << width,
-                SortOffsetsParams(n=blocks, counts=counts, totals=totals),
-            )
-        run(f"sort_scatter_{name}", blocks, sort_pass)
+            run("sort_offsets", {"n": blocks, "counts": counts, "totals": totals}, 1 << width)
+        run(f"sort_scatter_{name}", sort_pass)
         keys, keys2, values, values2 = keys2, keys, values2, values
     return keys, values

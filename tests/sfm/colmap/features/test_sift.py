@@ -12,7 +12,6 @@ from tests.sfm.colmap.scenes import texture
 from snowsplat.sfm.colmap.features import sift
 from snowsplat.sfm.colmap.features.sift import detect_in_grey, detect_sift, photos_at_once
 from snowsplat.sfm.colmap.pairs.matching import match_descriptors
-from snowsplat.util import array_kernels
 
 ALL = 100_000
 
@@ -127,7 +126,7 @@ def test_invalid_input():
 
 
 def test_not_enough_memory(monkeypatch):
-    monkeypatch.setattr(array_kernels, "call", lambda name, params: -1)
+    monkeypatch.setattr(sift, "call_with_arrays", lambda name, **fields: -1)
     with pytest.raises(MemoryError, match="not enough memory to detect features in a photo"):
         detect_in_grey(np.zeros((20, 20), np.uint8), None, 10)
 

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.util import array_kernels
 from snowsplat.util.native_layout import ALIGNMENT_RADIUS
-from snowsplat.util.native_library import ArrayPointer
+from snowsplat.util.native_library import call_with_arrays
 
 Floats = NDArray[np.floating[Any]]
 
@@ -102,13 +101,13 @@ def align_patches(patches: NDArray[np.uint8], pairs: NDArray[np.int32]) -> Align
     if pairs.size and not (pairs.min() >= 0 and pairs.max() < len(patches)):
         raise ValueError(f"align_patches: pairs must be indices of {len(patches)} patches")
     aligned = Aligned(np.empty((len(pairs), 2, 3), np.float32), np.empty(len(pairs), np.float32))
-    params = array_kernels.AlignPatchesParams(
+    call_with_arrays(
+        "align_patches",
         n=len(pairs),
         side=SIDE,
-        patches=ArrayPointer(np.ascontiguousarray(patches)),
-        pairs=ArrayPointer(np.ascontiguousarray(pairs)),
-        transform=ArrayPointer(aligned.transform),
-        correlation=ArrayPointer(aligned.correlation),
+        patches=np.ascontiguousarray(patches),
+        pairs=np.ascontiguousarray(pairs),
+        transform=aligned.transform,
+        correlation=aligned.correlation,
     )
-    array_kernels.call("align_patches", params)
     return aligned

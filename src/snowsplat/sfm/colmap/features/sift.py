@@ -15,9 +15,8 @@ from PIL import Image
 
 from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.photos.photo_files import open_image
-from snowsplat.util import array_kernels
 from snowsplat.util.machine import memory_bytes
-from snowsplat.util.native_library import ArrayPointer
+from snowsplat.util.native_library import call_with_arrays
 
 # Memory for each pixel of the resized photo. The first octave has 4 pixels for each pixel of the
 # photo; three levels of blur are kept, float32. The other octaves together have a third of its
@@ -88,16 +87,16 @@ def detect_in_grey(
             )
     height, width = grey.shape
     keypoints, descriptors = np.empty((count, 6), np.float32), np.empty((count, 128), np.uint8)
-    params = array_kernels.DetectSiftParams(
+    found = call_with_arrays(
+        "detect_sift",
         width=width,
         height=height,
-        grey=ArrayPointer(np.ascontiguousarray(grey)),
-        allowed=None if allowed is None else ArrayPointer(np.ascontiguousarray(allowed)),
+        grey=np.ascontiguousarray(grey),
+        allowed=None if allowed is None else np.ascontiguousarray(allowed),
         count=count,
-        keypoints=ArrayPointer(keypoints),
-        descriptors=ArrayPointer(descriptors),
+        keypoints=keypoints,
+        descriptors=descriptors,
     )
-    found = array_kernels.call("detect_sift", params)
     if found < 0:
         raise MemoryError("not enough memory to detect features in a photo")
     return Features(keypoints[:found], descriptors[:found])

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.util import array_kernels
-from snowsplat.util.native_library import ArrayPointer
+from snowsplat.util.native_library import call_with_arrays
 
 #: Number of values of a descriptor.
 LENGTH = 128
@@ -104,22 +103,22 @@ def two_nearest(
     if not 0 <= searched.common <= m:
         raise ValueError(f"two_nearest: common must be from 0 to {m}, got {searched.common}")
     rows, columns = (Nearest(*(np.empty(k, np.int32) for _ in range(3))) for k in (n, m))
-    params = array_kernels.MatchDescriptorsParams(
+    call_with_arrays(
+        "match_descriptors",
         n=n,
         m=m,
-        first=ArrayPointer(np.ascontiguousarray(first)),
-        second=ArrayPointer(np.ascontiguousarray(second)),
+        first=np.ascontiguousarray(first),
+        second=np.ascontiguousarray(second),
         common=searched.common,
-        begin=ArrayPointer(np.ascontiguousarray(searched.begin)),
-        end=ArrayPointer(np.ascontiguousarray(searched.end)),
-        row_index=ArrayPointer(rows.which),
-        row_best=ArrayPointer(rows.best),
-        row_second=ArrayPointer(rows.second),
-        column_index=ArrayPointer(columns.which),
-        column_best=ArrayPointer(columns.best),
-        column_second=ArrayPointer(columns.second),
+        begin=np.ascontiguousarray(searched.begin),
+        end=np.ascontiguousarray(searched.end),
+        row_index=rows.which,
+        row_best=rows.best,
+        row_second=rows.second,
+        column_index=columns.which,
+        column_best=columns.best,
+        column_second=columns.second,
     )
-    array_kernels.call("match_descriptors", params)
     return rows, columns
 
 
