@@ -129,9 +129,9 @@ def call(name: str, fields: Fields) -> int:
         function.layout.pack_into(buffer.bytes, name, fields)
     except Mismatch:
         raise UserError(
-            "the native library for {library} does not match the Python files ({name}); rebuild "
-            "it: `make native` in a checkout, `pip install .` elsewhere",
-            library=library()[0],
+            "the native library for {isa} does not match the Python files ({name}); rebuild it: "
+            "`make native` in a checkout, `pip install .` elsewhere",
+            isa=library()[0],
             name=name,
         ) from None
     return function.call(buffer.address)
