@@ -12,6 +12,7 @@ import torch
 from snowsplat import ops
 from snowsplat.ops.cuda import availability, inventory
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message
 
 TOO_OLD = "A card (compute capability 6.1) is too old; use one of 7.0 (2017) or newer"
 
@@ -39,8 +40,8 @@ def machine(monkeypatch) -> SimpleNamespace:
 
 
 def chosen(text: str | None = None) -> tuple[str, list[str]]:
-    notes: list[str] = []
-    return str(ops.resolve_device(text, notes.append)), notes
+    notes: list[Message] = []
+    return str(ops.resolve_device(text, notes.append)), list(map(str, notes))
 
 
 def refused(text: str) -> str:
