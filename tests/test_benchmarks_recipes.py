@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat import load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from . import fork_server
@@ -59,19 +58,6 @@ def test_a_comparison_resumes_and_shows_the_worst_views(tmp_path):
     assert [line for line in again.splitlines() if line.startswith("mean")] == [
         line for line in text.splitlines() if line.startswith("mean")
     ]
-
-
-def test_a_sector_is_one_side_of_the_scene(modules, tmp_path):
-    _, _, worker = modules
-    write_toy_dataset(tmp_path / "toy", n_views=16, width=16, height=16)
-    dataset = load_dataset(tmp_path / "toy", hold_out=None)
-    held_out = worker.sector(dataset)
-    assert len(held_out) == 2
-    position = {view.name: view.camera.position for view in dataset.train}
-    # The held-out cameras are neighbours: no other pair is nearer than they are.
-    a, b = (position[name] for name in held_out)
-    nearest = sorted(float((a - p).norm()) for name, p in position.items() if name != held_out[0])
-    assert float((a - b).norm()) <= nearest[2]
 
 
 def test_the_table_pairs_the_seeds(modules):

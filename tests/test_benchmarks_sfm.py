@@ -4,7 +4,6 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -114,20 +113,6 @@ def test_scenes_for_structure_from_motion(sfm_modules, tmp_path, monkeypatch):
             assert 0.9 < centres[:, 2].min() < centres[:, 2].max() < 2.1
 
 
-def test_the_two_rooms_are_identical(sfm_modules):
-    import sfm_scenes
-
-    a, b = (sfm_scenes.identical_room(np.random.default_rng(3), at) for at in sfm_scenes.MIDDLES)
-    shift = sfm_scenes.MIDDLES[1] - sfm_scenes.MIDDLES[0]
-    assert len(a) == len(b) > 8
-    for first, second in zip(a, b, strict=True):
-        moved = second.shape.centre - first.shape.centre
-        np.testing.assert_allclose(moved[:, 0], [shift, 0, 0], atol=1e-6)
-        assert first.shape.sizes == second.shape.sizes
-        for one, other in zip(first.paint, second.paint, strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.nightly
 def test_stages_and_places(tmp_path):
     file = tmp_path / "sfm.json"
@@ -165,34 +150,3 @@ def test_a_failure_is_a_row_of_the_table(tmp_path):
     (found,) = json.loads((tmp_path / "sfm.json").read_text())
     assert found["error"] in text
     assert (found["placed"], found["correct"], len(found["missing"])) == (0, 0, 3)
-
-
-def test_a_video_moves_smoothly_through_the_poses(sfm_modules):
-    from sfm_paths import in_between
-
-    poses = list(poses_on_a_spiral(12).values())
-    path = torch.stack(in_between(poses, 111))
-    assert torch.allclose(path[::10], torch.stack(poses), atol=1e-9)
-    centres = invert_rigid(path)[..., 3]
-    assert centres.diff(dim=0).norm(dim=1).max() < 1.3 * centres.diff(dim=0).norm(dim=1).median()
-    turns = path[..., :3]
-    assert torch.allclose(turns @ turns.mT, torch.eye(3).double().expand(111, 3, 3), atol=1e-9)
-
-
-def test_which_frames_the_photos_of_a_video_show(sfm_modules, tmp_path):
-    from PIL import Image
-
-    import sfm
-
-    random = np.random.default_rng(0)
-    for folder in ("frames", "photos"):
-        (tmp_path / folder).mkdir()
-    for i in range(6):
-        pixels = random.integers(0, 255, (24, 32, 3), np.uint8)
-        frame = Image.fromarray(pixels).resize((320, 240))
-        frame.save(tmp_path / "frames" / f"IMG_{i}.jpg")
-        if i in (1, 4):
-            frame.save(tmp_path / "photos" / f"frame_{i // 2}.jpg", quality=50)
-    shown = sfm.frames_shown(tmp_path / "photos", tmp_path / "frames")
-    assert shown == {"frame_0.jpg": "IMG_1.jpg", "frame_2.jpg": "IMG_4.jpg"}
-    assert sfm.frames_shown(tmp_path / "absent", tmp_path / "frames") == {}

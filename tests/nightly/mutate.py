@@ -53,13 +53,20 @@ _OPS = (
 PARTS = {
     "density": Part(("training/density/*.py",), ("tests/training/density",)),
     "optim": Part(
-        ("training/step/optim.py", "training/core/lr_schedule.py"),
+        ("training/step/optim.py", "training/settings/rates.py"),
         ("tests/training/test_optim.py", "tests/training/test_lr_schedule.py"),
     ),
-    "config": Part(("training/core/config.py",), ("tests/training/test_config.py",)),
+    "settings": Part(
+        ("training/settings/*.py",),
+        tuple(f"tests/training/test_{name}.py" for name in ("settings", "recipes", "parts")),
+    ),
     "losses": Part(("training/step/losses.py",), ("tests/training/test_losses.py",)),
     "trainer": Part(
-        tuple(f"training/core/{name}.py" for name in ("trainer", "step_runner", "view_gradient")),
+        (
+            "training/core/trainer.py",
+            "training/step/step_runner.py",
+            "training/step/view_gradient.py",
+        ),
         ("tests/training/test_trainer.py", "tests/training/test_step_runner.py"),
     ),
     "scene": Part(("scene/*.py",), ("tests/scene",)),
@@ -99,7 +106,7 @@ def main() -> int:
     tallies = {}
     stale = 0
     for name in flags.parts or PARTS:
-        paths = [path for source in PARTS[name].sources for path in _files(source)]
+        paths = files_of(name)
         mutants = [
             mutant
             for path in paths
@@ -127,12 +134,15 @@ def main() -> int:
     return 1 if stale or any(tally.share < REQUIRED for tally in tallies.values()) else 0
 
 
-def _files(pattern: str) -> list[Path]:
-    """The source files of a pattern, which may not be one of files that have been moved."""
-    paths = sorted(PACKAGE.glob(pattern))
-    if not paths:
-        sys.exit(f"mutate: {pattern} is no source file; change PARTS")
-    return paths
+def files_of(name: str) -> list[Path]:
+    """The source files of a part. Files that have been moved are an error, also among its tests."""
+    part = PARTS[name]
+    found = {pattern: sorted(PACKAGE.glob(pattern)) for pattern in part.sources}
+    lost = [pattern for pattern, paths in found.items() if not paths]
+    lost += [test for test in part.tests if not (PACKAGE.parents[1] / test).exists()]
+    if lost:
+        sys.exit(f"mutate: {', '.join(lost)} does not exist; change PARTS")
+    return [path for paths in found.values() for path in paths]
 
 
 def report_stale(mutants: list[Mutant]) -> int:

@@ -90,7 +90,7 @@ FAULTS = (
     ),
     Fault(
         "projection.h",
-        "grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.opacity);",
+        "grad.opacity_logit = d.opacity * p.opacity * (Real(1.f) - p.activated_opacity);",
         "grad.opacity_logit = d.opacity * p.opacity;",
         "gradient of the sigmoid",
         "project",
@@ -233,8 +233,8 @@ FAULTS = (
     ),
     Fault(
         "rasterize.h",
-        "d_mean[1] = conic[1] * m.qx + conic[2] * m.qy;",
-        "d_mean[1] = conic[2] * m.qy;",
+        "d_mean[1] = conic[1] * qx + conic[2] * qy;",
+        "d_mean[1] = conic[2] * qy;",
         "gradient of a 2D mean",
         "rasterize",
     ),
@@ -330,10 +330,10 @@ FAULTS = (
         "tiling",
     ),
     Fault(
-        "cpu/tiles.cpp",
-        "slot_range[2 * splat + 1] = slot;",
-        "slot_range[2 * splat + 1] = slot - (slot > first_slot);",
-        "the last tile of a splat is not summed",
+        "cpu/rasterize.cpp",
+        "i < last; i++) {\n      if (i + 16 < last)",
+        "i + 1 < last; i++) {\n      if (i + 16 < last)",
+        "the last slot of a tile is not summed",
         "rasterize",
     ),
     Fault(
@@ -369,8 +369,8 @@ FAULTS = (
     ),
     Fault(
         "cpu/photometric.cpp",
-        "select(zero > difference, down, zero)",
-        "down",
+        "select(zero > difference, -away, zero)",
+        "-away",
         "gradient of |0|",
         "photometric",
     ),
@@ -565,8 +565,8 @@ FAULTS = (
     ),
     Fault(
         "cuda/project.cu",
-        "for (int k = 1; k < kParts; k++) sum += parts[16 * k + int(threadIdx.x)];",
-        "for (int k = 2; k < kParts; k++) sum += parts[16 * k + int(threadIdx.x)];",
+        "for (int k = 1; k < kParts; k++) sum += parts[kPoseSums * k + int(threadIdx.x)];",
+        "for (int k = 2; k < kParts; k++) sum += parts[kPoseSums * k + int(threadIdx.x)];",
         "gradient of the pose",
         "project",
     ),

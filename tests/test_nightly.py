@@ -1,0 +1,49 @@
+"""The nightly scripts fit the code: the files and texts that they name exist."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+NIGHTLY = Path(__file__).resolve().parent / "nightly"
+NATIVE = Path(__file__).resolve().parents[1] / "src" / "snowsplat" / "native"
+
+
+@pytest.fixture
+def nightly(monkeypatch):
+    pytest.importorskip("mutmut", reason="comes with the extra nightly")
+    monkeypatch.syspath_prepend(str(NIGHTLY))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] in ("mutate", "mutation")]:
+        del sys.modules[name]
+
+
+def test_every_part_of_the_mutation_tests_has_files_and_tests(nightly, monkeypatch):
+    import mutate
+
+    for name in mutate.PARTS:
+        assert mutate.files_of(name)
+    monkeypatch.setitem(
+        mutate.PARTS, "lost", mutate.Part(("ops/*.py", "core/*.py"), ("tests/a.py",))
+    )
+    with pytest.raises(SystemExit, match=r"core/\*\.py, tests/a\.py does not exist; change PARTS"):
+        mutate.files_of("lost")
+
+
+def test_every_fault_of_a_kernel_fits_its_source(monkeypatch):
+    monkeypatch.syspath_prepend(str(NIGHTLY))
+    from mutation.kernel_faults import FAULTS
+
+    assert len(FAULTS) > 60
+    for fault in FAULTS:
+        assert (NATIVE / fault.file).read_text("utf-8").count(fault.was) == 1, fault.breaks
+        assert (NIGHTLY.parent / "ops" / f"test_{fault.tests}.py").exists(), fault.tests
+
+
+def test_every_fault_without_an_effect_names_a_file():
+    text = (NIGHTLY / "mutation" / "equivalents.py").read_text("utf-8")
+    package = NATIVE.parent
+    named = {line.strip(' ",') for line in text.splitlines() if line.endswith('.py",')}
+    assert len(named) > 10
+    for name in named:
+        assert (package / name).exists(), name
