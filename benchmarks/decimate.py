@@ -28,9 +28,9 @@ from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.decimate import Decimation
 from snowsplat.pipeline.output.image_files import write_png
-from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
 from snowsplat.pipeline.output.scene_source import cameras_of
 from snowsplat.pipeline.refine import photos_of, refine
+from snowsplat.project.project import Project
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.scene.simplify import simplify
@@ -64,11 +64,13 @@ class Scene:
     images: Path | None  # Where a held-out view of each row is written.
 
     def __post_init__(self) -> None:
-        self.file = scene_file(self.folder)
+        self.file = Project.open(self.folder).scene_file()
+        training = Project.open(self.file).training
+        assert training is not None
         self.whole = read_gaussians(self.file)
-        self.cameras = cameras_of(folder_around(self.file))
-        photos = Path(folder_around(self.file).settings()[0].path)
-        self.dataset, self.background = photos_of(self.file, photos)
+        self.cameras = cameras_of(training)[1]
+        photos = Path(training.settings()[0].path)
+        self.dataset, self.background = photos_of(training, photos)
 
     def ways(self, count: int) -> dict[str, Callable[[], Gaussians | None]]:
         """The name and the function of each way to ``count`` Gaussians."""

@@ -17,10 +17,10 @@ from snowsplat.pipeline import all_photos, make_plan
 from snowsplat.pipeline import make as make_module
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.make import RECORD, STAGES
-from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.pipeline.output.scene_paths import scene_file, scene_name
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.sfm import cost
 from snowsplat.sfm.ingest.search import sources
 from snowsplat.util.stages import Stages
@@ -148,7 +148,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     monkeypatch.setattr(all_photos, "SHARE", 0.01)  # fewer than two steps for each photo
     assert "no last part with the held-out photos: it would use each" in run(*command).out
     before = (out / f"{dataset.name}.ply").read_bytes()
-    evaluated = OutputFolder(out / "scene").scene_path(70)
+    evaluated = TrainingFolder(out / "scene").scene_path(70)
     assert before == evaluated.read_bytes()
 
     monkeypatch.setattr(all_photos, "SHARE", 1.0)
@@ -160,7 +160,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     assert f"before the last part, which has used all {views} photos" in result.out
     metrics = json.loads((out / "scene/metrics.json").read_text())
     assert f"PSNR {metrics['psnr']:.2f} dB" in result.out
-    scene = scene_file(out)
+    scene = Project.open(out).scene_file()
     assert scene == out / f"{dataset.name}.ply"
     assert evaluated.read_bytes() == before != scene.read_bytes()
     assert load_viewable(out).file == scene
@@ -170,7 +170,7 @@ def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(
     assert evaluate(held_out).psnr == pytest.approx(metrics["psnr"], abs=1e-4)
     ours = evaluate_views(read_gaussians(scene), held_out.dataset.test, background=[0.0, 0.0, 0.0])
     assert ours.psnr > metrics["psnr"] + 0.1
-    assert scene_name(out) == scene_name(out / "scene") == "A <title>"
+    assert Project.open(out).name == Project.open(out / "scene").name == "A <title>"
     assert "<h1>A &lt;title&gt;</h1>" in (out / "scene/report.html").read_text("utf-8")
     assert run(*command).out.count("done before") == 3
 

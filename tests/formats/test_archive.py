@@ -12,8 +12,8 @@ import torch
 
 from snowsplat.formats import format_for_reading, read_gaussians, write_gaussians
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.output.scene_paths import scene_file
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.project.project import Project
 from snowsplat.scene import edit
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.util.errors import UserError
@@ -163,12 +163,12 @@ def test_a_folder_of_sog_is_a_scene(tmp_path, make_scene):
     folder = tmp_path / "folder"
     with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
         bundle.extractall(folder)
-    assert scene_file(folder) == folder / "meta.json"
+    assert Project.open(folder).scene_file() == folder / "meta.json"
     assert_same(read_gaussians(tmp_path / "a.sog"), load_viewable(folder).gaussians)
     assert describe(folder)["gaussians"] == 20
     (folder / "meta.json").write_text('{"what": "the data of another program"}')
     with pytest.raises(UserError, match="no scene"):
-        scene_file(folder)
+        Project.open(folder).scene_file()
 
 
 def test_a_large_directory_is_not_read(tmp_path, one_line):

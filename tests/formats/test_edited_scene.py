@@ -5,8 +5,8 @@ import numpy as np
 from snowsplat.formats import read_arrays
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import edit
-from snowsplat.pipeline.output.edit_record import PageEdit
 from snowsplat.pipeline.publish import publish
+from snowsplat.project.edit_record import PageEdit
 
 from ..pipeline.test_edit import N, bits, write_scene
 

@@ -42,7 +42,8 @@ from snowsplat.formats.lod_writer import LodSizes, write_lod
 from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.training_files import write_beginning, write_scene
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.sfm import dataset_folder
@@ -541,12 +542,12 @@ def _video(name: str, file: str, **options: Any) -> Reader:
 # Records
 
 
-def _output(folder: Path) -> OutputFolder:
+def _output(folder: Path) -> TrainingFolder:
     write_toy_dataset(folder / "dataset", "colmap-bin", 5, 32, 24, n_points=20)
     dataset = load_dataset(folder / "dataset")
-    out = OutputFolder(folder / "out")
-    out.begin(dataset, DatasetSettings(str(folder / "dataset")), TrainConfig())
-    out.write_scene(7, make_scene(5, 0))
+    out = TrainingFolder(folder / "out")
+    write_beginning(out, dataset, DatasetSettings(str(folder / "dataset")), TrainConfig())
+    write_scene(out, 7, make_scene(5, 0))
     figures = {"iteration": 7, "split": "test", "psnr": 20.5, "ssim": 0.9, "views": {"a": 1.0}}
     (out.path / "metrics.json").write_text(json.dumps(figures))
     history = History()
@@ -559,7 +560,7 @@ def _output(folder: Path) -> OutputFolder:
 
 
 def _read_settings(folder: Path) -> Any:
-    settings, background = OutputFolder(folder / "out").settings()
+    settings, background = TrainingFolder(folder / "out").settings()
     return asdict(settings), background
 
 

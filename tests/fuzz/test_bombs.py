@@ -26,7 +26,7 @@ from snowsplat.data.photos.decode import ImageSource, load_image, read_header
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack
-from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.sfm import dataset_folder
 from snowsplat.sfm.colmap.process import check_model
@@ -522,7 +522,7 @@ def test_json_files(tmp_path, rejected, text):
     rejected(lambda: read_cameras(path))
     rejected(lambda: Stages(path, dataset_folder.STAGES))
     rejected(lambda: load_dataset(path))
-    rejected(lambda: OutputFolder(out).settings())
+    rejected(lambda: TrainingFolder(out).settings())
     empty = guarded(lambda: History.read(path, 9), tmp_path, path.stat().st_size)
     assert empty.stretches == []
 
@@ -545,7 +545,7 @@ def test_json_files(tmp_path, rejected, text):
 def test_cfg_args_with_code(tmp_path, rejected, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cfg_args").write_text(text)
-    assert "does not name the dataset" in rejected(lambda: OutputFolder(tmp_path).settings())
+    assert "does not name the dataset" in rejected(lambda: TrainingFolder(tmp_path).settings())
     assert not (tmp_path / "ran").exists()
 
 

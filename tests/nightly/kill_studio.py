@@ -43,8 +43,8 @@ from browser import Browser, BrowserError, chromium
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.film import moved_film, page_frames
-from snowsplat.pipeline.output.edit_record import read_record
-from snowsplat.pipeline.output.page_film import PageFilm
+from snowsplat.project.edit_record import read_record
+from snowsplat.project.page_film import PageFilm
 from snowsplat.studio.library import Library, Scene
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.safe_json import from_json

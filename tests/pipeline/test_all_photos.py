@@ -13,7 +13,8 @@ from snowsplat.pipeline import all_photos
 from snowsplat.pipeline.all_photos import train_on_all
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.training_files import write_beginning, write_scene
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.history import History
@@ -26,13 +27,13 @@ CONFIG = recipe("default", iterations=200, init="points", max_gaussians=300, exp
 
 
 @pytest.fixture
-def trained(tmp_path) -> OutputFolder:
+def trained(tmp_path) -> TrainingFolder:
     """A folder as after 200 steps, with the points of the dataset as its scene."""
     root = write_toy_dataset(tmp_path / "data", "colmap-bin", 9, 48, 36, n_points=300)
     dataset = load_dataset(root, hold_out=4)
-    folder = OutputFolder(tmp_path / "out")
-    folder.begin(dataset, DatasetSettings(str(root), hold_out=4), CONFIG)
-    folder.write_scene(200, Gaussians.from_points(dataset.points))
+    folder = TrainingFolder(tmp_path / "out")
+    write_beginning(folder, dataset, DatasetSettings(str(root), hold_out=4), CONFIG)
+    write_scene(folder, 200, Gaussians.from_points(dataset.points))
     left_out = {"left_out": [dataset.train[0].name]}
     (folder.path / "metrics.json").write_text(json.dumps(left_out), encoding="utf-8")
     history = History()

@@ -8,6 +8,7 @@ import torch
 
 from snowsplat.data.points_ply import write_points
 from snowsplat.pipeline.cameras_from_above import cameras_from_above
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.geometry import look_at
@@ -27,7 +28,7 @@ def drawn(folder, up_axis: int, with_points: bool) -> str:
     if with_points:
         xyz = np.random.default_rng(0).uniform(-1, 1, (50, 3)).astype(np.float32)
         write_points(folder / "input.ply", xyz, np.full((50, 3), 128, np.uint8))
-    return cameras_from_above(folder)
+    return cameras_from_above(TrainingFolder(folder))
 
 
 @pytest.mark.parametrize("up_axis", [0, 1, 2])
@@ -42,4 +43,4 @@ def test_a_ring_is_drawn_as_a_ring(tmp_path, up_axis):
 
 def test_a_folder_without_cameras(tmp_path):
     with pytest.raises(UserError, match=r"cameras\.json"):
-        cameras_from_above(tmp_path)
+        cameras_from_above(TrainingFolder(tmp_path))

@@ -15,12 +15,12 @@ from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames
 from snowsplat.pipeline.output import edit_record
-from snowsplat.pipeline.output.edit_record import Note, PageEdit, read_record, shown_file
-from snowsplat.pipeline.output.output_folder import OutputFolder
-from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.view import viewed_scene
+from snowsplat.project.edit_record import Note, PageEdit, read_record, shown_file
+from snowsplat.project.page_film import PageFilm
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.geometry import look_at
@@ -50,7 +50,7 @@ def write_scene(folder: Path, with_cameras: bool) -> Path:
     file.parent.mkdir()
     write_gaussians(file, gaussians)
     if with_cameras:
-        trained = OutputFolder(file.parent / "scene")
+        trained = TrainingFolder(file.parent / "scene")
         trained.scene_path(1).parent.mkdir(parents=True)
         write_gaussians(trained.scene_path(1), gaussians)
         write_json(file.parent / "make.json", {"file": "tour.ply", "title": "The tour"})

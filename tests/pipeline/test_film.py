@@ -8,9 +8,9 @@ import torch
 
 from snowsplat.pipeline.film import film, film_preview, write_keys
 from snowsplat.pipeline.output import page_film
-from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.videos import VideoSize, cameras_along
+from snowsplat.project.page_film import PageFilm
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.geometry import Similarity
 from snowsplat.util.errors import UserError

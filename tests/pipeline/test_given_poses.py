@@ -7,7 +7,7 @@ import pytest
 
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.output.output_folder import DatasetSettings
+from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 

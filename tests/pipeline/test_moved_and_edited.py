@@ -11,9 +11,9 @@ from PIL import Image, ImageOps
 from snowsplat.pipeline import make
 from snowsplat.pipeline.make_plan import MakePlan
 from snowsplat.pipeline.observer import SILENT
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.sfm.ingest.search.sources import Sources
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
@@ -36,7 +36,7 @@ def _longer(iterations):
 
 
 def _dataset_of(out):
-    return load_dataset_of(OutputFolder(out))[0].train[0].image.path.parents[1]
+    return load_dataset_of(TrainingFolder(out))[0].train[0].image.path.parents[1]
 
 
 def test_moved_folders(project, tmp_path, caplog):
@@ -59,7 +59,7 @@ def test_moved_folders(project, tmp_path, caplog):
     assert _dataset_of(other / "out") == other / "photos"
     assert "was moved; photos is read from" in caplog.text
     resume(other / "out", TrainOptions(settings={"iterations": 4}))
-    assert OutputFolder(other / "out").scenes() == [2, 4]
+    assert TrainingFolder(other / "out").scenes() == [2, 4]
 
 
 def test_edited_photos(project, tmp_path, caplog):

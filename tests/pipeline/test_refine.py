@@ -8,9 +8,9 @@ from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.convert import Edits, convert
-from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.output.scene_source import cameras_of
 from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.project.project import Project
 from snowsplat.scene import edit
 from snowsplat.scene.render import render
 from snowsplat.util.errors import SettingError
@@ -45,7 +45,7 @@ def test_the_cameras_of_an_output_folder_are_used(dataset, tmp_path):
     file = out / "point_cloud/iteration_60/point_cloud.ply"
     whole, bare = read_gaussians(file), tmp_path / "bare.ply"
     shutil.copy(file, bare)
-    cameras = cameras_of(training_folder(out))
+    _, cameras = cameras_of(Project.open(out).training)
     wanted = [render(whole, camera).image for camera in cameras]
 
     def loss(source, edits):

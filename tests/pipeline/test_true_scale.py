@@ -16,8 +16,9 @@ from snowsplat.data.frame.placement import PLACEMENT, Placement
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.pipeline.convert import Edits, convert
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.output.edit_record import EditRecord, record_file
 from snowsplat.pipeline.true_scale import KnownDistance
+from snowsplat.project.edit_record import EditRecord, record_file
+from snowsplat.project.project import Project
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.edit import merge, transform
@@ -100,11 +101,11 @@ def test_it_is_between_photos(tmp_path: Path) -> None:
     cameras = ((name, Camera(8, 6, 9, 9, 4, 3, p)) for name, p in poses.items())
     write_cameras(out / "cameras.json", cameras)
     between = ("room/IMG_1.jpg", "IMG_2")
-    assert KnownDistance("6m", between).metres_per_unit(file) == pytest.approx(2)
+    assert KnownDistance("6m", between).metres_per_unit(Project.open(file)) == pytest.approx(2)
     edited = file.with_name("point_cloud_edited.ply")
     write_gaussians(edited, scene())
     write_json(record_file(edited), asdict(EditRecord(file.name, 0, scale=4.0)))
-    assert KnownDistance("6m", between).metres_per_unit(edited) == pytest.approx(0.5)
+    assert KnownDistance("6m", between).metres_per_unit(Project.open(edited)) == pytest.approx(0.5)
     convert(file, tmp_path / "true.ply", known=KnownDistance("6m", between))
     assert read_gaussians(tmp_path / "true.ply").metres_per_unit == 1
 

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.train import TrainOptions, train
-from snowsplat.pipeline.watch import NewestScene, watched_folder
+from snowsplat.pipeline.watch import NewestScene
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
 
@@ -25,7 +26,7 @@ def trained(dataset, tmp_path_factory) -> Path:
 def test_the_newest_scene_is_shown(trained, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(trained, out)
-    folder = OutputFolder(out)
+    folder = TrainingFolder(out)
     scene = NewestScene(folder, None)()
     assert scene.about[0] == "After 50 steps"
     assert NewestScene(folder, 20)().about[0] == "After 20 steps"
@@ -59,7 +60,7 @@ def test_the_newest_scene_is_shown(trained, tmp_path):
 
 
 def test_a_checkpoint_of_something_else(trained, tmp_path):
-    out = OutputFolder(tmp_path / "out")
+    out = TrainingFolder(tmp_path / "out")
     shutil.copytree(trained, out.path)
     for tensors in ({"a": torch.zeros(3)}, {"gaussians.means": torch.zeros(3)}):
         checkpoint.save(out.checkpoints, 5000, tensors, {})
@@ -69,5 +70,5 @@ def test_a_checkpoint_of_something_else(trained, tmp_path):
 
 def test_the_folder_of_make_contains_the_output_folder_of_training(trained, tmp_path):
     shutil.copytree(trained, tmp_path / "made" / "scene")
-    assert watched_folder(tmp_path / "made").path == tmp_path / "made" / "scene"
-    assert watched_folder(trained).path == trained
+    assert Project.open(tmp_path / "made").training_folder().path == tmp_path / "made" / "scene"
+    assert Project.open(trained).training_folder().path == trained

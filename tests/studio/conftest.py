@@ -20,8 +20,8 @@ import torch
 from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import write_gaussians
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.publish import publish
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.studio import job, worker
 from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library, Scene
@@ -56,7 +56,7 @@ def of_the_command_line(folder: Path, step: int = 5) -> Path:
     folder.mkdir(exist_ok=True)
     settings = "eval=True, images='images', resolution=-1, sh_degree=1, source_path='photos'"
     (folder / "cfg_args").write_text(f"Namespace({settings}, white_background=False)")
-    file = OutputFolder(folder).scene_path(step)
+    file = TrainingFolder(folder).scene_path(step)
     file.parent.mkdir(parents=True)
     box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])
     write_gaussians(file, gaussians_in_box(box, 50, torch.Generator().manual_seed(0), 1))

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from snowsplat.evaluation.verdict import Reason, Verdict
-from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.stage_lines import described
+from snowsplat.project.page_film import PageFilm
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, failure
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED
 from snowsplat.sfm.ingest.inputs import _too_few

@@ -10,7 +10,7 @@ import pytest
 
 from snowsplat.formats import read_gaussians
 from snowsplat.formats.sog import read_sog
-from snowsplat.pipeline.output.page_film import PageFilm
+from snowsplat.project.page_film import PageFilm
 from snowsplat.studio import changes, job
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json

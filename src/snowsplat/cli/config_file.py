@@ -15,7 +15,7 @@ from snowsplat.util.safe_json import from_json, printable, read_json
 from snowsplat.util.settings import kinds_of, suggestion
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.output.output_folder import DatasetSettings
+    from snowsplat.project.training_folder import DatasetSettings
     from snowsplat.training.settings.config import TrainConfig
 
 _FLAG = "--config"
@@ -74,7 +74,7 @@ def training_in(file: Path) -> tuple[TrainConfig, DatasetSettings]:
     Raises:
         UserError: the file is not readable, or contains settings that this version does not have.
     """
-    from snowsplat.pipeline.output.output_folder import DatasetSettings
+    from snowsplat.project.training_folder import DatasetSettings
     from snowsplat.training.settings.stored import config_from_json
 
     content = _content(file)

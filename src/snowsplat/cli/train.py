@@ -44,9 +44,9 @@ class Train(TrainFlags, Reports):
         """Returns the exit code: 0, or 130 after Ctrl-C (with the scene and a checkpoint saved)."""
         if self.output is None:
             raise UserError("train needs a folder for the result; add -o OUT")
-        from snowsplat.pipeline.output.output_folder import OutputFolder
         from snowsplat.pipeline.run import processes
         from snowsplat.pipeline.run.train_result import TrainingStopped
+        from snowsplat.project.training_folder import TrainingFolder
 
         if self.processes is not None and self.processes != 1 and processes.count() == 1:
             return processes.launch(self.processes, sys.argv[1:])
@@ -60,14 +60,14 @@ class Train(TrainFlags, Reports):
             raise UserError("--resume and --overwrite cannot be combined; use one of them")
         dataset, options = self.dataset_path(), self.options()
         with one_run(self.output):  # reports what is wrong before torch is imported
-            OutputFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
+            TrainingFolder(self.output).check_free(resume=self.resume, overwrite=self.overwrite)
         if dataset is None and not self.resume:
             raise UserError("train needs a dataset; add the folder of the photos and their cameras")
         from snowsplat.pipeline.observer import Observers
         from snowsplat.pipeline.step_logs import LOGS
         from snowsplat.pipeline.train import resume, train
 
-        logs = [LOGS[name](self.output) for name in self.log]
+        logs = [LOGS[name](TrainingFolder(self.output)) for name in self.log]
         page = page_at(self.port, self.host, self.allow_host, self.view)
         with TerminalObserver(self.quiet) as terminal, page or nullcontext():
             observer = Observers(terminal, *logs)

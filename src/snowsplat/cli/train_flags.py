@@ -16,8 +16,8 @@ from snowsplat.cli.page_flags import AllowHost
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.output.output_folder import DatasetSettings
     from snowsplat.pipeline.train import TrainOptions
+    from snowsplat.project.training_folder import DatasetSettings
     from snowsplat.training.settings.config import TrainConfig
 
 

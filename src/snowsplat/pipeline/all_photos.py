@@ -15,8 +15,8 @@ import torch
 from snowsplat.data import ImageLoader
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
 from snowsplat.training.core.trainer import Trainer
@@ -26,7 +26,6 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.rates import DecayRates
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json
-from snowsplat.util.safe_json import read_json
 
 #: The steps, relative to those of the training.
 SHARE = 0.12
@@ -50,7 +49,7 @@ class LastPart:
 
 
 def train_on_all(
-    folder: OutputFolder, iteration: int, seconds: float, compute: Compute, observer: Observer
+    folder: TrainingFolder, iteration: int, seconds: float, compute: Compute, observer: Observer
 ) -> LastPart:
     """Continue a finished training with all photos; writes nothing.
 
@@ -65,10 +64,10 @@ def train_on_all(
 
     Raises: UserError: scene, settings, dataset or a photo are missing or damaged.
     """
-    if (folder.path / "masks").is_dir():
+    if folder.masks.is_dir():
         return LastPart(why_not="something moves in the photos")
     scene = load_trained(folder.path, iteration=iteration, compute=compute)
-    left_out = set(read_json(folder.path / "metrics.json").get("left_out", []))
+    left_out = {each.photo for each in folder.left_out()}
     used = [view for view in scene.dataset.train if view.name not in left_out]
     views = [*used, *scene.dataset.test]
     steps = round(SHARE * iteration)
@@ -89,7 +88,7 @@ def train_on_all(
         )
     views = [view for i, view in enumerate(views) if i < len(used) or i not in wrong]
     exposures = folder.exposures()
-    config = config_from_json(read_json(folder.path / "config.json")["training"])
+    config = config_from_json(folder.training_settings())
     config = _last_config(config, scene, steps, exposures=bool(exposures))
     trainer = Trainer(
         replace(scene.dataset, train=views, test=[]),

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from snowsplat.data.points_ply import read_points
-from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.geometry import shortest_rotation
 from snowsplat.scene.orientation import scene_up
 from snowsplat.sfm.report.scene_map import PlacedPhoto, draw_scene
 
 
-def cameras_from_above(output: Path | str) -> str:
+def cameras_from_above(training: TrainingFolder) -> str:
     """An SVG drawing of the cameras and points of a training run, seen from above.
 
     It needs no points. Up is the up direction of the cameras, whatever that of the dataset is.
 
-    ``output``: the output folder of a training run that has begun.
-
-    Raises: UserError: its cameras or points are missing or damaged.
+    Raises: UserError: the training has not begun; or its cameras or points are missing or damaged.
     """
-    folder = OutputFolder(Path(output))
-    names, cameras = read_cameras(folder.path / "cameras.json")
+    names, cameras = read_cameras(training.cameras)
     photos = [
         PlacedPhoto(
             name,
@@ -38,10 +34,9 @@ def cameras_from_above(output: Path | str) -> str:
         )
         for name, camera in zip(names, cameras, strict=True)
     ]
-    points = folder.path / "input.ply"
-    if not points.is_file():
+    if not training.points.is_file():
         return draw_level(photos, np.empty((0, 3)))
-    return draw_level(photos, *read_points(points))
+    return draw_level(photos, *read_points(training.points))
 
 
 def draw_level(

@@ -17,9 +17,10 @@ from snowsplat.evaluation.metrics import compare, evaluate_views, size_text
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
-from snowsplat.pipeline.output.scene_paths import folder_around, has_seen_all_photos
-from snowsplat.pipeline.output.scene_source import Color, load_viewable
+from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.refine import photos_of
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import Color
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
@@ -82,8 +83,9 @@ def clean(
     format_for_writing(target)
     device = (compute or Compute()).apply()
     with observer.waiting("reading"):
-        source = load_viewable(scene)
-        photos = _photos(source.file, None if dataset is None else Path(dataset))
+        project = Project.open(scene)
+        source = load_viewable(project)
+        photos = _photos(project, None if dataset is None else Path(dataset))
     gaussians, cameras = source.gaussians, source.cameras
     if photos is not None:
         gaussians = seen_from_dataset(gaussians, photos.origin)
@@ -148,17 +150,16 @@ def _judge_of_renderings(
     return _Judge(f"renderings of {len(chosen)} cameras", psnr, lambda before: _SAME)
 
 
-def _photos(scene: Path, dataset: Path | None) -> Dataset | None:
+def _photos(project: Project, dataset: Path | None) -> Dataset | None:
     """The photos of a scene; None: they are unknown, or not there any more. Raises UserError."""
     if dataset is None:
-        folder = folder_around(scene)
-        if not folder.scenes():
+        if project.training is None or not project.training.scenes():
             return None
-        dataset = Path(folder.settings()[0].path)
+        dataset = Path(project.training.settings()[0].path)
         if not dataset.is_dir():
             return None
-    photos = photos_of(scene, dataset)[0]
-    if has_seen_all_photos(scene):
+    photos = photos_of(project.training, dataset)[0]
+    if project.has_seen_all_photos:
         return replace(photos, train=[*photos.train, *photos.test], test=[])
     return photos
 

@@ -23,10 +23,10 @@ from snowsplat.pipeline.output.scene_files import (
     read_gaussians,
     write_gaussians,
 )
-from snowsplat.pipeline.output.scene_paths import folder_around, scene_file
-from snowsplat.pipeline.output.scene_source import background_of, cameras_of, viewable
+from snowsplat.pipeline.output.scene_source import cameras_of, viewable
 from snowsplat.pipeline.refine import photos_of, refine
 from snowsplat.pipeline.true_scale import KnownDistance, compared
+from snowsplat.project.project import Project
 from snowsplat.scene import edit
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
@@ -179,12 +179,13 @@ def convert(
     if format.name == LEVELS and size is not None:
         raise SettingError("decimate", "a size is that of one file; use a number or a share")
     given = [sources] if isinstance(sources, Path | str) else sources
-    files = [scene_file(Path(source)) for source in given]
+    projects = [Project.open(source) for source in given]
+    files = [project.scene_file() for project in projects]
     if known is not None and edits.scale != 1:
         raise SettingError("scale", "is determined by `scale_to`; leave one of them out")
-    metres = known and known.metres_per_unit(files[0])
+    metres = known and known.metres_per_unit(projects[0])
     edits = replace(edits, scale=metres) if metres else edits
-    decimation = _decimation(edits, files, dataset, observer)
+    decimation = _decimation(edits, projects, dataset, observer)
     with observer.waiting("reading"):
         parts = [read_gaussians(file) for file in files]
     if len({part.antialiased for part in parts}) > 1:
@@ -213,7 +214,7 @@ def convert(
     if georeferenced and format.name == "PLY":  # glTF files always have the place in the world
         write = partial(write_gaussians, georeferenced=True)
     if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
-        write = partial(_write_page, source=files[0])
+        write = partial(_write_page, project=projects[0])
     if format.name == LEVELS:
         write = partial(write_levels, observer=observer)
 
@@ -257,7 +258,7 @@ def _noted(format: Format, target: Path) -> str:
 
 
 def _decimation(
-    edits: Edits, scenes: Sequence[Path], dataset: Path | str | None, observer: Observer
+    edits: Edits, scenes: Sequence[Project], dataset: Path | str | None, observer: Observer
 ) -> Decimation:
     """The decimation, with the cameras or photos that are known for these scene files.
 
@@ -266,21 +267,23 @@ def _decimation(
     if dataset is None:
         if len(scenes) != 1:  # the cameras of one of several scenes do not show the others
             return Decimation(observer=observer)
-        folder = folder_around(scenes[0])
-        return Decimation(
-            cameras_of(folder), background_of(folder), folder.origin(), observer=observer
-        )
+        training = scenes[0].training
+        if training is None:
+            return Decimation(observer=observer)
+        cameras, background = cameras_of(training)[1], training.background()
+        return Decimation(cameras, background, training.origin(), observer=observer)
     if edits.decimate is None:
         raise SettingError("refine", "is for decimated scenes; set `decimate` as well")
     if edits.crop:
         raise SettingError("refine", "the photos show the whole scene; crop it later")
-    photos, background = photos_of(scenes[0], Path(dataset))
+    photos, background = photos_of(scenes[0].training, Path(dataset))
     refined = partial(refine, dataset=photos, background=background, observer=observer)
     cameras = [view.camera for view in photos.train]
     return Decimation(cameras, origin=photos.origin, refined=refined)
 
 
-def _write_page(target: Path, scene: Gaussians, source: Path) -> None:
+def _write_page(target: Path, scene: Gaussians, project: Project) -> None:
     """Write an HTML page, with the cameras and the background of its training if they are known."""
-    shown, about = viewable(source, scene), Description(target.stem, made=made_on(source))
+    shown, about = viewable(project, scene), Description(target.stem)
+    about = replace(about, made=made_on(project.scene_file()))
     write_html(target, shown.ready(), about)

@@ -11,15 +11,13 @@ import numpy as np
 from snowsplat.data.points_ply import read_points
 from snowsplat.formats import Format, GaussianArrays, ply
 from snowsplat.formats.lod import LEVELS, read_index
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_files import format_for_reading, read_arrays
-from snowsplat.pipeline.output.scene_paths import file_of_make, index_in, training_folder
+from snowsplat.project.project import Project
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip
 from snowsplat.training.core import checkpoint_file
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
-from snowsplat.util.safe_json import read_json
 
 _ROOT_OF_SOG = "meta.json"  # the file that a zip file with a scene has
 _PERCENTILES = (1, 50, 99)
@@ -53,7 +51,8 @@ def describe(path: Path | str) -> dict[str, Any]:
         raise UserError("{path}: no such file or folder", path=path)
     if path.suffix == ".safetensors":
         return _checkpoint(path)
-    path = index_in(path) or path
+    project = Project.open(path)
+    path = project.scene_file() if project.is_file else path
     if is_zip(path) and _has_photos(path):
         return _zip(path)
     if path.is_file():
@@ -67,9 +66,9 @@ def describe(path: Path | str) -> dict[str, Any]:
                 return _photos(path, unknown)
         else:
             return _scene(path, format)
-    folder = training_folder(path)
-    if folder.is_output_folder() or folder.scenes():
-        return _output(folder, file_of_make(path))
+    training = project.training_folder()
+    if training.is_training() or training.scenes():
+        return _output(project)
     return _dataset(path)
 
 
@@ -154,25 +153,23 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     }
 
 
-def _output(folder: OutputFolder, made: Path | None) -> dict[str, Any]:
-    """``made``: the scene of `make`, with its last part, if there is one."""
+def _output(project: Project) -> dict[str, Any]:
+    folder = project.training_folder()
     facts: dict[str, Any] = {"kind": "output folder", "path": str(folder.path)}
-    if folder.is_output_folder():
+    if folder.is_training():
         settings, background = folder.settings()
         facts["dataset"] = settings.path
         facts["background"] = list(background)
     facts["scenes"] = folder.scenes()
     if folder.checkpoints.is_dir():
         facts["checkpoints"] = sorted(p.name for p in folder.checkpoints.glob("step_*.safetensors"))
-    metrics = folder.path / "metrics.json"
-    if metrics.is_file():
-        try:
-            values = read_json(metrics)
-            facts["metrics"] = {name: v for name, v in values.items() if name != "views"}
-        except (ValueError, AttributeError):
-            raise UserError("{metrics}: damaged; it is not JSON", metrics=metrics) from None
+    if folder.metrics.is_file():
+        metrics = folder.read_metrics()
+        if not metrics:
+            raise UserError("{metrics}: damaged; it is not JSON", metrics=folder.metrics)
+        facts["metrics"] = {name: v for name, v in metrics.items() if name != "views"}
     if facts["scenes"]:
-        facts["last_scene"] = describe(made or folder.scene_path(facts["scenes"][-1]))
+        facts["last_scene"] = describe(project.scene_file())
     return facts
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 from snowsplat.formats import GaussianArrays
 from snowsplat.formats.ply import write_ply
 from snowsplat.formats.sog import order_in_sog, read_sog
-from snowsplat.pipeline.output.edit_record import (
+from snowsplat.pipeline.output.scene_source import load_viewable, moved_origin
+from snowsplat.project.edit_record import (
     EditRecord,
     PageEdit,
     edited_file,
@@ -20,7 +21,7 @@ from snowsplat.pipeline.output.edit_record import (
     remove_edited,
     written_with_record,
 )
-from snowsplat.pipeline.output.scene_source import load_viewable, moved_origin
+from snowsplat.project.project import Project
 from snowsplat.scene.edit import transform, with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, quat_from_rotation, quat_product
@@ -53,7 +54,8 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         OSError: the file cannot be written.
     """
     scene = Path(scene)
-    source = load_viewable(scene)
+    project = Project.open(scene)
+    source = load_viewable(project)
     frame = source.frame()
     # The largest part of the Gaussians, their colours, is not copied.
     moved = transform(with_sh_degree(source.gaussians, 0), frame)
@@ -74,7 +76,7 @@ def edit(scene: Path | str, site: Path | str, changes: PageEdit) -> Path:
         raise UserError("nothing would be left of the scene; keep some of it")
     kept = source.gaussians
     kept.select_(torch.from_numpy(~removed))
-    before = read_record(scene) or EditRecord(scene.name, 0)
+    before = project.edit or EditRecord(scene.name, 0)
     change, turn = replace(Similarity.identity(), scale=changes.scale), before.turn
     if changes.turn is not None:
         # The world of the edited scene is upright as its page.

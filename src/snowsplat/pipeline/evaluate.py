@@ -52,7 +52,7 @@ def evaluate(
             scene.gaussians, views, background=scene.background, lpips=lpips, on_view=on_view
         )
     try:
-        scene.folder.write_metrics(scene.iteration, split, evaluation)
+        scene.folder.write_metrics(scene.iteration, split, evaluation.as_json())
     except OSError as error:  # the folder may be of somebody else; the figures are returned
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC):
             raise

@@ -12,10 +12,10 @@ from torch import Tensor
 from snowsplat import trajectory
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.edit_record import read_record
-from snowsplat.pipeline.output.page_film import PageFilm
 from snowsplat.pipeline.output.scene_source import change_of, load_viewable
 from snowsplat.pipeline.videos import VideoOptions, render_video
+from snowsplat.project.page_film import PageFilm
+from snowsplat.project.project import Project
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.geometry import Similarity
@@ -69,9 +69,9 @@ def page_frames(scene: Path | str) -> list[Similarity]:
 
     Raises: UserError: the scene is missing or damaged.
     """
-    record = read_record(Path(scene))
-    edits = [] if record is None else [change_of(record)]
-    return [*edits, load_viewable(scene).frame()]
+    project = Project.open(scene)
+    edits = [] if project.edit is None else [change_of(project.edit)]
+    return [*edits, load_viewable(project).frame()]
 
 
 def moved_film(plan: PageFilm, before: list[Similarity], after: list[Similarity]) -> PageFilm:

@@ -10,7 +10,8 @@ from snowsplat.data import Dataset, View
 from snowsplat.data.files.matching import match_names
 from snowsplat.data.judge.verdict import judge
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.output.output_folder import DatasetSettings
+from snowsplat.pipeline.run.training_files import read_dataset
+from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
@@ -27,7 +28,7 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     """
     name = shown(settings.path)
     try:
-        dataset = settings.load()
+        dataset = read_dataset(settings)
         views = [*dataset.train, *dataset.test]
         without = _without_pose(sources.photos, views)
         reason = _why_not(dataset, len(without), len(sources.photos))

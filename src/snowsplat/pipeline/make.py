@@ -23,15 +23,7 @@ from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import (
-    DATASET,
-    FORMER_DATASET,
-    SCENE,
-    DatasetSettings,
-    OutputFolder,
-)
 from snowsplat.pipeline.output.scene_files import write_gaussians
-from snowsplat.pipeline.output.scene_paths import RECORD
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset, Quality
 from snowsplat.pipeline.render import render_images
@@ -39,6 +31,13 @@ from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import stamps_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.project.project import MAKE_RECORD as RECORD
+from snowsplat.project.training_folder import (
+    DATASET,
+    SCENE,
+    DatasetSettings,
+    TrainingFolder,
+)
 from snowsplat.sfm.colmap import SfmOptions
 from snowsplat.sfm.cost import measure_speed
 from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
@@ -55,7 +54,6 @@ from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, one_run
-from snowsplat.util.safe_json import read_json
 from snowsplat.util.settings import Settings, same, setting
 from snowsplat.util.stages import Outcome, Stages
 
@@ -137,7 +135,7 @@ class MakeResult:
     """
 
     scene: Path
-    folder: OutputFolder
+    folder: TrainingFolder
     dataset: Path
     dataset_report: Path | None
     renders: Path
@@ -252,9 +250,7 @@ class _Job:
         inputs = [str(path.absolute()) for path in self.inputs]
         before = self.stages.about.get("inputs", inputs)
         # `make_dataset` compares the photos themselves, whose folder may have been renamed.
-        compared = self.sources.posed is None and any(
-            (self.out / name).is_dir() for name in (DATASET, FORMER_DATASET)
-        )
+        compared = self.sources.posed is None and (self.out / DATASET).is_dir()
         if before != inputs and not (compared or self.overwrite):
             what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
             raise UserError(
@@ -339,9 +335,8 @@ class _Job:
         return Later(work=PRESETS[self.plan.quality].training)
 
     def _make_scene(self) -> MakeResult:
-        # The key is the name of the folder, also if version 0.1.0 has recorded it.
         settings: dict[str, Any] = (
-            {self.dataset.name: _fingerprint(self.dataset)}
+            {DATASET: _fingerprint(self.dataset)}
             if self.given is None
             else {"given": _fingerprint_of(self.given, self.dataset)}
         )
@@ -353,11 +348,11 @@ class _Job:
         else:
             settings["minutes"] = self.options.minutes
         settings |= {**self._split, "exposure": self.options.exposure}
-        folder = OutputFolder(self.out / SCENE)
-        outputs = [self.file, folder.path / "point_cloud", folder.path / "metrics.json"]
+        folder = TrainingFolder(self.out / SCENE)
+        outputs = [self.file, folder.path / "point_cloud", folder.metrics]
         scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
         shutil.rmtree(folder.checkpoints, ignore_errors=True)  # no longer needed
-        target = folder.path / "test" / f"ours_{scene['iteration']}"
+        target = folder.rendered("test", scene["iteration"])
         whole: dict[str, Any] = {"steps": 0, "photos": 0}
         if scene["views"]:
             self._stage("pictures", {}, [target], self._render)
@@ -383,12 +378,11 @@ class _Job:
 
     @property
     def dataset(self) -> Path:
-        """The folder of the dataset; a folder with the former name is kept."""
+        """The folder of the dataset."""
         if self.given is not None:
             assert self.sources.posed is not None
             return self.sources.posed
-        former = self.out / FORMER_DATASET
-        return former if former.is_dir() else self.out / DATASET
+        return self.out / DATASET
 
     @property
     def file(self) -> Path:
@@ -415,7 +409,7 @@ class _Job:
 
     def _train(self, settings: dict[str, Any]) -> dict[str, Any]:
         """Start or resume the training; copy its scene into the output folder of `make`."""
-        folder = OutputFolder(self.out / SCENE)
+        folder = TrainingFolder(self.out / SCENE)
         options = TrainOptions(
             memory=self.options.memory,
             checkpoint_seconds=_CHECKPOINT_SECONDS,
@@ -433,14 +427,14 @@ class _Job:
             trained = train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
         with atomic_path(self.file) as temporary:
             shutil.copyfile(trained.scene, temporary)
-        self.stages.about["file"] = self.file.name
+        self.stages.about |= {"file": self.file.name, "last_part": False}
         result: dict[str, Any] = {"iteration": trained.step, "views": 0}
         if trained.evaluation is not None:
-            metrics = read_json(folder.path / "metrics.json")
+            metrics = folder.read_metrics()
             result |= {key: metrics[key] for key in ("psnr", "ssim", "psnr_aligned", "size")}
             result["views"] = len(metrics["views"])
         return result | {
-            "exposures": (folder.path / "exposure.json").is_file(),
+            "exposures": bool(folder.exposures()),
             "verdict": trained.verdict and trained.verdict.as_json(),
         }
 
@@ -476,10 +470,12 @@ class _Job:
         seconds = math.inf
         if self.options.minutes is not None:
             seconds = 60.0 * self.options.minutes - self._elapsed()
-        folder = OutputFolder(self.out / SCENE)
+        folder = TrainingFolder(self.out / SCENE)
         compute = self.options.compute
         last = train_on_all(folder, scene["iteration"], seconds, compute, self.observer)
         if last.gaussians is not None:
+            self.stages.about["last_part"] = True
+            self.stages.save()  # before the scene is written: it must not be judged by its photos
             write_gaussians(self.file, last.gaussians)
         return {name: getattr(last, name) for name in ("steps", "photos", "left_out", "why_not")}
 

@@ -11,8 +11,8 @@ from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
-from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.project.project import Project
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import SettingError, UserError
@@ -89,17 +89,18 @@ def publish(
             files, or a web site that is not to be overwritten.
         OSError: a file cannot be written.
     """
-    options, scene, folder = options or PublishOptions(), Path(scene), Path(folder)
+    options, folder = options or PublishOptions(), Path(folder)
     if folder.exists():
         _check_free(folder, overwrite)
     Compute("cpu", threads).apply()
     with observer.waiting("reading"):
-        source = load_viewable(scene, iteration)
+        project = Project.open(scene, iteration)
+        source = load_viewable(project)
     if not len(source.gaussians):
         raise UserError("{file}: contains no Gaussians; there is nothing to see", file=source.file)
 
     url = options.url and options.url.rstrip("/") + "/"
-    about = Description(options.title or scene_name(scene), options.licence, made_on(source.file))
+    about = Description(options.title or project.name, options.licence, made_on(source.file))
     if any(source.gaussians.origin):
         place = " ".join(f"{value:.15g}" for value in source.gaussians.origin)
         observer.note(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import DatasetSettings
-from snowsplat.pipeline.output.scene_paths import folder_around
 from snowsplat.pipeline.run.refined_cameras import with_refined
+from snowsplat.pipeline.run.training_files import read_dataset
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.distillation import MERGED_RATES
 from snowsplat.training.core.trainer import Trainer
@@ -21,20 +21,19 @@ _STEPS = 600
 _RATES = replace(MERGED_RATES, means=1.44e-4, means_final=4.8e-6, anneal=0.1, anneal_from=0.7)
 
 
-def photos_of(scene: Path, dataset: Path) -> tuple[Dataset, str]:
+def photos_of(training: TrainingFolder | None, dataset: Path) -> tuple[Dataset, str]:
     """The photos for `refine`, and the colour behind them.
 
-    If ``scene`` is in an output folder, the photos have the size of its training, those that it
+    If the training of the scene is known, the photos have the size of its training, those that it
     held out are held out, and the cameras are those that it has refined.
     Raises: UserError: ``dataset`` is not a dataset.
     """
-    folder, background = folder_around(scene), "black"
     settings = DatasetSettings(str(dataset.absolute()))
-    if folder.scenes():
-        trained, color = folder.settings()
-        settings = replace(trained, path=settings.path)
-        background = "white" if min(color) == 1.0 else "black"
-    return with_refined(folder.path, settings.load()), background
+    if training is None or not training.scenes():
+        return read_dataset(settings), "black"
+    trained, color = training.settings()
+    photos = read_dataset(replace(trained, path=settings.path))
+    return with_refined(training, photos), "white" if min(color) == 1.0 else "black"
 
 
 def refine(

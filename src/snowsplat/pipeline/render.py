@@ -53,7 +53,7 @@ def render_images(
     scene, chosen = _chosen(scene, splits, antialias)
     rendered = {}
     for split, of_split in chosen.items():
-        target = scene.folder.path / split / f"ours_{scene.iteration}"
+        target = scene.folder.rendered(split, scene.iteration)
         _render(scene, of_split, target, depth)
         rendered[target / "renders"] = len(of_split)
     return rendered
@@ -88,7 +88,7 @@ def render_panoramas(
     color = torch.tensor(scene.background, device=device)
     rendered = {}
     for split, views in chosen.items():
-        folder = scene.folder.path / split / f"ours_{scene.iteration}" / "panoramas"
+        folder = scene.folder.rendered(split, scene.iteration) / "panoramas"
         folder.mkdir(parents=True, exist_ok=True)
         places: list[Camera] = []
         for view, camera in zip(views, level_cameras([v.camera for v in views]), strict=True):

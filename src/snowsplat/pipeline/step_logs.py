@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.pipeline.observer import Observer
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
@@ -128,7 +129,7 @@ class TensorBoardLog(_StepLog):
 
 
 #: The names of the logs -> what makes them in an output folder.
-LOGS: dict[str, Callable[[Path], Observer]] = {
-    "csv": lambda out: CsvLog(out / "log.csv"),
-    "tensorboard": lambda out: TensorBoardLog(out / "tensorboard"),
+LOGS: dict[str, Callable[[TrainingFolder], Observer]] = {
+    "csv": lambda out: CsvLog(out.csv_log),
+    "tensorboard": lambda out: TensorBoardLog(out.tensorboard),
 }

@@ -16,8 +16,6 @@ from snowsplat.data import Dataset
 from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
@@ -27,7 +25,10 @@ from snowsplat.pipeline.run.photo_stamps import Stamp, edited, stamps_of
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainResult
+from snowsplat.pipeline.run.training_files import read_dataset, read_dataset_files, write_beginning
 from snowsplat.pipeline.run.training_run import TrainingRun
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.checkpoint import Checkpoint
 from snowsplat.training.core.run import Loss
@@ -40,7 +41,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.schedule import Schedule
-from snowsplat.training.settings.stored import config_from_json
+from snowsplat.training.settings.stored import config_from_json, config_to_json
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
@@ -160,7 +161,7 @@ def train(
 
     Args:
         dataset: a folder with photos and their cameras, see `snowsplat.data.load_dataset`.
-        output: the output folder, see `snowsplat.pipeline.output.output_folder`. It is created if
+        output: the output folder, see `snowsplat.project.training_folder`. It is created if
             it does not exist.
         overwrite: replace the results of an earlier training run in ``output``.
         page: shows the training in the browser.
@@ -181,7 +182,7 @@ def train(
     started = time.monotonic()
     options = options or TrainOptions()
     options.configuration()  # reports an invalid setting first
-    out = OutputFolder(Path(output))
+    out = TrainingFolder(Path(output))
     with one_run(out.path):
         out.check_free(resume=False, overwrite=overwrite)
         job = _Job(out, options, observer, page, started, parts, loss)
@@ -221,7 +222,7 @@ def resume(
     """
     started = time.monotonic()
     options = options or TrainOptions()
-    out = OutputFolder(Path(output))
+    out = TrainingFolder(Path(output))
     with one_run(out.path):
         out.check_free(resume=True, overwrite=False)
         job = _Job(out, options, observer, page, started, parts, loss)
@@ -244,7 +245,7 @@ def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | N
 class _Job:
     """One call of `train` or `resume`: prepares a `TrainingRun` and runs it."""
 
-    out: OutputFolder
+    out: TrainingFolder
     options: TrainOptions
     observer: Observer
     page: LivePage | None
@@ -268,7 +269,7 @@ class _Job:
         settings = options.dataset_settings(path)
         name = "custom" if options.config is not None else options.recipe or "default"
         config = options.configuration()
-        files = settings.read_files()
+        files = read_dataset_files(settings)
         dataset = files.dataset(settings.resolution)
         self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
         check_test_photos(dataset.test)
@@ -305,7 +306,8 @@ class _Job:
         chosen = options.config is not None or "exposure" in options.settings
         if config.exposure == "off" and not chosen and (hint := exposure_hint(trainer)):
             self.observer.note(hint)
-        self.out.begin(dataset, settings, memory.plan.config)
+        self.out.remove_results()
+        write_beginning(self.out, dataset, settings, memory.plan.config)
         time_ratio = 1.0 if plan is None else plan.time_ratio
         return self._run(settings, name, trainer, budget, time_ratio, memory)
 
@@ -322,7 +324,7 @@ class _Job:
         meta = replace(meta, dataset=self.out.located(meta.dataset))
         settings = _resumed_dataset(options, path, start, meta)
         config = _resumed_config(options, start, meta)
-        dataset = settings.load()
+        dataset = read_dataset(settings)
         # The first run has refused impossible cameras, or not.
         self.doubts = check_cameras(dataset, settings.path, trusted=True)
         self._compare_photos(dataset, settings.path, meta)
@@ -330,7 +332,7 @@ class _Job:
         self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
         trainer = self._trainer(dataset, memory.plan.config, schedule, start.tensors)
         start.tensors.clear()  # the trainer has a copy, which is the one in the memory plan
-        self.out.write_config(settings, memory.plan.config)
+        self.out.write_settings(settings, config_to_json(memory.plan.config))
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations
         self.observer.note(
@@ -422,7 +424,7 @@ class _Job:
             photos=self.photos,
         )
         if self.page is not None:
-            self.page.open_training(trainer, scene_name(self.out.path), self.observer)
+            self.page.open_training(trainer, Project.open(self.out.path).name, self.observer)
         return run.run()
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
-from snowsplat.pipeline.output.edit_record import read_record
-from snowsplat.pipeline.output.scene_paths import folder_around
-from snowsplat.pipeline.output.scene_source import change_of
-from snowsplat.scene.camera_json import read_cameras
+from snowsplat.pipeline.output.scene_source import cameras_of, change_of
+from snowsplat.project.project import Project
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.length import metres_of
 from snowsplat.util.errors import SettingError
@@ -50,8 +48,8 @@ class KnownDistance:
                 "between", "{between} twice; use two different places", between=self.between[0]
             )
 
-    def metres_per_unit(self, scene: Path) -> float:
-        """The true length of a unit of the world of ``scene``, a file.
+    def metres_per_unit(self, scene: Project) -> float:
+        """The true length of a unit of the world of ``scene``.
 
         Raises:
             SettingError: a photo is not known, or the two places are the same.
@@ -80,15 +78,10 @@ def _point(text: str) -> np.ndarray | None:
     return point if point.shape == (3,) and np.isfinite(point).all() else None
 
 
-def _positions(scene: Path) -> dict[str, np.ndarray]:
-    """The positions (3,) of the photos of the training of ``scene``, in the world of this file."""
-    record = read_record(scene)
-    original = scene.with_name(Path(record.scene).name) if record else scene
-    file = folder_around(original).path / "cameras.json"
-    if not file.is_file():
-        return {}
-    names, cameras = read_cameras(file)
-    change = change_of(record) if record else Similarity.identity()
+def _positions(scene: Project) -> dict[str, np.ndarray]:
+    """The positions (3,) of the photos of the training of ``scene``, in the world of its file."""
+    names, cameras = cameras_of(scene.original.training)
+    change = change_of(scene.edit) if scene.edit else Similarity.identity()
     positions = (change.apply(camera.position).numpy() for camera in cameras)
     return dict(zip(names, positions, strict=True))
 

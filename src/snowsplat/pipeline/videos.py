@@ -19,10 +19,11 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output import image_files
-from snowsplat.pipeline.output.scene_paths import existing_folder, folder_around, index_in
-from snowsplat.pipeline.output.scene_source import seen_by_cameras
+from snowsplat.pipeline.output.scene_source import cameras_of
+from snowsplat.project.project import Project
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras, read_speeds
+from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.orientation import scene_up
 from snowsplat.scene.panorama import PanoramaRenderer, level_pose
@@ -245,21 +246,20 @@ class _Source:
 
 
 def _load(scene: Path, iteration: int | None, name: str) -> _Source:
-    scene = index_in(scene) or scene
-    if scene.is_file():
-        file = scene.with_name(f"{scene.stem}_{name}.mp4")
-        folder, gaussians = folder_around(scene), read_gaussians(scene)
-        if not folder.is_output_folder():
-            return _Source(gaussians, None, (0.0, 0.0, 0.0), file)
+    project = Project.open(scene)
+    if project.is_file:
+        training, found = project.training, project.scene_file()
+        file = found.with_name(f"{found.stem}_{name}.mp4")
     else:
-        folder = existing_folder(scene)
-        _, gaussians = folder.read_scene(iteration)
-        file = folder.videos / f"{name}.mp4"
-    _, background = folder.settings()
-    gaussians = seen_by_cameras(gaussians, folder)
-    trained = folder.path / "cameras.json"
-    cameras = read_cameras(trained) if trained.is_file() else None
-    return _Source(gaussians, cameras, background, file)
+        training = project.training_folder()
+        found = training.find_scene(iteration)[1]
+        file = training.videos / f"{name}.mp4"
+    gaussians = read_gaussians(found)
+    if training is None or not training.is_training():
+        return _Source(gaussians, None, (0.0, 0.0, 0.0), file)
+    names, cameras = cameras_of(training)
+    gaussians = seen_from_dataset(gaussians, training.origin())
+    return _Source(gaussians, (names, cameras) if names else None, training.background(), file)
 
 
 def cameras_along(

@@ -12,8 +12,8 @@ from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.levels import write_levels
-from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
+from snowsplat.project.project import Project
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
@@ -48,14 +48,14 @@ def viewed_scene(
     Raises: UserError: the scene is missing or damaged, or has no Gaussians.
     """
     path = Path(path)
-    title = scene_name(path)
-    published, index = is_site(path), _levels_in(path)
-    if iteration is not None and (published or index is not None):
-        raise UserError("`iteration` selects a scene of an output folder; leave it out")
-    if published:
+    if is_site(path):
+        if iteration is not None:
+            raise UserError("`iteration` selects a scene of an output folder; leave it out")
         yield ViewedScene(path / PAGE, None, *site_files(path))
         return
-    if index is not None:
+    project = Project.open(path, iteration)
+    title, index = project.name, project.scene
+    if index is not None and project.is_file and format_for_reading(index).name == LEVELS:
         counts = read_index(index).counts()
         coarse = read_lod(index, len(counts) - 1).to_gaussians()
         _check(index, coarse)
@@ -64,7 +64,7 @@ def viewed_scene(
         yield ViewedScene(index, counts[0], *page)
         return
     with observer.waiting("reading"):
-        scene = load_viewable(path, iteration)
+        scene = load_viewable(project)
     _check(scene.file, scene.gaussians)
     about = Description(title, made=made_on(scene.file))
     if len(scene.gaussians) <= _LARGE:
@@ -87,13 +87,6 @@ def viewed_scene(
         with observer.waiting("preparing"):
             page = site(about, scene.ready(), levels)
         yield ViewedScene(scene.file, len(scene.gaussians), *page)
-
-
-def _levels_in(path: Path) -> Path | None:
-    """The index of levels of detail in a folder, or ``path`` itself if it is one."""
-    if (path / INDEX).is_file():
-        return path / INDEX
-    return path if path.is_file() and format_for_reading(path).name == LEVELS else None
 
 
 def _check(file: Path, gaussians: Gaussians) -> None:

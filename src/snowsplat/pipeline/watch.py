@@ -15,11 +15,11 @@ import torch
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import SCENE, OutputFolder
-from snowsplat.pipeline.output.scene_paths import existing_folder, scene_name
 from snowsplat.pipeline.output.scene_source import load_dataset_of
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.watchers import PageReply, PageRequest, socket_in
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.origin import HERE, Origin
@@ -58,7 +58,8 @@ def watch(
 
     Raises: UserError: scene, settings or dataset are missing or damaged; an unusable device.
     """
-    folder = watched_folder(Path(output))
+    project = Project.open(output)
+    folder = project.training_folder()
     of_folder = any(each is not None for each in (iteration, dataset, resolution))
     if not of_folder and compute in (None, Compute()):
         try:
@@ -70,7 +71,7 @@ def watch(
     newest = NewestScene(folder, iteration, (compute or Compute()).apply(), data.origin)
     newest()  # a scene that cannot be shown is reported before the page opens
     with suppress(KeyboardInterrupt):  # Ctrl-C is the normal end as soon as the page is open
-        page.open(data, background, scene_name(folder.path), observer)
+        page.open(data, background, project.name, observer)
         page.show(newest)
 
 
@@ -107,19 +108,12 @@ def _attached(output: Path, page: LivePage, observer: Observer) -> bool:
     return True
 
 
-def watched_folder(path: Path) -> OutputFolder:
-    """The same as `existing_folder`, but also finds a training run of `make` without scenes."""
-    folder = existing_folder(path)
-    made = OutputFolder(folder.path / SCENE)
-    return made if made.is_output_folder() and not folder.is_output_folder() else folder
-
-
 class NewestScene:
     """The newest scene or checkpoint of a folder; each file is read once."""
 
     def __init__(
         self,
-        folder: OutputFolder,
+        folder: TrainingFolder,
         iteration: int | None,
         device: torch.device | None = None,
         origin: Origin = HERE,
@@ -158,9 +152,7 @@ class NewestScene:
 
     def _newest(self) -> tuple[int, Path | None]:
         if self._iteration is not None:
-            if self._iteration not in self._folder.scenes():
-                self._folder.read_scene(self._iteration)  # raises an error that lists the scenes
-            return self._iteration, self._folder.scene_path(self._iteration)
+            return self._folder.find_scene(self._iteration)
         found = [(step, self._folder.scene_path(step)) for step in self._folder.scenes()]
         found += checkpoint.files(self._folder.checkpoints)
         return max(found, key=lambda each: each[0], default=(0, None))

@@ -47,10 +47,9 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from snowsplat.pipeline.output.edit_record import PageEdit, read_record
-from snowsplat.pipeline.output.output_folder import DATASET
-from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.pipeline.output.scene_paths import training_folder
+from snowsplat.project.edit_record import PageEdit, read_record
+from snowsplat.project.page_film import PageFilm
+from snowsplat.project.project import Project
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import (
     FORMATS,
@@ -597,17 +596,17 @@ def _photo_list(scene: Scene) -> list[dict[str, Any]]:
     shown, placed = _shown_photos(scene), scene.state().get("placed")
     if placed is None:
         return [{"name": path.name, "placed": True} for path in shown]
-    names, folder = set(placed), scene.made / DATASET / "input"
+    names, folder = set(placed), Project.open(scene.made).dataset.photos
     inside = ((path.name, path.relative_to(folder).as_posix()) for path in shown)
     return [{"name": name, "placed": path in names} for name, path in inside]
 
 
 def _shown_photos(scene: Scene) -> list[Path]:
     """The photos of the dataset: those with a pose as soon as they are known, before that all."""
-    dataset = scene.made / DATASET
+    dataset = Project.open(scene.made).dataset
     # While poses are estimated, the images of an earlier job may still be there.
-    for name in ("input",) if "placed" in scene.state() else ("images", "input"):
-        folder = dataset / name
+    early = "placed" in scene.state()
+    for folder in (dataset.photos,) if early else (dataset.images, dataset.photos):
         if folder.is_dir():
             found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
             step = max(1, math.ceil(len(found) / _PHOTOS))
@@ -620,8 +619,9 @@ def _picture_of(scene: Scene) -> Path | None:
     poster = scene.site / "poster.jpg"
     if is_file(poster):
         return poster
-    views = training_folder(scene.made).path.glob("test/ours_*/renders/*.png")
-    return next(iter([*sorted(views)[:1], *_shown_photos(scene)[:1]]), None)
+    training = Project.open(scene.made).training
+    views = training.rendered_views() if training else []
+    return next(iter([*views[:1], *_shown_photos(scene)[:1]]), None)
 
 
 def _small(path: Path) -> bytes:

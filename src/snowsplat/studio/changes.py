@@ -17,12 +17,10 @@ from typing import Any
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames, write_keys
-from snowsplat.pipeline.output.edit_record import PageEdit, edited_file
-from snowsplat.pipeline.output.output_folder import DATASET
-from snowsplat.pipeline.output.page_film import PageFilm
-from snowsplat.pipeline.output.scene_paths import training_folder
 from snowsplat.pipeline.publish import PublishOptions, publish
-from snowsplat.sfm.report.dataset_report import REPORT
+from snowsplat.project.edit_record import PageEdit, edited_file
+from snowsplat.project.page_film import PageFilm
+from snowsplat.project.project import Project
 from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
 from snowsplat.studio.library import Scene, safe_title
@@ -188,14 +186,12 @@ def show_whole(scene: Scene) -> dict[str, Any]:
 
 def _found(scene: Scene) -> dict[str, Any]:
     """What a scene of the command line tells about its training."""
-    folder = training_folder(scene.folder)
-    try:
-        facts = dict(read_json(folder.path / "metrics.json"))
-    except (OSError, ValueError, TypeError):  # it was not evaluated, or not by this program
-        facts = {}
+    project = Project.open(scene.folder)
+    folder = project.training_folder()
+    facts = folder.read_metrics()  # empty: it was not evaluated, or not by this program
     aligned = bool(folder.exposures())
     psnr = facts.get("psnr_aligned" if aligned else "psnr")
-    reports = {"training": folder.report, "photos": scene.made / DATASET / REPORT}
+    reports = {"training": folder.report, "photos": project.dataset.report}
     return {
         "psnr": psnr if facts.get("split") == "test" and isinstance(psnr, float) else None,
         "aligned": aligned,

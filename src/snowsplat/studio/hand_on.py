@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from snowsplat.pipeline.output.page_film import PageFilm
+from snowsplat.project.page_film import PageFilm
 from snowsplat.studio.library import Job, Scene, safe_name
 from snowsplat.util.safe_json import is_file
 

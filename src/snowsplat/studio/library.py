@@ -28,13 +28,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from snowsplat.pipeline.output.edit_record import shown_file
-from snowsplat.pipeline.output.scene_paths import (
-    file_of_make,
-    scene_file,
-    scene_name,
-    training_folder,
-)
+from snowsplat.project.edit_record import shown_file
+from snowsplat.project.project import Project
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.safe_json import from_json, printable, read_json
@@ -111,10 +106,11 @@ class Scene:
         """Raises UserError: its file is missing or damaged."""
         file = self.kept / _JOB
         if self.found and not file.is_file():
+            project = Project.open(self.folder)
             made = datetime.datetime.fromtimestamp(
-                scene_file(self.folder).stat().st_mtime, datetime.timezone.utc
+                project.scene_file().stat().st_mtime, datetime.timezone.utc
             )
-            return Job(scene_name(self.folder), made.isoformat(timespec="seconds"), [])
+            return Job(project.name, made.isoformat(timespec="seconds"), [])
         try:
             return from_json(Job, read_json(file))
         except (OSError, ValueError, KeyError, TypeError):
@@ -171,7 +167,7 @@ class Scene:
     def scene_file(self) -> Path | None:
         """The finished scene, as it was edited."""
         if self.found:
-            return shown_file(scene_file(self.folder))
+            return shown_file(Project.open(self.folder).scene_file())
         result = self.state().get("result") or {}
         file = self.made / Path(str(result.get("file", ""))).name
         return shown_file(file) if file.is_file() else None
@@ -278,10 +274,10 @@ def _is_scene(folder: Path) -> bool:
 
 
 def _has_scene(folder: Path) -> bool:
-    trained = training_folder(folder)
-    return file_of_make(folder) is not None or (
-        trained.is_output_folder() and bool(trained.scenes())
-    )
+    project = Project.open(folder)
+    if project.is_file or project.scene is None or project.training is None:
+        return False
+    return bool(project.made) or project.training.is_training()
 
 
 def default_folder() -> Path:

@@ -34,12 +34,12 @@ from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import MakeOptions, MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
-from snowsplat.pipeline.output.edit_record import shown_file
-from snowsplat.pipeline.output.output_folder import DATASET, SCENE
 from snowsplat.pipeline.publish import PublishOptions, publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
+from snowsplat.project.edit_record import shown_file
+from snowsplat.project.project import Project
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of
 from snowsplat.sfm.ingest.search.sources import find_sources
@@ -108,7 +108,7 @@ class _Recorder(Observer):
             {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
         )
         if stage == "images":
-            self._draw_map(lambda made: draw_from_above(made / DATASET))
+            self._draw_map(lambda made: draw_from_above(made.dataset.path))
         if stage == "poses":
             self.state.pop("placed", None)
         self.leave()
@@ -124,7 +124,7 @@ class _Recorder(Observer):
 
     def step(self, progress: Progress) -> None:
         if not self._drawn:  # the poses were given
-            self._draw_map(lambda made: cameras_from_above(made / SCENE))
+            self._draw_map(lambda made: cameras_from_above(made.training_folder()))
         self.state["steps"] = {
             "step": progress.step,
             "iterations": progress.iterations,
@@ -149,10 +149,10 @@ class _Recorder(Observer):
         self.state.pop("page", None)
         self.write()
 
-    def _draw_map(self, draw: Callable[[Path], str]) -> None:
+    def _draw_map(self, draw: Callable[[Project], str]) -> None:
         self._drawn = True
         try:
-            write_text(self._scene.map, draw(self._scene.made))
+            write_text(self._scene.map, draw(Project.open(self._scene.made)))
         except (UserError, OSError) as error:  # the job goes on without it
             self.note(message("there is no map of the cameras: {error}", error=error))
 

@@ -12,9 +12,9 @@ from snowsplat.extras.globe.globe_video import GlobeVideo
 from snowsplat.extras.globe.layout import arrange
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.scene_paths import scene_name
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.videos import VideoSize
+from snowsplat.project.project import Project
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.stages import Outcome
@@ -102,7 +102,8 @@ def make_globe(
         KeyboardInterrupt: Ctrl-C; no incomplete file is left.
     """
     options, scene = options or GlobeOptions(), Path(scene)
-    beside = scene.with_name(f"{scene_name(scene)}_globe.html")
+    project = Project.open(scene, iteration)
+    beside = scene.with_name(f"{project.name}_globe.html")
     default = scene / "globe.html" if scene.is_dir() else beside
     target = default if page is None else Path(page)
     if target.suffix.lower() != ".html":
@@ -111,10 +112,10 @@ def make_globe(
         raise UserError("{video}: the name of a video must end in .mp4", video=video)
     Compute("cpu", threads).apply()
     with observer.waiting("reading"):
-        source = load_viewable(scene, iteration)
+        source = load_viewable(project)
     with observer.waiting("arranging"):
         arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
-    name = options.name or scene_name(scene)[:_LONGEST_NAME]
+    name = options.name or project.name[:_LONGEST_NAME]
     write_page(target, arrangement, name)
     if video is not None:
         width, height = options.video_size

@@ -20,7 +20,8 @@ from snowsplat.extras.lift.edges import resize_depth
 from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit, write_png
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.training_files import read_dataset, write_beginning, write_scene
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
@@ -160,7 +161,7 @@ def lift_photo(
         OSError: a file cannot be written.
     """
     options, started = options or LiftOptions(), time.monotonic()
-    out = OutputFolder(Path(output))
+    out = TrainingFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
     pixels, camera, source = read_photo(Path(photo), size, focal)
     Compute("cpu", threads).apply()
@@ -212,7 +213,7 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     return pixels, Camera(width, height, focal, focal, width / 2, height / 2, pose), source
 
 
-def _begin(out: OutputFolder, name: str, pixels: Tensor, camera: Camera) -> None:
+def _begin(out: TrainingFolder, name: str, pixels: Tensor, camera: Camera) -> None:
     """Write the photo as a dataset of one view, and what `train` writes before its first step."""
     folder = out.path / PHOTO
     (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -225,11 +226,12 @@ def _begin(out: OutputFolder, name: str, pixels: Tensor, camera: Camera) -> None
     intrinsics |= {"cx": camera.cx, "cy": camera.cy}
     write_json(folder / "transforms.json", intrinsics | {"frames": [frame]})
     settings = DatasetSettings(str(folder.absolute()))
-    out.begin(settings.load(), settings, TrainConfig(sh_degree=0))
+    out.remove_results()
+    write_beginning(out, read_dataset(settings), settings, TrainConfig(sh_degree=0))
 
 
 def finish(
-    out: OutputFolder,
+    out: TrainingFolder,
     step: int,
     gaussians: Gaussians,
     pixels: Tensor,
@@ -240,11 +242,11 @@ def finish(
     started: float,
 ) -> LiftResult:
     """Write the scene, its pictures and metrics."""
-    scene = out.write_scene(step, gaussians)
+    scene = write_scene(out, step, gaussians)
     with torch.no_grad():
         image = render(gaussians, camera).image
     metrics = compare(image, pixels, name="photo")
-    out.write_metrics(step, "train", Evaluation([metrics]))
+    out.write_metrics(step, "train", Evaluation([metrics]).as_json())
     write_png(out.path / "rendered.png", to_8bit(image))
     known = z[z.isfinite()].numpy()
     near, far = (float(value) for value in np.percentile(known, [1, 99]))

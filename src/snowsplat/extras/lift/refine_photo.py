@@ -12,7 +12,8 @@ from snowsplat.extras.lift.lift import LiftOptions, lift
 from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, finish
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
+from snowsplat.pipeline.run.training_files import read_dataset, write_beginning
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
@@ -57,10 +58,10 @@ def refine_photo(
         KeyboardInterrupt: Ctrl-C; the folder then contains the scene after 0 steps.
     """
     options, started = options or LiftOptions(), time.monotonic()
-    out = OutputFolder(Path(output))
+    out = TrainingFolder(Path(output))
     out.check_free(resume=False, overwrite=overwrite)
     settings = DatasetSettings(str(Path(dataset).absolute()), hold_out=hold_out)
-    posed = settings.load()
+    posed = read_dataset(settings)
     view = _view_of(posed, Path(photo))
     if posed.points is None:
         raise UserError(
@@ -79,7 +80,8 @@ def refine_photo(
     limit = round(_LIFTED_SHARE * config.density.max_gaussians)
     options = replace(options, max_gaussians=min(options.max_gaussians or limit, limit))
     lifted = replace(lift(pixels, z, view.camera, options), origin=posed.origin)
-    out.begin(posed, settings, config)
+    out.remove_results()
+    write_beginning(out, posed, settings, config)
     what = pixels, z, view.camera, "of the dataset"
     finish(out, 0, lifted, *what, swing=False, started=started)
     seconds = time.monotonic() - started
@@ -90,7 +92,7 @@ def refine_photo(
     result = finish(out, trainer.step, trainer.gaussians, *what, swing=swing, started=started)
     evaluation = trainer.evaluate() if posed.test else None
     if evaluation is not None:
-        out.write_metrics(trainer.step, "test", evaluation)
+        out.write_metrics(trainer.step, "test", evaluation.as_json())
     return replace(result, seconds=seconds, alignment=alignment, evaluation=evaluation)
 
 

@@ -24,9 +24,9 @@ from snowsplat.evaluation.lpips import Lpips
 from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.evaluate import evaluate
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
@@ -149,7 +149,7 @@ def work(job: Job, device: str | None, threads: int | None) -> None:
     )
     output = Path(job.output)
     begin = time.monotonic()
-    if OutputFolder(output).is_output_folder():
+    if TrainingFolder(output).is_training():
         trained_now = resume(output, options, dataset=job.dataset)
     else:
         trained_now = train(job.dataset, output, options)
@@ -177,7 +177,7 @@ def work(job: Job, device: str | None, threads: int | None) -> None:
 
 def _seconds_of_steps(output: Path) -> float:
     """The duration of the steps of all runs."""
-    history = read_json(output / "history.json")
+    history = read_json(TrainingFolder(output).history)
     return float(sum(stretch["seconds"] for stretch in history["stretches"]))
 
 

@@ -15,7 +15,7 @@ from snowsplat.formats.ply import read_ply, write_ply_parts
 from snowsplat.pipeline.blocks.cells import Axes, Cell
 from snowsplat.pipeline.blocks.plan import Plan
 from snowsplat.pipeline.blocks.train import is_finished, scene_folder
-from snowsplat.pipeline.output.output_folder import OutputFolder
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
@@ -87,7 +87,7 @@ def merge_blocks(folder: Path | str, output: Path | str | None = None) -> Merged
         raise UserError(
             "{folder}: no Gaussian is in the cell of its block; train more steps", folder=folder
         )
-    scene = OutputFolder(folder).scene_path(max(steps))
+    scene = TrainingFolder(folder).scene_path(max(steps))
     scene.parent.mkdir(parents=True, exist_ok=True)
     own_rows = (part()[1] for part in parts)
     write_ply_parts(

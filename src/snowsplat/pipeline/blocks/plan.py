@@ -21,10 +21,11 @@ from snowsplat._version import __version__
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.pipeline.blocks.cells import Axes, Cell
 from snowsplat.pipeline.blocks.content import block_content
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
 from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.camera_check import check_cameras
+from snowsplat.pipeline.run.training_files import read_dataset_files, write_beginning
 from snowsplat.pipeline.train import TrainOptions
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.parts.found_sky import sky_distance
 from snowsplat.training.settings.recipes import check_recipe, recipe
@@ -171,7 +172,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         test_list=options.test_list,
     )
     settings = train_options.dataset_settings(dataset)
-    files = settings.read_files()
+    files = read_dataset_files(settings)
     whole = files.dataset(settings.resolution)
     check_cameras(whole, settings.path, trusted=True)
     if options.blocks > len(whole.train):
@@ -183,7 +184,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         )
     posed = [image for image, _, _ in files.images]
     if any(image.divided > 1 for image in posed):
-        original = replace(settings, resolution=-1).read_files()
+        original = read_dataset_files(replace(settings, resolution=-1))
         posed += [image for image, _, _ in original.images]
     axes, contents = block_content(whole, options.blocks, options.margin)
     sizes = sorted(view.camera.width * view.camera.height for view in whole.train)
@@ -212,7 +213,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         own_limit = max(1, round(limit * content.share)) if limit else 0
         points = 0 if content.points is None else len(content.points)
         blocks.append(Block(name, content.cell, len(content.views), points, own_limit))
-    OutputFolder(folder).describe(whole, settings, config)
+    write_beginning(TrainingFolder(folder), whole, settings, config)
     plan = replace(plan, blocks=blocks)
     plan.write(folder)
     return plan

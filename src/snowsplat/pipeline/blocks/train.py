@@ -8,22 +8,21 @@ from pathlib import Path
 from snowsplat.pipeline.blocks.plan import Block, Plan
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.output_folder import OutputFolder
 from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.run_lock import InUse, one_run
-from snowsplat.util.safe_json import read_json
 
 _CHECKPOINT_SECONDS = 60.0
 
 
-def scene_folder(folder: Path, block: Block) -> OutputFolder:
+def scene_folder(folder: Path, block: Block) -> TrainingFolder:
     """The output folder of the training of a block."""
-    return OutputFolder(folder / block.name / "scene")
+    return TrainingFolder(folder / block.name / "scene")
 
 
-def is_finished(out: OutputFolder) -> bool:
+def is_finished(out: TrainingFolder) -> bool:
     """Whether a training run in an output folder has reached its last step.
 
     Raises: UserError: its settings are damaged.
@@ -31,12 +30,9 @@ def is_finished(out: OutputFolder) -> bool:
     scenes = out.scenes()
     if not scenes:
         return False
-    try:
-        iterations = int(read_json(out.path / "config.json")["training"]["iterations"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(
-            "{path}: damaged; remove {path2}", path=out.path / "config.json", path2=out.path
-        ) from None
+    iterations = out.training_settings().get("iterations")
+    if not isinstance(iterations, int):
+        raise UserError("{path}: its settings are damaged; remove it", path=out.path)
     return scenes[-1] >= iterations
 
 
@@ -118,6 +114,6 @@ def _train(
         checkpoint_seconds=_CHECKPOINT_SECONDS,
         compute=compute,
     )
-    if out.is_output_folder():
+    if out.is_training():
         return resume(out.path, options, dataset=dataset, observer=observer)
     return train(dataset, out.path, options, observer=observer)

@@ -11,16 +11,11 @@ import torch
 from snowsplat.data import Dataset
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.output.edit_record import EditRecord, Note, read_record
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.output.scene_paths import (
-    existing_folder,
-    file_of_make,
-    folder_around,
-    index_in,
-    training_folder,
-)
 from snowsplat.pipeline.run.refined_cameras import with_refined
+from snowsplat.pipeline.run.training_files import read_dataset
+from snowsplat.project.edit_record import EditRecord, Note
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import Color, DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import read_cameras
 from snowsplat.scene.edit import seen_from_dataset
@@ -31,8 +26,6 @@ from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.web.scene import ReadyScene, ready, viewing_frame
 from snowsplat.viewer.web.viewer_page import Annotation
-
-Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -46,7 +39,7 @@ class TrainedScene:
         background: red, green, blue in 0..1.
     """
 
-    folder: OutputFolder
+    folder: TrainingFolder
     iteration: int
     gaussians: Gaussians
     dataset: Dataset
@@ -76,25 +69,27 @@ def load_trained(
     Raises:
         UserError: scene, settings or dataset are missing or damaged; an unusable device.
     """
-    file = index_in(Path(output)) or Path(output)
-    if file.is_file():
+    project = Project.open(output)
+    if project.is_file:
+        file = project.scene_file()
         if dataset is None:
             raise UserError(
                 "{file}: a scene file does not name its photos; set `dataset`", file=file
             )
         settings = DatasetSettings(str(dataset), resolution=resolution or -1, hold_out=8)
-        folder, background = OutputFolder(file.with_name(f"{file.stem}_views")), (0.0, 0.0, 0.0)
-        data, found, gaussians = settings.load(), 0, read_gaussians(file)
+        folder, background = TrainingFolder(file.with_name(f"{file.stem}_views")), (0.0, 0.0, 0.0)
+        data, found = read_dataset(settings), 0
     else:
-        folder = existing_folder(Path(output))
+        folder = project.training_folder()
         data, background = load_dataset_of(folder, dataset, resolution)
-        found, gaussians = folder.read_scene(iteration)
-    gaussians = seen_from_dataset(gaussians, data.origin).to((compute or Compute()).apply())
+        found, file = folder.find_scene(iteration)
+    gaussians = seen_from_dataset(read_gaussians(file), data.origin)
+    gaussians = gaussians.to((compute or Compute()).apply())
     return TrainedScene(folder, found, gaussians, data, background)
 
 
 def load_dataset_of(
-    folder: OutputFolder, dataset: Path | str | None = None, resolution: int | None = None
+    folder: TrainingFolder, dataset: Path | str | None = None, resolution: int | None = None
 ) -> tuple[Dataset, Color]:
     """The dataset of the training in ``folder``, and its background colour; see `load_trained`.
 
@@ -105,25 +100,15 @@ def load_dataset_of(
         settings = replace(settings, path=str(dataset))
     if resolution is not None:
         settings = replace(settings, resolution=resolution)
-    return with_refined(folder.path, settings.load()), background
+    return with_refined(folder, read_dataset(settings)), background
 
 
-def cameras_of(folder: OutputFolder) -> list[Camera]:
-    """The cameras of the photos of the training in ``folder``; empty if they are not stored.
+def cameras_of(training: TrainingFolder | None) -> tuple[list[str], list[Camera]]:
+    """Names and cameras of the photos of a training; empty if they are not stored.
     Raises: UserError: the file is damaged.
     """
-    file = folder.path / "cameras.json"
-    return read_cameras(file)[1] if file.is_file() else []
-
-
-def seen_by_cameras(gaussians: Gaussians, folder: OutputFolder) -> Gaussians:
-    """The scene relative to the origin of the cameras of the training in ``folder``."""
-    return seen_from_dataset(gaussians, folder.origin())
-
-
-def background_of(folder: OutputFolder) -> Color:
-    """The background colour of the training in ``folder``; black if it is not stored."""
-    return folder.settings()[1] if folder.is_output_folder() else (0.0, 0.0, 0.0)
+    known = training is not None and training.cameras.is_file()
+    return read_cameras(training.cameras) if training and known else ([], [])
 
 
 @dataclass(frozen=True)
@@ -150,52 +135,43 @@ class ViewableScene:
         return change or Similarity.identity()
 
 
-def load_viewable(path: Path | str, iteration: int | None = None) -> ViewableScene:
+def load_viewable(scene: Project | Path | str, iteration: int | None = None) -> ViewableScene:
     """Load a scene file of any format, levels of detail, or a scene of an output folder.
 
     ``iteration``: an iteration of an output folder; default: the last one.
 
     Raises:
-        UserError: the scene is missing or damaged, or ``iteration`` is set and ``path`` is a file.
+        UserError: the scene is missing or damaged, or ``iteration`` is set and ``scene`` is a file.
     """
-    path = Path(path)
-    if not path.exists():
-        raise UserError("{path}: no such file or folder", path=path)
-    path = index_in(path) or path
-    if iteration is None and path.is_dir():
-        path = file_of_make(path) or path
-    if path.is_dir():
-        folder = training_folder(path)
-        found, gaussians = folder.read_scene(iteration)
-        file = folder.scene_path(found)
-    else:
-        if iteration is not None:
-            raise UserError("`iteration` selects a scene of an output folder; leave it out")
-        file, gaussians = path, read_gaussians(path)
-        return viewable(file, gaussians)
-    gaussians = seen_by_cameras(gaussians, folder)
-    return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
+    project = scene if isinstance(scene, Project) else Project.open(scene, iteration)
+    return viewable(project, read_gaussians(project.scene_file()))
 
 
-def viewable(file: Path, gaussians: Gaussians) -> ViewableScene:
-    """The scene of a file, with the cameras and the background of its training if it is known.
+def viewable(project: Project, gaussians: Gaussians) -> ViewableScene:
+    """``gaussians``, read from the scene file of a project, with the cameras and the background of
+    its training if it is known.
 
     An edited scene has the cameras of the other scene, at its scale, turned with it.
     """
-    record = read_record(file)
-    if record is None:
-        folder = folder_around(file)
-        gaussians = seen_by_cameras(gaussians, folder)
-        return ViewableScene(file, gaussians, cameras_of(folder), background_of(folder))
-    folder = folder_around(file.with_name(Path(record.scene).name))
-    origin = folder.origin()
-    change = change_of(record)
+    training, edit = project.original.training, project.edit
+    cameras, background = cameras_of(training)[1], (0.0, 0.0, 0.0)
+    origin = None
+    if training is not None:
+        origin, background = training.origin(), training.background()
+    if edit is None:
+        gaussians = seen_from_dataset(gaussians, origin)
+        return ViewableScene(project.scene_file(), gaussians, cameras, background)
+    change = change_of(edit)
     gaussians = seen_from_dataset(gaussians, origin and moved_origin(origin, change))
-    cameras = [camera.transformed(change) for camera in cameras_of(folder)]
-    start = None if record.start is None else _view(record.start)
-    notes = [(note, _view(note.view)) for note in record.notes]
-    turned = record.turn is not None
-    return ViewableScene(file, gaussians, cameras, background_of(folder), start, notes, turned)
+    return ViewableScene(
+        project.scene_file(),
+        gaussians,
+        [camera.transformed(change) for camera in cameras],
+        background,
+        None if edit.start is None else _view(edit.start),
+        [(note, _view(note.view)) for note in edit.notes],
+        turned=edit.turn is not None,
+    )
 
 
 def change_of(record: EditRecord) -> Similarity:

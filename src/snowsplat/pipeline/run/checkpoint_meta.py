@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from snowsplat.pipeline.output.output_folder import FORMER_DATASET, DatasetSettings
 from snowsplat.pipeline.run.photo_stamps import Stamp
+from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import from_json
@@ -35,10 +35,7 @@ class CheckpointMeta:
         Raises: UserError: not a checkpoint of a training run, or damaged.
         """
         try:
-            values = dict(start.meta)
-            if FORMER_DATASET in values:
-                values["dataset"] = values.pop(FORMER_DATASET)
-            meta = from_json(CheckpointMeta, values)
+            meta = from_json(CheckpointMeta, dict(start.meta))
             if meta.time is not None and meta.time.keys() != {"seconds", "spent"}:
                 raise ValueError("invalid time budget")
         except ValueError as error:

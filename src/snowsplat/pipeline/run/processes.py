@@ -29,7 +29,7 @@ from snowsplat.util.interrupts import ended_together, interrupts_between_steps
 if TYPE_CHECKING:
     import torch
 
-    from snowsplat.pipeline.output.output_folder import DatasetSettings
+    from snowsplat.project.training_folder import DatasetSettings
     from snowsplat.training.core.run import Loss
     from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
@@ -127,6 +127,7 @@ def follow(
 ) -> None:
     """Take part in the training of process 0, until it ends; ``parts`` and ``loss`` as there."""
     from snowsplat.pipeline.run.collective import Collective
+    from snowsplat.pipeline.run.training_files import read_dataset
     from snowsplat.training.core.checkpoint import load
     from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.list import parts_of
@@ -136,7 +137,7 @@ def follow(
     assert isinstance(setup, Setup)
     state = None if setup.checkpoint is None else load(setup.checkpoint).tensors
     trainer = Trainer(
-        setup.settings.load(),
+        read_dataset(setup.settings),
         setup.config,
         setup.schedule,
         device,

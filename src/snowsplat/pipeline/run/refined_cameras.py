@@ -16,16 +16,13 @@ import numpy as np
 from snowsplat.data import Dataset, View
 from snowsplat.data.colmap import ColmapImage, posed_camera, read_model, write_model
 from snowsplat.data.lens.perspective import Pinhole
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import opposite
 from snowsplat.util.errors import UserError
 
-#: The folder of the model in an output folder, beside which a link to the photos makes a dataset.
-FOLDER = "refined"
-_SPARSE = ("sparse", "0")
 
-
-def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
+def write_refined(output: TrainingFolder, views: Iterable[View], full: Dataset) -> Path:
     """Write the model of ``views``, which may have any size; returns its folder.
 
     ``full``: the same dataset, with the photos at their full size.
@@ -44,17 +41,17 @@ def write_refined(output: Path, views: Iterable[View], full: Dataset) -> Path:
     xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if full.points is not None:
         xyz, rgb = full.points.xyz.double().numpy() + full.origin, full.points.rgb.numpy()
-    folder = output.joinpath(FOLDER, *_SPARSE)
+    folder = output.refined_model
     write_model(folder, {number: camera for camera, number in numbers.items()}, images, xyz, rgb)
     return folder
 
 
-def with_refined(output: Path, dataset: Dataset) -> Dataset:
+def with_refined(output: TrainingFolder, dataset: Dataset) -> Dataset:
     """The dataset with the cameras of `write_refined`; unchanged if there are none.
 
     Raises: UserError: the model is damaged, or a photo is not in it.
     """
-    folder = output.joinpath(FOLDER, *_SPARSE)
+    folder = output.refined_model
     if not folder.is_dir():
         return dataset
     model = read_model(folder)
@@ -64,10 +61,10 @@ def with_refined(output: Path, dataset: Dataset) -> Dataset:
         if view.name not in images:
             raise UserError(
                 "{folder}: has no camera for {name}; use the dataset of the training, or remove "
-                "{folder2} to use the cameras of the dataset",
+                "{refined} to use the cameras of the dataset",
                 folder=folder,
                 name=view.name,
-                folder2=output / FOLDER,
+                refined=output.refined,
             )
         camera = posed_camera(model, images[view.name]).seen_from(dataset.origin)
         camera = camera.scaled(view.camera.width, view.camera.height)

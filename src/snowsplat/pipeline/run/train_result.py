@@ -8,6 +8,7 @@ from pathlib import Path
 
 from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.evaluation.verdict import Verdict
+from snowsplat.project.left_out import LeftOut
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,8 @@ class TrainResult:
         memory: the peak memory of the steps, as text.
         reductions: what was reduced because of the memory budget, as text.
         evaluation: the step and the metrics of the last evaluation on held-out photos.
-        left_out: names of the training photos that were left out, because the scene does not
-            explain them; see ``TrainConfig.leave_out_after``.
+        left_out: the training photos that were left out, because the scene does not explain
+            them; see ``TrainConfig.leave_out_after``.
         moving: the share of each photo that is masked because something moves there, by name; see
             ``TrainConfig.transients``.
         poses: the line about the camera poses: how far they were refined, or that they are not
@@ -45,7 +46,7 @@ class TrainResult:
     memory: str
     reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
-    left_out: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
     moving: Mapping[str, float]
     poses: str | None
     verdict: Verdict | None

@@ -14,8 +14,6 @@ from snowsplat.data import Dataset
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.output.output_folder import DatasetSettings, OutputFolder
-from snowsplat.pipeline.output.scene_paths import folder_of_make, scene_name
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.collective import Collective
 from snowsplat.pipeline.run.live_page import LivePage
@@ -24,7 +22,16 @@ from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
+from snowsplat.pipeline.run.training_files import (
+    read_dataset,
+    write_beginning,
+    write_cameras,
+    write_scene,
+)
 from snowsplat.pipeline.run.watchers import Watchers
+from snowsplat.project.left_out import LeftOut
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import UNEXPLAINED, DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm.report.capture_verdict import recorded_verdict
 from snowsplat.training.budgets.pace import Pace
@@ -56,7 +63,7 @@ _TRAINING_VIEWS = 4
 class TrainingRun:
     """One training run, to its end or to Ctrl-C."""
 
-    out: OutputFolder
+    out: TrainingFolder
     # settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
     settings: DatasetSettings
     recipe: str
@@ -164,8 +171,9 @@ class TrainingRun:
         left = self._left.after(schedule, progress.step, progress.downscale, progress.gaussians)
         return left if self.budget is None else max(0.0, self.budget.left)
 
-    def _left_out(self) -> tuple[str, ...]:
-        return tuple(self.trainer.dataset.train[i].name for i in self.trainer.left_out)
+    def _left_out(self) -> tuple[LeftOut, ...]:
+        views = self.trainer.dataset.train
+        return tuple(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.left_out)
 
     def _masks(self) -> dict[str, Image]:
         return {} if self.transients is None else self.transients.pictures()
@@ -195,15 +203,15 @@ class TrainingRun:
         cameras = self.trainer.cameras
         if not isinstance(cameras, DatasetCameras):  # a part has refined them
             views = [*cameras.views(), *cameras.test_views()]
-            self.out.write_cameras(views)
-            write_refined(self.out.path, views, replace(self.settings, resolution=-1).load())
-        return self.out.write_scene(self.trainer.step, gaussians)
+            write_cameras(self.out, views)
+            write_refined(self.out, views, read_dataset(replace(self.settings, resolution=-1)))
+        return write_scene(self.out, self.trainer.step, gaussians)
 
     def _restore_folder(self) -> None:
         """Create the folder again if it was moved or removed, so that the training is not lost."""
-        if not self.out.is_output_folder():
+        if not self.out.is_training():
             warnings.warn(f"{self.out.path}: was removed; it is created again", stacklevel=2)
-            self.out.describe(self.trainer.dataset, self.settings, self.config)
+            write_beginning(self.out, self.trainer.dataset, self.settings, self.config)
 
     def _save_checkpoint(self) -> Path:
         self._restore_folder()
@@ -245,7 +253,7 @@ class TrainingRun:
             if self.evaluation is None or self.evaluation[0] != step:
                 self._record_evaluation(step, self.together.evaluate())
             assert self.evaluation is not None
-            self.out.write_metrics(step, "test", self.evaluation[1], self._left_out())
+            self.out.write_metrics(step, "test", self.evaluation[1].as_json(), self._left_out())
         if self.page is not None:
             self.page.end_training(self._result_lines(len(gaussians), seconds))
         self.history.write(self.out.history)
@@ -257,7 +265,8 @@ class TrainingRun:
         report = self._write_report(gaussians, poses, verdict)
         time_used = None
         if self.budget is not None:
-            self.out.write_config(self.settings, replace(self.config, iterations=step))
+            longer = config_to_json(replace(self.config, iterations=step))
+            self.out.write_settings(self.settings, longer)
             time_used = self.budget.as_json()["spent"], self.budget.seconds
         result = TrainResult(
             scene=scene,
@@ -316,8 +325,8 @@ class TrainingRun:
         """The verdict on the scene; see `TrainResult.verdict`."""
         if self.evaluation is None:
             return None
-        dataset, left_out = self._dataset(), self._left_out()
-        used = [view for view in dataset.train if view.name not in left_out]
+        dataset = self._dataset()
+        used = [view for i, view in enumerate(dataset.train) if i not in self.trainer.left_out]
         with single_threaded():
             trained_on = evaluate_views(
                 gaussians,
@@ -328,7 +337,7 @@ class TrainingRun:
             self.evaluation[1],
             trained_on,
             dataset,
-            left_out=left_out,
+            left_out=[each.photo for each in self._left_out()],
             spread=pstdev(exposures) if (exposures := self._mean_exposures()) else 0.0,
             poses=about_poses if self.poses is None else None,  # refined poses are no fault
             capture=recorded_verdict(Path(self.settings.path)),
@@ -347,14 +356,15 @@ class TrainingRun:
         self, gaussians: Gaussians, about_poses: str | None, verdict: Verdict | None
     ) -> Path:
         # Users may share the report, so it contains names of files but no paths.
-        out, folder = self.out.path, folder_of_make(self.out.path)
+        project = Project.open(self.out.path)
+        folder = project.home
         dataset = asdict(self.settings)
         for key in ("path", "test_list"):
             dataset[key] = dataset[key] and Path(dataset[key]).name
         write_training_report(
             self.out.report,
             Trained(
-                name=scene_name(out),
+                name=project.name,
                 folder=folder.resolve().name if folder.is_absolute() else str(folder),
                 dataset=self._dataset(),
                 gaussians=gaussians,
@@ -362,7 +372,7 @@ class TrainingRun:
                 background=self.out.settings()[1],
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
-                left_out=self._left_out(),
+                left_out=tuple(each.photo for each in self._left_out()),
                 exposures=self._mean_exposures(),
                 masks=self._masks(),
                 poses=about_poses,
@@ -374,7 +384,7 @@ class TrainingRun:
                     "training": config_to_json(self.config),
                 },
                 peak_bytes=peak_bytes(),
-                of_make=folder != out,
+                of_make=folder != self.out.path,
             ),
         )
         return self.out.report

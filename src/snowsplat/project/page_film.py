@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from snowsplat.pipeline.output.edit_record import is_view
+from snowsplat.project.edit_record import is_view
 
 #: Width and height of the films, in pixels.
 SIZES = ("1920x1080", "1080x1920", "1080x1080")
