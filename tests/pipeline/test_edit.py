@@ -14,7 +14,7 @@ from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames
-from snowsplat.pipeline.output import edit_record
+from snowsplat.project import edit_record
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.view import viewed_scene

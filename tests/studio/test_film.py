@@ -10,7 +10,7 @@ from pathlib import Path
 import av
 import pytest
 
-from snowsplat.pipeline.output import page_film
+from snowsplat.project import page_film
 from snowsplat.studio import job, worker
 
 from ..browser import Browser
