@@ -14,10 +14,10 @@ from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames
-from snowsplat.project import edit_record
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.view import viewed_scene
+from snowsplat.project import edit_record
 from snowsplat.project.edit_record import Note, PageEdit, read_record, shown_file
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.training_folder import TrainingFolder
