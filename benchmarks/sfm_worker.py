@@ -71,7 +71,7 @@ class Stopwatch:
     def note(self, line: str) -> None:
         pass
 
-    def placed(self, photos: object, points: object) -> None:
+    def show_poses(self, photos: object, points: object) -> None:
         pass
 
     def _switch(self, to: str) -> None:

@@ -29,7 +29,7 @@ def test_photos_are_placed_one_by_one(studio):
     for count in (2, 3):
         names = [f"walk/{letter}.jpg" for letter in "abc"[:count]]
         photos = [PlacedPhoto(n, None, standing(i), 0.5, 0.4) for i, n in enumerate(names)]
-        recorder.placed(photos, cloud)
+        recorder.show_poses(photos, cloud)
         answer = studio.ask(address)[1]
         assert "placed" not in answer["state"]  # there may be thousands
         drawn.add(answer["map"])

@@ -47,8 +47,8 @@ class Observer:
     def end(self, stage: str, outcome: Outcome) -> None:
         """The stage has finished, now or in an earlier run."""
 
-    def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
-        """Photos have a pose; see `snowsplat.sfm.progress.Placed`."""
+    def show_poses(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+        """Photos have a pose; see `snowsplat.sfm.progress.ShowPoses`."""
 
     def leave(self) -> None:
         """The stage that began last is over; there is nothing to tell about it."""
@@ -111,7 +111,7 @@ def _passed_on(name: str) -> Callable[..., None]:
 
 
 for _name in (
-    *("note", "end", "placed", "leave", "page_opened"),
+    *("note", "end", "show_poses", "leave", "page_opened"),
     *("steps_begin", "step", "steps_end", "trained"),
 ):
     setattr(Observers, _name, _passed_on(_name))

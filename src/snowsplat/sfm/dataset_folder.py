@@ -88,8 +88,8 @@ class Watcher(Protocol):
     def note(self, line: str) -> None:
         """Called with a line of information for the user."""
 
-    def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
-        """Called every two seconds while photos get their poses; see `progress.Placed`."""
+    def show_poses(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+        """Called every two seconds while photos get their poses; see `progress.ShowPoses`."""
 
 
 def make_dataset(
@@ -181,7 +181,7 @@ def _run(
     def find_poses(report: Report) -> dict[str, Any]:
         if options.skip_matching:
             return asdict(describe_model(folder, photos))
-        watchers = report, left.figures, watcher.placed
+        watchers = report, left.figures, watcher.show_poses
         return asdict(estimate_poses(folder, photos, options.sfm, *watchers))
 
     settings = {k: v for k, v in asdict(options.sfm).items() if k not in ("threads", "seconds")}

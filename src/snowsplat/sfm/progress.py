@@ -33,7 +33,7 @@ def silent(done: int, total: int, what: str = "", left: float | None = None) -> 
 Figures = Callable[[float, float], None]
 
 
-class Placed(Protocol):
+class ShowPoses(Protocol):
     """Receives the photos that have a pose so far, and some points (P, 3), every two seconds.
 
     Scale and orientation are arbitrary, and another attempt begins anew.

@@ -113,7 +113,7 @@ class _Recorder(Observer):
             self.state.pop("placed", None)
         self.leave()
 
-    def placed(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
+    def show_poses(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
         self.state["placed"] = [photo.name for photo in photos]
         self._draw_map(lambda made: draw_level(photos, points))
         self.write()

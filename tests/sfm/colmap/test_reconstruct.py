@@ -9,7 +9,7 @@ from snowsplat.sfm.colmap import reconstruct
 from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
 from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.colmap.options import SfmOptions
-from snowsplat.sfm.colmap.reconstruct import PoseEstimation
+from snowsplat.sfm.colmap.reconstruct import PoseEstimation, best_attempt
 from snowsplat.sfm.progress import silent
 
 
@@ -29,7 +29,8 @@ def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registe
     job = PoseEstimation(Folders(tmp_path), [], options, 1, progress)
     job.started = time.monotonic() - elapsed
     job.attempts = [SimpleNamespace(registered=registered)]
-    assert job._enough(SimpleNamespace(usable=10)) == enough
+    job.evidence = SimpleNamespace(usable=10)
+    assert job._enough == enough
 
 
 @pytest.mark.parametrize(
@@ -50,8 +51,9 @@ def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
         )
         for n, share in attempts
     ]
-    assert job._good(SimpleNamespace(usable=10)) == good
-    assert job._best() is job.attempts[best]
+    job.evidence = SimpleNamespace(usable=10)
+    assert job._good == good
+    assert best_attempt(job.attempts) is job.attempts[best]
 
 
 def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
@@ -61,9 +63,9 @@ def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
         SimpleNamespace(registered=n, agreement=share, error=e, lens=lens, doubts=[], misfit=e)
         for n, share, e, lens in ((9, 0.95, 0.24, fisheye), (10, 0.99, 0.62, Lens()))
     ]
-    assert job._best() is job.attempts[0]
+    assert best_attempt(job.attempts) is job.attempts[0]
     job.attempts[1].error = 0.25
-    assert job._best() is job.attempts[1]
+    assert best_attempt(job.attempts) is job.attempts[1]
 
 
 def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_path):
@@ -75,9 +77,9 @@ def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_p
     ]
     bent, other = job.attempts
     bent.doubts, other.doubts = ["the focal length in EXIF does not agree with the photos"], []
-    assert job._best() is other
+    assert best_attempt(job.attempts) is other
     other.misfit = 1.2e-3  # the photos contradict the focal length in EXIF
-    assert job._best() is bent
+    assert best_attempt(job.attempts) is bent
 
 
 @pytest.mark.parametrize(
@@ -100,4 +102,5 @@ def test_the_focal_length_in_exif_is_held_if_the_lens_contradicts_it(
             registered=9, agreement=0.95, error=1.0, lens=Lens(), doubts=doubts, misfit=1.0
         )
     ]
-    assert job._contradicts_exif(Lens(exif=exif)) == tried
+    job.lens = Lens(exif=exif)
+    assert job._contradicts_exif() == tried

@@ -36,46 +36,31 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from collections.abc import Sequence
 
-import numpy as np
-import pycolmap
-
-from snowsplat.sfm.colmap.checks.consistency import CONSISTENT, agreement_of_model
-from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure, gather_evidence
-from snowsplat.sfm.colmap.checks.repair import repair
+from snowsplat.sfm.colmap.attempt import AnyMapper, Attempt, AttemptRunner, Matched
+from snowsplat.sfm.colmap.checks.consistency import CONSISTENT
+from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
 from snowsplat.sfm.colmap.database import (
-    fingerprint_of,
     forget_verification,
-    open_database,
-    read_descriptors,
     remove_database,
     replace_database,
     set_cameras,
     verified_pairs,
 )
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress, extract_features
+from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
 from snowsplat.sfm.colmap.lenses import camera_groups
 from snowsplat.sfm.colmap.lenses.fisheye import LensEvidence, lens_evidence
 from snowsplat.sfm.colmap.lenses.lens import (
     EQUAL_ERROR,
     Lens,
-    Refine,
     camera_ids,
     circle_focals,
     exif_focals,
     focals_by_camera,
-    misfit,
-    settled,
-    with_all_parameters,
 )
-from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models, write_models
-from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult, detection_size
-from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
-from snowsplat.sfm.colmap.pairs.pair_matching import match_pairs, verify_pairs
-from snowsplat.sfm.colmap.pairs.retrieval import FEATURES, similarity
+from snowsplat.sfm.colmap.mapping.mapping import write_models
+from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
 from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.ingest.photo import Photo
 
@@ -83,60 +68,26 @@ _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time
 # from the start of the job until now.
 _NEXT_ATTEMPT = 3.0
-# Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
-# which the features were detected.
-_MAX_ERROR = 4.0
 # A model of the wrong kind of lens has larger errors than one of the right kind, by this factor.
 _OTHER_LENS = 1.25
+# The photos of a model that is in doubt count as this share of their number: it is chosen only if
+# it has twice as many photos as one without doubts.
+_IN_DOUBT = 0.5
 # Each attempt with several focal lengths has better estimates of them than the one before.
 _ZOOM_ATTEMPTS = 3
 
-_MAPPING = {
-    "incremental": "incremental mapping",
-    "plain": "incremental mapping in COLMAP's order",
-    "global": "global mapping",
-}
-
-
-@dataclass(frozen=True)
-class Matched:
-    """A database with features and matches, and how they were made."""
-
-    database: Path
-    effort: Effort  # with which the features were detected
-    choice: PairChoice
-    scale: float  # size of a photo / size at which its features were detected (1 or more)
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """The result of an attempt."""
-
-    matched: Matched
-    lens: Lens  # with which the attempt began
-    mapping: Mapping  # for further work on the models
-    models: list[pycolmap.Reconstruction]
-    agreement: float  # of the first model with its matches; see `agreement_of`
-    left_out: dict[str, str]  # name -> reason, for photos that had a pose in a wrong place
-    doubts: list[str]  # about the lenses, as text for users
-
-    @property
-    def registered(self) -> int:
-        return self.models[0].num_reg_images() if self.models else 0
-
-    @property
-    def error(self) -> float:
-        """The mean reprojection error of the first model, in pixels of the photos."""
-        return self.models[0].compute_mean_reprojection_error() if self.models else float("inf")
-
-    @property
-    def misfit(self) -> float:
-        """`lens.misfit` of the first model."""
-        return misfit(self.models[0]) if self.models else float("inf")
-
 
 class PoseEstimation:
-    """The attempts for one set of photos. `run` makes them and writes the best result."""
+    """The attempts for one set of photos. `run` makes them and writes the best result.
+
+    Each method ``_try_…`` is a remedy for one cause of a failure: it makes an attempt if the
+    attempts before show this cause.
+    """
+
+    matched: Matched  # of the last attempt
+    evidence: Evidence  # of the matches of the first attempts
+    mapper: Mapper  # of the first attempt
+    lens: Lens  # with which the next attempt begins
 
     def __init__(
         self,
@@ -147,14 +98,19 @@ class PoseEstimation:
         progress: WorkerProgress,
     ) -> None:
         self.folders = folders
-        self.photos = photos  # `_try_zooms` may change their groups
+        self.strong_database = folders.distorted / "database_strong.db"  # with more features
         self.options = options
         self.threads = threads
         self.progress = progress
+        self.runner = AttemptRunner(folders, photos, options.camera_model, threads, progress)
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
         self.log: list[str] = []  # a description of each attempt, as text for users
+
+    @property
+    def photos(self) -> list[Photo]:
+        return self.runner.photos
 
     def run(self, effort: Effort) -> SfmResult:
         """Make the attempts, the first with ``effort``; write ``sparse/`` and the database.
@@ -162,126 +118,184 @@ class PoseEstimation:
         Raises: UserError: no camera poses were found.
         """
         shutil.rmtree(self.folders.sparse, ignore_errors=True)
-        second = self.folders.distorted / "database_strong.db"
         given = self.photos
-        evidence = self._make_attempts(effort, second)
-        best = self._best()
+        self._make_attempts(effort)
+        best = best_attempt(self.attempts)
         if not best.models:
-            remove_database(second)
-            raise failure(evidence, next((a.doubts for a in self.attempts if a.doubts), []))
-        self.progress.placed(best.models[0], True)
+            doubts = next((a.doubts for a in self.attempts if a.doubts), [])
+            error = failure(self.runner.evidence(self.matched), doubts)
+            remove_database(self.strong_database)
+            raise error
+        self.progress.show_poses(best.models[0], True)
         for model in best.models:
             best.mapping.align_features(model, best.matched.effort.image_size)
             best.mapping.add_points(model)
             model.extract_colors_for_all_images(self.folders.images, self.threads)
         write_models(best.models, self.folders.sparse)
         names = [names_in(model) for model in best.models]
-        reasons = explain(self.photos, self._evidence(best.matched), names, best.left_out)
+        evidence = self.runner.evidence(best.matched)
         result = result_of(
             best.models,
             self.photos,
-            reasons,
+            explain(self.photos, evidence, names, best.excluded),
             best.matched.choice.description,
             self.log,
             exif=best.lens.exif,
             held=best.mapping.held,
         )
-        if best.matched.database == second:
-            replace_database(self.folders.database, by=second)
-        remove_database(second)
-        zooms = "" if self.photos is given else camera_groups.describe(best.models[0])
+        if best.matched.database == self.strong_database:
+            replace_database(self.folders.database, by=self.strong_database)
+        remove_database(self.strong_database)
         doubts = list(best.doubts)
         if best.agreement < CONSISTENT:
             doubts.append(
                 f"the poses may be bent: where they fit least, {best.agreement:.0%} of the matches "
                 "between neighbouring photos agree with them"
             )
-        doubts += self._other_lens(best)
         return dataclasses.replace(
             result,
-            doubts=doubts,
-            zooms=zooms,
+            doubts=doubts + self._doubt_about_fisheye(best),
+            zooms="" if self.photos is given else camera_groups.describe(best.models[0]),
             agreement=best.agreement,
-            fisheye=self._found_fisheye(best),
+            fisheye=self._describe_fisheye(best),
         )
 
-    def _make_attempts(self, effort: Effort, second: Path) -> Evidence:
-        """Make as many attempts as needed; returns the evidence of the last matching. ``second`` is
-        the path of the database for the attempts that have more features."""
-        first, mapper = self.folders.database, self.options.mapper
-        matched = self._match(first, effort, effort, reserve=False)
-        self.lens_evidence = lens_evidence(first, self.photos, matched.scale)
-        lens = self._first_lens()
-        self._verify(matched, lens)
-        completed = matched.choice.completed(verified_pairs(first), len(self.photos))
-        matched = self._with_pairs(matched, completed, lens)
-        evidence = self._evidence(matched)
-        if evidence.flat:
-            mapper = "incremental"  # the global mapper returns a wrong depth for flat scenes
-        self._try("as configured", matched, mapper, lens)
-        if not self._good(evidence) and matched.choice.reserve:
-            matched = self._with_pairs(matched, matched.choice.whole(), lens)
-            evidence = self._evidence(matched)
-            self._try("with more pairs", matched, mapper, lens)
-        if not self._found and evidence.flat and exif_focals(self.photos):
-            lens = dataclasses.replace(lens, exif=False)
-            forget_verification(first)
-            self._verify(matched, lens)
-            evidence = self._evidence(matched)
-            self._try("as configured", matched, mapper, lens)
-        if lens.fisheyes and not self._good(evidence):
-            ordinary = dataclasses.replace(lens, fisheyes=frozenset(), focals={})
-            self._try("as configured", matched, mapper, ordinary)
-            lens = self._best().lens
-        if not self._found and evidence.more_effort_is_useless:
-            return evidence
-        other: Mapper = "incremental" if mapper == "global" else "global"
-        if not (self._good(evidence) or evidence.flat):
-            self._try("as configured", matched, other, lens)
-        if not self._good(evidence) or self._contradicts_exif(lens):
-            self._try("as configured", matched, "incremental", lens.fixed)
-        if not self._enough(evidence):
-            self._try("as configured", matched, "plain", lens)
-        if not lens.any_fisheye:  # fisheye lenses with a zoom are rare
-            lens = self._try_zooms(matched, mapper, lens, evidence)
-        if self._enough(evidence):
-            return evidence
-        if not (self._found and evidence.matched_all):
-            matched = self._match(first, effort, effort.stronger())
-            self._verify(matched, lens)
-            self._try("with more pairs and weaker matches", matched, "incremental", lens, True)
-        if self._enough(evidence):
-            return self._evidence(matched)
-        strong = effort.stronger()
-        matched = self._match(second, strong, strong)
-        self._verify(matched, lens)
+    def _make_attempts(self, effort: Effort) -> None:
+        """Make as many attempts as needed, the first with ``effort``."""
+        self._try_first(effort)
+        self._try_reserved_pairs()
+        self._try_without_exif()
+        self._try_ordinary_lens()
+        if not self._found and self.evidence.more_effort_is_useless:
+            return
+        self._try_other_mapper()
+        self._try_held_focal_length()
+        self._try_plain_order()
+        self._try_zooms()
+        if not self._enough:
+            self._try_more_pairs(effort)
+        if not self._enough:
+            self._try_more_features(effort.stronger())
+
+    def _try(
+        self,
+        how: str,
+        mapper: AnyMapper | None = None,
+        lens: Lens | None = None,
+        weak: bool = False,
+    ) -> None:
+        """Make an attempt with the last matches; the default is the mapper and the lens of the
+        first attempt. ``weak``: accept weaker matches."""
+        attempt = self.runner.run(how, self.matched, mapper or self.mapper, lens or self.lens, weak)
+        self.attempts.append(attempt)
+        self.log.append(attempt.description)
+
+    def _try_first(self, effort: Effort) -> None:
+        database = self.folders.database
+        self.matched = self.runner.match(database, effort, effort, reserve=False)
+        self.lens_evidence = lens_evidence(database, self.photos, self.matched.scale)
+        self.lens = self._first_lens()
+        self.runner.verify(self.matched, self.lens)
+        completed = self.matched.choice.completed(verified_pairs(database), len(self.photos))
+        self.matched = self.runner.match_more(self.matched, completed, self.lens)
+        self.evidence = self.runner.evidence(self.matched)
+        # The global mapper returns a wrong depth for flat scenes.
+        self.mapper = "incremental" if self.evidence.flat else self.options.mapper
+        self._try("as configured")
+
+    def _try_reserved_pairs(self) -> None:
+        """Pairs of similar photos were held in reserve, because places may only look alike."""
+        if self._good or not self.matched.choice.reserve:
+            return
+        self.matched = self.runner.match_more(self.matched, self.matched.choice.whole(), self.lens)
+        self.evidence = self.runner.evidence(self.matched)
+        self._try("with more pairs")
+
+    def _try_without_exif(self) -> None:
+        """With a wrong focal length, the matches may show only a rotation."""
+        if self._found or not (self.evidence.flat and exif_focals(self.photos)):
+            return
+        self.lens = dataclasses.replace(self.lens, exif=False)
+        forget_verification(self.matched.database)
+        self.runner.verify(self.matched, self.lens)
+        self.evidence = self.runner.evidence(self.matched)
+        self._try("as configured")
+
+    def _try_ordinary_lens(self) -> None:
+        """The matches, or a disc, may suggest a fisheye lens where there is none."""
+        if self.lens.fisheyes and not self._good:
+            ordinary = dataclasses.replace(self.lens, fisheyes=frozenset(), focals={})
+            self._try("as configured", lens=ordinary)
+            self.lens = best_attempt(self.attempts).lens
+
+    def _try_other_mapper(self) -> None:
+        if not (self._good or self.evidence.flat):
+            self._try("as configured", self._other_mapper)
+
+    def _try_held_focal_length(self) -> None:
+        """The photos may not determine the focal length."""
+        if not self._good or self._contradicts_exif():
+            self._try("as configured", "incremental", self.lens.fixed)
+
+    def _try_plain_order(self) -> None:
+        if not self._enough:
+            self._try("as configured", "plain")
+
+    def _try_more_pairs(self, effort: Effort) -> None:
+        if self._found and self.evidence.matched_all:
+            return
+        self.matched = self.runner.match(self.folders.database, effort, effort.stronger())
+        self.runner.verify(self.matched, self.lens)
+        self._try("with more pairs and weaker matches", "incremental", weak=True)
+
+    def _try_more_features(self, effort: Effort) -> None:
         how = "with more features, from larger photos"
-        self._try(how, matched, mapper, lens, True)
-        if not self._enough(evidence):
-            self._try(how, matched, "incremental", lens.fixed)
-        if not self._enough(evidence) and not evidence.flat:
-            self._try(how, matched, other, lens, True)
-        return self._evidence(matched)
+        self.matched = self.runner.match(self.strong_database, effort, effort)
+        self.runner.verify(self.matched, self.lens)
+        self._try(how, weak=True)
+        if not self._enough:
+            self._try(how, "incremental", self.lens.fixed)
+        if not self._enough and not self.evidence.flat:
+            self._try(how, self._other_mapper, weak=True)
 
-    def _best(self) -> Attempt:
-        """The attempt with the most registered photos, weighted by the share of correct matches.
+    def _try_zooms(self) -> None:
+        """The photos of a camera may have several focal lengths, which remain for the others.
 
-        A model that is bent, because photos were registered with too few points, may have all
-        photos. So may a model of the wrong kind of lens, but it has larger errors. A lens in doubt,
-        for example because of EXIF, is right only if no other lens agrees equally well with the
-        matches.
-        """
-        least = min(attempt.error for attempt in self.attempts)
-        lenses = {attempt.lens.any_fisheye for attempt in self.attempts}
-        undoubted = min((a.misfit for a in self.attempts if not a.doubts), default=float("inf"))
+        Fisheye lenses with a zoom are rare, so they are not tried."""
+        lens = self.lens
+        one, best = self.photos, best_attempt(self.attempts)
+        if lens.any_fisheye or not camera_groups.may_differ(one):
+            return
+        if not self._enough:
+            pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
+            set_cameras(self.matched.database, camera_groups.separate(one), pinhole)
+            models = self.runner.mapping(self.matched, pinhole).run("incremental")
+            focals = camera_groups.focals_of(models[0]) if models else {}
+        else:
+            focals = camera_groups.own_focals(best.models[0], self.threads)
+        for _ in range(_ZOOM_ATTEMPTS):
+            before, several = self.photos, camera_groups.grouped(one, focals)
+            if several is None or camera_ids(several) == camera_ids(before):
+                break
+            self.runner.photos = several
+            begin = dataclasses.replace(lens, focals=focals_by_camera(several, focals))
+            self._try("with several focal lengths", lens=begin)
+            made, best = self.attempts.pop(), best_attempt(self.attempts)
+            made_better = bool(made.models) and camera_groups.better(
+                made.models[0], best.models, several=before is not one
+            )
+            if not made_better:
+                self.runner.photos = before
+                break
+            self.attempts, lens = [made], begin  # the other models are bent
+            model = made.models[0]
+            focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
+        set_cameras(self.matched.database, self.photos, lens)
+        self.lens = lens
 
-        def score(attempt: Attempt) -> float:
-            wrong_kind = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
-            doubtful = attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit
-            weight = 0.5 if wrong_kind or doubtful else 1.0
-            return attempt.registered * attempt.agreement * weight
-
-        return max(self.attempts, key=score)
+    @property
+    def _other_mapper(self) -> Mapper:
+        return "incremental" if self.mapper == "global" else "global"
 
     def _first_lens(self) -> Lens:
         """The lens of the first attempt, with the focal lengths that discs and matches propose."""
@@ -295,7 +309,7 @@ class PoseEstimation:
             return lens
         return dataclasses.replace(lens, focals=proposed | circles | sure)
 
-    def _found_fisheye(self, best: Attempt) -> str:
+    def _describe_fisheye(self, best: Attempt) -> str:
         """`SfmResult.fisheye` of the attempt ``best``."""
         if not best.lens.fisheyes:
             return ""
@@ -310,7 +324,7 @@ class PoseEstimation:
             "with any ordinary lens"
         )
 
-    def _other_lens(self, best: Attempt) -> list[str]:
+    def _doubt_about_fisheye(self, best: Attempt) -> list[str]:
         """A doubt, if the photos seem to be from a fisheye lens, but the model has an ordinary one.
 
         The model FOV describes fisheye lenses, too. An endoscope shows a disc without one: if poses
@@ -331,167 +345,50 @@ class PoseEstimation:
         """Whether an attempt has found poses."""
         return any(attempt.models for attempt in self.attempts)
 
-    def _match(
-        self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
-    ) -> Matched:
-        """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
-        ``reserve``: whether the pairs of the reserve are matched, too."""
-        fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
-        open_database(database, self.photos, Lens(self.options.camera_model), fingerprint)
-        extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
-        indices = range(len(self.photos))
-        choice = choose_pairs(
-            self.photos,
-            pairing,
-            lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices]),
-        )
-        choice = choice.whole() if reserve else choice
-        scales = [
-            max(photo.width, photo.height) / detection_size(effort.image_size, photo.panorama)
-            for photo in self.photos
-        ]
-        scale = max(1.0, float(np.median(scales)))
-        match_pairs(database, choice.pairs, _MAX_ERROR * scale, self.threads, self.progress)
-        return Matched(database, effort, choice, scale)
-
-    def _with_pairs(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
-        """Match and verify those pairs of ``choice`` that are not matched yet."""
-        if choice.pairs == matched.choice.pairs:
-            return matched
-        error = _MAX_ERROR * matched.scale
-        match_pairs(matched.database, choice.pairs, error, self.threads, self.progress)
-        more = dataclasses.replace(matched, choice=choice)
-        self._verify(more, lens)
-        return more
-
-    def _verify(self, matched: Matched, lens: Lens) -> None:
-        """Verify those matches of ``matched`` that are not verified yet. The cameras of ``lens``
-        replace those in the database."""
-        set_cameras(matched.database, self.photos, lens)
-        error, pairs = _MAX_ERROR * matched.scale, matched.choice.pairs
-        verify_pairs(matched.database, pairs, error, self.threads, self.progress)
-
-    def _try(
-        self,
-        how: str,
-        matched: Matched,
-        mapper: Mapper | Literal["plain"],
-        lens: Lens,
-        relaxed: bool = False,
-    ) -> None:
-        """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
-        set_cameras(matched.database, self.photos, lens)
-        mapping = self._mapping(matched, lens)
-        models = mapping.run(mapper, relaxed)
-        weak = ""
-        if models and models[0].num_reg_images() < len(self.photos):
-            before = models[0].num_reg_images()
-            models = mapping.extend(models)
-            added = models[0].num_reg_images() - before
-            weak = f", {added} of them with weak matches" if added else ""
-        check, left_out, doubts = "", dict[str, str](), list[str]()
-        if models:
-            repaired = repair(models[0], mapping, _MAX_ERROR * matched.scale)
-            left_out = repaired.left_out
-            check = f"; {repaired.description}" if repaired.description else ""
-            refine = self._refine(mapping)
-            found = settled(repaired.model, self.photos, lens, refine)
-            mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
-            if found.model:
-                model = with_all_parameters(found.model, self.photos, lens, refine, found.held)
-                models = usable_models([model, *models[1:]])
-            else:
-                models = []
-                check = f"; impossible: {', '.join(doubts)}"
-        agreement = 0.0
-        if models:
-            error = _MAX_ERROR * matched.scale
-            pairs = repaired.pairs if models[0] is repaired.model else None
-            agreement = agreement_of_model(models[0], matched.database, error, pairs)
-        attempt = Attempt(matched, lens, mapping, models, agreement, left_out, doubts)
-        self.attempts.append(attempt)
-        effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
-        self.log.append(
-            f"{how}{lens_text}: {effort.features} features per photo at {effort.image_size} "
-            f"pixels, {matched.choice.description}, {_MAPPING[mapper]}: "
-            f"{attempt.registered} of {len(self.photos)} photos registered{weak}{check}"
-        )
-
-    def _try_zooms(self, matched: Matched, mapper: Mapper, lens: Lens, evidence: Evidence) -> Lens:
-        """Make attempts with several focal lengths per camera, if one does not fit all photos.
-        Returns the lens of further attempts."""
-        one, best = self.photos, self._best()
-        if not camera_groups.may_differ(one):
-            return lens
-        if not self._enough(evidence):
-            pinhole = Lens("SIMPLE_PINHOLE", exif=lens.exif)
-            set_cameras(matched.database, camera_groups.separate(one), pinhole)
-            models = self._mapping(matched, pinhole).run("incremental")
-            focals = camera_groups.focals_of(models[0]) if models else {}
-        else:
-            focals = camera_groups.own_focals(best.models[0], self.threads)
-        for _ in range(_ZOOM_ATTEMPTS):
-            before, several = self.photos, camera_groups.grouped(one, focals)
-            if several is None or camera_ids(several) == camera_ids(before):
-                break
-            self.photos = several
-            begin = dataclasses.replace(lens, focals=focals_by_camera(several, focals))
-            self._try("with several focal lengths", matched, mapper, begin)
-            made, best = self.attempts.pop(), self._best()
-            made_better = bool(made.models) and camera_groups.better(
-                made.models[0], best.models, several=before is not one
-            )
-            if not made_better:
-                self.photos = before
-                break
-            self.attempts, lens = [made], begin  # the other models are bent
-            model = made.models[0]
-            focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
-        set_cameras(matched.database, self.photos, lens)
-        return lens
-
-    def _mapping(self, matched: Matched, lens: Lens) -> Mapping:
-        return Mapping(
-            matched.database,
-            self.folders.images,
-            matched.scale,
-            self.threads,
-            self.progress.report,
-            held=lens.held,
-            forward=lens.held,
-            placed=self.progress.placed,
-        )
-
-    @staticmethod
-    def _refine(mapping: Mapping) -> Refine:
-        return lambda model, cameras, held: dataclasses.replace(mapping, held=held).with_cameras(
-            model, cameras
-        )
-
-    def _contradicts_exif(self, lens: Lens) -> bool:
-        """Whether the best lens is in doubt, and EXIF knows another focal length, which is tried.
-
-        If the photos do not determine the focal length, the model that was made with a wrong one is
-        bent, so `settled`, which starts from this model, may not find that EXIF is right.
-        """
-        doubtful = lens.exif and bool(self._best().doubts) and not self._late()
-        return doubtful and bool(exif_focals(self.photos))
-
-    def _good(self, evidence: Evidence) -> bool:
+    @property
+    def _good(self) -> bool:
         """Whether enough photos are registered, in a model that agrees with its matches."""
-        consistent = self._best().agreement >= CONSISTENT
-        return self._enough(evidence) and (consistent or self._late())
+        consistent = best_attempt(self.attempts).agreement >= CONSISTENT
+        return self._enough and (consistent or self._late)
 
-    def _enough(self, evidence: Evidence) -> bool:
+    @property
+    def _enough(self) -> bool:
         """Whether no further attempt is made: enough photos are registered, or no time is left."""
         registered = max(attempt.registered for attempt in self.attempts)
-        least = 1.0 if self._late() else _ENOUGH * evidence.usable
+        least = 1.0 if self._late else _ENOUGH * self.evidence.usable
         return registered > 0 and registered >= least
 
+    @property
     def _late(self) -> bool:
         if self.options.seconds is None:
             return False
         return _NEXT_ATTEMPT * (time.monotonic() - self.started) > self.options.seconds
 
-    def _evidence(self, matched: Matched) -> Evidence:
-        return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))
+    def _contradicts_exif(self) -> bool:
+        """Whether the best lens is in doubt, and EXIF knows another focal length, which is tried.
+
+        If the photos do not determine the focal length, the model that was made with a wrong one is
+        bent, so `settled`, which starts from this model, may not find that EXIF is right.
+        """
+        doubtful = self.lens.exif and bool(best_attempt(self.attempts).doubts) and not self._late
+        return doubtful and bool(exif_focals(self.photos))
+
+
+def best_attempt(attempts: Sequence[Attempt]) -> Attempt:
+    """The attempt with the most registered photos, weighted by the share of correct matches.
+
+    A model that is bent, because photos were registered with too few points, may have all photos.
+    So may a model of the wrong kind of lens, but it has larger errors. A lens in doubt, for example
+    because of EXIF, is right only if no other lens agrees equally well with the matches.
+    """
+    least = min(attempt.error for attempt in attempts)
+    lenses = {attempt.lens.any_fisheye for attempt in attempts}
+    undoubted = min((a.misfit for a in attempts if not a.doubts), default=float("inf"))
+
+    def score(attempt: Attempt) -> float:
+        wrong_kind = len(lenses) > 1 and attempt.error > _OTHER_LENS * least
+        doubtful = attempt.doubts and undoubted <= (1 + EQUAL_ERROR) * attempt.misfit
+        weight = _IN_DOUBT if wrong_kind or doubtful else 1.0
+        return attempt.registered * attempt.agreement * weight
+
+    return max(attempts, key=score)

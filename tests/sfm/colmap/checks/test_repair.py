@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from snowsplat.scene.geometry import similarity_from_points
+from snowsplat.sfm.colmap.attempt import AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CheckedPair, check_pairs
 from snowsplat.sfm.colmap.checks.repair import _false_pairs, _parts, repair
 from snowsplat.sfm.colmap.database import closing_database, copy_for_mapping, verified_pairs
 from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
 from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
-from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
+from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.colmap.pairs.choice import PairChoice
-from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
 from snowsplat.sfm.progress import silent
 
 from .. import look_alikes
@@ -66,7 +66,7 @@ def test_a_correct_model_is_not_changed(mapping, scene):
     repaired = repair(model, mapping, 4.0)
     assert repaired.model is model
     assert state_of(model) == before
-    assert (repaired.contradicting, repaired.left_out, repaired.description) == (0, {}, "")
+    assert (repaired.contradicting, repaired.excluded, repaired.description) == (0, {}, "")
 
 
 @pytest.mark.parametrize("anew", [False, True], ids=["in the model", "in a new model"])
@@ -77,7 +77,7 @@ def test_a_folded_part_is_registered_again(mapping, scene, monkeypatch, anew):
     assert largest_centre_error(model, scene) > 5
     repaired = repair(model, mapping, 4.0)
     assert repaired.contradicting == len(FAR)
-    assert repaired.left_out == {}
+    assert repaired.excluded == {}
     assert (
         repaired.description
         == "the poses of 7 contradicted their matches: 7 registered again, 0 left out"
@@ -141,9 +141,9 @@ def test_a_part_that_cannot_be_registered_is_left_out_with_a_reason(
 ):
     monkeypatch.setattr(Mapping, "run", lambda self, mapper: [])
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
-    assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
+    assert set(repaired.excluded) == {f"{i - 1:02}.png" for i in FAR}
     assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
-    reason = repaired.left_out["09.png"]
+    reason = repaired.excluded["09.png"]
     assert reason.startswith("it was, with 6 other photos, in a place that its matches contradict")
     assert "09.png" in reason
     assert "but only 0 points in common" in reason
@@ -165,7 +165,7 @@ def test_photos_that_the_mapper_drops_are_named(mapping, scene, monkeypatch, tmp
     monkeypatch.setattr(Mapping, "run", drop)
     repaired = repair(look_alikes.model(scene, folded=True), mapping, 4.0)
     assert set(repaired.model.images).isdisjoint(FAR)
-    assert set(repaired.left_out) == {f"{i - 1:02}.png" for i in FAR}
+    assert set(repaired.excluded) == {f"{i - 1:02}.png" for i in FAR}
 
 
 def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypatch, made_anew):
@@ -180,7 +180,7 @@ def test_what_still_contradicts_at_the_end_is_left_out(mapping, scene, monkeypat
     assert len(made) == 3
     assert repaired.model is made[-1]
     assert set(repaired.model.reg_image_ids()).isdisjoint(FAR)
-    assert len(repaired.left_out) == len(FAR)
+    assert len(repaired.excluded) == len(FAR)
 
 
 def test_a_photo_may_be_in_a_later_model_only(mapping, scene, monkeypatch, tmp_path, made_anew):
@@ -192,7 +192,7 @@ def test_a_photo_may_be_in_a_later_model_only(mapping, scene, monkeypatch, tmp_p
     runs = iter([[folded], []])
     monkeypatch.setattr(Mapping, "run", lambda self, mapper: next(runs))
     repaired = repair(first, mapping, 4.0)
-    assert f"{look_alikes.COUNT - 1:02}.png" in repaired.left_out
+    assert f"{look_alikes.COUNT - 1:02}.png" in repaired.excluded
 
 
 def test_a_photo_that_no_other_photo_confirms_is_left_out(mapping, scene, monkeypatch):
@@ -211,7 +211,7 @@ def test_a_photo_that_no_other_photo_confirms_is_left_out(mapping, scene, monkey
     model = look_alikes.model(scene, folded=False)
     monkeypatch.setattr("snowsplat.sfm.colmap.checks.repair.check_pairs", doubtful)
     repaired = repair(model, mapping, 4.0)
-    assert repaired.left_out == {
+    assert repaired.excluded == {
         f"{last - 1}.png": "no other photo confirms its place: 4 photos have matches with it, and "
         f"at best 71% of the matches agree with its pose ({last - 2}.png)"
     }
@@ -244,13 +244,13 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
     progress = WorkerProgress(silent)
     photos = look_alikes.photos()
-    job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, progress)
+    runner = AttemptRunner(Folders(tmp_path), photos, "auto", 1, progress)
     choice = PairChoice(sorted(scene.matches), "neighbours")
     matched = Matched(mapping.database, EFFORTS["draft"], choice, 1.0)
-    job._try("as configured", matched, "global", Lens("SIMPLE_PINHOLE"))
-    assert job.attempts[0].registered == len(photos) - len(FAR)
-    assert len(job.attempts[0].left_out) == len(FAR)
-    assert job.log[0].endswith(
+    attempt = runner.run("as configured", matched, "global", Lens("SIMPLE_PINHOLE"))
+    assert attempt.registered == len(photos) - len(FAR)
+    assert len(attempt.excluded) == len(FAR)
+    assert attempt.description.endswith(
         "9 of 16 photos registered; the poses of 7 contradicted their matches: "
         "0 registered again, 7 left out"
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from snowsplat.sfm.colmap.attempt import Matched
 from snowsplat.sfm.colmap.checks.diagnosis import gather_evidence
 from snowsplat.sfm.colmap.database import set_cameras
 from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
@@ -22,7 +23,7 @@ from snowsplat.sfm.colmap.lenses.lens import Lens, camera_ids
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
 from snowsplat.sfm.colmap.pairs.choice import PairChoice
-from snowsplat.sfm.colmap.reconstruct import Matched, PoseEstimation
+from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.progress import silent
 
 from .. import walks
@@ -50,8 +51,10 @@ def attempted(folder, walk, exif=None):
     progress = WorkerProgress(silent)
     job = PoseEstimation(folders, photos, SfmOptions("SIMPLE_RADIAL"), 1, progress)
     matched = Matched(folders.database, EFFORTS["draft"], PairChoice(list(walk.matches), ""), 1.0)
-    job._try("as configured", matched, "incremental", RADIAL)
-    job._try_zooms(matched, "incremental", RADIAL, gather_evidence(folders.database, photos, 100))
+    job.matched, job.mapper, job.lens = matched, "incremental", RADIAL
+    job.evidence = gather_evidence(folders.database, photos, 100)
+    job._try("as configured")
+    job._try_zooms()
     return job
 
 

@@ -94,9 +94,9 @@ def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
     assert camera.mean_focal_length() == pytest.approx(WIDE.focal, rel=0.01)
     # The matches of an ordinary attempt, which contradict its poses, do not hide the disc.
     bent = SimpleNamespace(lens=Lens(), agreement=0.75)
-    assert "from a fisheye lens, but" in job._other_lens(bent)[0]
-    assert job._other_lens(SimpleNamespace(lens=Lens(), agreement=0.99)) == []
-    found = job._found_fisheye(SimpleNamespace(lens=lens))
+    assert "from a fisheye lens, but" in job._doubt_about_fisheye(bent)[0]
+    assert job._doubt_about_fisheye(SimpleNamespace(lens=Lens(), agreement=0.99)) == []
+    found = job._describe_fisheye(SimpleNamespace(lens=lens))
     assert found == "the photos are from a fisheye lens: the picture is a disc"
 
 

@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from snowsplat.sfm.colmap.pairs import guided_matching
-from snowsplat.sfm.colmap.pairs.guided_matching import Described, match
+from snowsplat.sfm.colmap.pairs.guided_matching import PhotoSide, match
 from snowsplat.sfm.colmap.pairs.matching import LENGTH, match_descriptors
 
 COUNT, UNRELATED = 900, 300
@@ -35,7 +35,7 @@ def photos(moved, flat=False, model="SIMPLE_PINHOLE"):
         places = random.uniform((0, 0), (800, 600), (UNRELATED, 2))
         shuffled = random.permutation(COUNT + UNRELATED) if rows is order else None
         side = [np.concatenate([pixels, places]), normalised(np.concatenate([noisy, others]))]
-        sides.append(Described(lens, *(side if shuffled is None else (a[shuffled] for a in side))))
+        sides.append(PhotoSide(lens, *(side if shuffled is None else (a[shuffled] for a in side))))
     second_of_point = np.argsort(shuffled)[np.argsort(order)]
     return (*sides, second_of_point)
 
@@ -108,7 +108,7 @@ def test_few_features():
     first, second, _ = photos((0.8, 0, 0))
     for count in (0, 1, 119, 130):
         sides = [
-            Described(s.camera, s.positions[:count], s.descriptors[:count]) for s in (first, second)
+            PhotoSide(s.camera, s.positions[:count], s.descriptors[:count]) for s in (first, second)
         ]
         expected = match_descriptors(*(side.descriptors for side in sides))
         np.testing.assert_array_equal(match(*sides, 4.0), expected)

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.pairs.pair_matching import _INLIER_RATIOS, _inlier_ratio, verified
+from snowsplat.sfm.colmap.pairs.pair_matching import _INLIER_RATIOS, _inlier_ratio, verify_matches
 
 FLAT = {
     getattr(pycolmap.TwoViewGeometryConfiguration, name).value
@@ -41,7 +41,7 @@ def scene(true, false, lens, flat=False, moved=(0.8, 0.1, 0.2)):
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize(("true", "false"), [(40, 20), (150, 30), (900, 500)])
 def test_matches_that_agree_with_a_pose_are_kept(true, false, known):
-    found = verified(*scene(true, false, camera(known)), max_error=4.0)
+    found = verify_matches(*scene(true, false, camera(known)), max_error=4.0)
     kind = "CALIBRATED" if known else "UNCALIBRATED"
     assert found.config == getattr(pycolmap.TwoViewGeometryConfiguration, kind).value
     inliers = found.inlier_matches[:, 0]
@@ -51,7 +51,7 @@ def test_matches_that_agree_with_a_pose_are_kept(true, false, known):
 
 
 def test_few_true_matches_are_found_with_a_known_lens():
-    found = verified(*scene(60, 120, camera(True)), max_error=4.0)
+    found = verify_matches(*scene(60, 120, camera(True)), max_error=4.0)
     assert (found.inlier_matches[:, 0] < 60).sum() > 55
 
 
@@ -59,18 +59,18 @@ def test_few_true_matches_are_found_with_a_known_lens():
 @pytest.mark.parametrize("true", [60, 900])
 def test_flat_scenes_and_turned_cameras_are_recognised(true, known):
     for given in ({"flat": True}, {"moved": (0.0, 0.0, 0.0)}):
-        found = verified(*scene(true, true // 4, camera(known), **given), max_error=4.0)
+        found = verify_matches(*scene(true, true // 4, camera(known), **given), max_error=4.0)
         assert found.config in FLAT
         assert (found.inlier_matches[:, 0] < true).sum() > 0.95 * true
 
 
 def test_false_matches_are_rejected():
     for false in (0, 10, 60):
-        assert not len(verified(*scene(0, false, camera()), max_error=4.0).inlier_matches)
+        assert not len(verify_matches(*scene(0, false, camera()), max_error=4.0).inlier_matches)
 
 
 def test_lenses_without_an_image_plane():
-    found = verified(*scene(200, 100, camera(True, "SIMPLE_RADIAL_FISHEYE")), max_error=4.0)
+    found = verify_matches(*scene(200, 100, camera(True, "SIMPLE_RADIAL_FISHEYE")), max_error=4.0)
     assert (found.inlier_matches[:, 0] < 200).sum() > 190
 
 

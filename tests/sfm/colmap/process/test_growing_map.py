@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.process import growing_map as placed
-from snowsplat.sfm.colmap.process.growing_map import Placements, read_placed
+from snowsplat.sfm.colmap.process import growing_map
+from snowsplat.sfm.colmap.process.growing_map import PoseMessages, read_poses
 
 pytestmark = pytest.mark.sfm
 
@@ -21,8 +21,8 @@ def synthetic(points: int) -> pycolmap.Reconstruction:
 
 def test_a_message_has_the_poses_of_the_model():
     model, sent = synthetic(10), []
-    Placements(lambda message: sent.append(json.dumps(message)))(model, False)
-    photos, points = read_placed(json.loads(sent[0]))
+    PoseMessages(lambda message: sent.append(json.dumps(message)))(model, False)
+    photos, points = read_poses(json.loads(sent[0]))
     images = {image.name: image for image in model.images.values()}
     assert {photo.name for photo in photos} == set(images)
     for photo in photos:
@@ -36,17 +36,17 @@ def test_a_message_has_the_poses_of_the_model():
 
 
 def test_many_points_are_thinned(monkeypatch):
-    monkeypatch.setattr(placed, "_MAX_POINTS", 100)
+    monkeypatch.setattr(growing_map, "_MAX_POINTS", 100)
     sent = []
-    Placements(sent.append)(synthetic(900), False)
-    assert 50 <= len(read_placed(sent[0])[1]) <= 100
+    PoseMessages(sent.append)(synthetic(900), False)
+    assert 50 <= len(read_poses(sent[0])[1]) <= 100
 
 
 def test_no_more_than_a_message_in_a_pause(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(placed.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(growing_map.time, "monotonic", lambda: now[0])
     model, sent = synthetic(3), []
-    send = Placements(sent.append)
+    send = PoseMessages(sent.append)
     for seconds, forced, total in ((0, False, 1), (1.9, False, 1), (0.05, True, 2), (2, False, 3)):
         now[0] += seconds
         send(model, forced)
@@ -56,7 +56,7 @@ def test_no_more_than_a_message_in_a_pause(monkeypatch):
         now[0] += 2
         sent.append(message)
 
-    slow = Placements(slowly)
+    slow = PoseMessages(slowly)
     slow(model, False)
     now[0] += 399
     slow(model, False)
@@ -68,4 +68,4 @@ def test_no_more_than_a_message_in_a_pause(monkeypatch):
 
 def test_a_point_at_infinity_is_left_out():
     message = {"photos": [], "points": [1.0, 2.0, 3.0, 1.0, float("inf"), 0.0]}
-    np.testing.assert_array_equal(read_placed(message)[1], [[1.0, 2.0, 3.0]])
+    np.testing.assert_array_equal(read_poses(message)[1], [[1.0, 2.0, 3.0]])

@@ -87,13 +87,13 @@ def explain(
     photos: Sequence[Photo],
     evidence: Evidence,
     models: Sequence[set[str]],
-    left_out: Mapping[str, str],
+    excluded: Mapping[str, str],
 ) -> dict[str, str]:
     """Why photos have no pose: name -> reason, for each photo that is not in the first model.
 
     Args:
         models: the names of the photos in each model, the largest model first.
-        left_out: name -> reason, for photos that had a pose in a wrong place (`repair`).
+        excluded: name -> reason, for photos that had a pose in a wrong place (`repair`).
     """
     partners: list[list[int]] = [[] for _ in photos]
     for pair in evidence.pairs:
@@ -105,8 +105,8 @@ def explain(
             continue
         other_model = next((model for model in models[1:] if photo.name in model), None)
         others = f"{len(matches)} other photo{'' if len(matches) == 1 else 's'}"
-        if photo.name in left_out:
-            reason = left_out[photo.name]
+        if photo.name in excluded:
+            reason = excluded[photo.name]
         elif other_model is not None:
             reason = f"it is in a separate group of {len(other_model)} photos"
         elif features < _FEW_FEATURES:

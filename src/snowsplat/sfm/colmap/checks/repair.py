@@ -28,7 +28,7 @@ class Repaired:
 
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
-    left_out: dict[str, str]  # name -> reason, for those of these photos that have no pose now
+    excluded: dict[str, str]  # name -> reason, for those of these photos that have no pose now
     pairs: list[CheckedPair] | None  # `check_pairs` of the model; None: it has changed since
 
     @property
@@ -36,10 +36,10 @@ class Repaired:
         """What the check found, as text; empty if it found nothing."""
         if not self.contradicting:
             return ""
-        again = self.contradicting - len(self.left_out)
+        again = self.contradicting - len(self.excluded)
         return (
             f"the poses of {self.contradicting} contradicted their matches: {again} registered "
-            f"again, {len(self.left_out)} left out"
+            f"again, {len(self.excluded)} left out"
         )
 
 
@@ -84,9 +84,9 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
         if not models:
             break
         model = models[0]
-    model, left_out, checked = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
-    if left_out:
-        model, checked = mapping.without(model, left_out), None
+    model, excluded, checked = max(reversed(found), key=lambda m: m[0].num_reg_images() - len(m[1]))
+    if excluded:
+        model, checked = mapping.without(model, excluded), None
     registered = set(model.reg_image_ids())
     reasons = {names[i]: reason for i, reason in wrong.items() if i not in registered}
     return Repaired(model, len(wrong), reasons, checked)

@@ -35,12 +35,12 @@ class WorkerProgress:
     """The functions with which the worker sends its progress to the parent process.
 
     ``report`` sends a number of finished items. ``features`` is called with the mean number of
-    features of the photos, ``placed`` as `Placements`.
+    features of the photos, ``show_poses`` as `PoseMessages`.
     """
 
     report: Report
     features: Callable[[float], None] = lambda mean: None
-    placed: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
+    show_poses: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
 
 
 def extract_features(

@@ -81,7 +81,7 @@ class Mapping:
     # The photos may have been taken while walking forward. Then the points ahead have small angles,
     # and few of them are in several photos.
     forward: bool = False
-    placed: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
+    show_poses: Callable[[pycolmap.Reconstruction, bool], None] = lambda model, now: None
 
     def run(
         self, mapper: Mapper | Literal["plain"], relaxed: bool = False
@@ -247,7 +247,7 @@ class Mapping:
     ) -> IncrementalMapper:
         def registered(model: pycolmap.Reconstruction) -> None:
             self.report(model.num_reg_images(), len(graph.names), "registered photos")
-            self.placed(model, False)
+            self.show_poses(model, False)
 
         return IncrementalMapper(self.database, graph, self._options(relaxed), registered, reduced)
 

@@ -52,7 +52,7 @@ _Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
-class Described:
+class PhotoSide:
     """The features of a photo, the largest first."""
 
     camera: pycolmap.Camera
@@ -70,7 +70,7 @@ class Described:
         return self.known[self.image]
 
 
-def match(first: Described, second: Described, max_error: float) -> NDArray[np.uint32]:
+def match(first: PhotoSide, second: PhotoSide, max_error: float) -> NDArray[np.uint32]:
     """The matches (K, 2) between the features of two photos: indices, ascending in the first.
 
     If the epipolar lines are not known from the largest features, these are the matches of
@@ -115,7 +115,7 @@ def _joined(part: Nearest, rest: Nearest) -> Nearest:
 
 
 def _epipolar_lines(
-    first: Described, second: Described, matches: NDArray[np.uint32], max_error: float
+    first: PhotoSide, second: PhotoSide, matches: NDArray[np.uint32], max_error: float
 ) -> tuple[_Floats, float] | None:
     """The fundamental matrix (3, 3) of ``matches`` (K, 2), and the distance from the lines at which
     features are compared, in pixels; None if the matches do not determine the lines."""
@@ -149,7 +149,7 @@ def _with_look_alikes(
 
 
 def _along_lines(
-    first: Described, second: Described, matrix: _Floats, band: float
+    first: PhotoSide, second: PhotoSide, matrix: _Floats, band: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Searched]:
     """The orders of the features of the two photos around the epipoles, and which are compared.
 

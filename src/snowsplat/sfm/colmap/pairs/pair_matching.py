@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features.extraction import SEED, WorkerProgress
-from snowsplat.sfm.colmap.pairs.guided_matching import Described, match
+from snowsplat.sfm.colmap.pairs.guided_matching import PhotoSide, match
 from snowsplat.sfm.colmap.pairs.matching import LENGTH
 from snowsplat.util import native_library
 
@@ -67,7 +67,7 @@ def match_pairs(
 ) -> None:
     """Match those ``pairs`` (two indices of photos each) that have no matches in the database.
 
-    ``max_error`` as in `verified`.
+    ``max_error`` as in `verify_matches`.
     """
     native_library.set_num_threads(1)  # pairs are matched at the same time
     with closing_database(database) as opened, ThreadPoolExecutor(threads) as pool:
@@ -75,23 +75,19 @@ def match_pairs(
         alike: dict[int, NDArray[np.int32]] = {}
 
         @functools.lru_cache(_CACHED_PHOTOS)
-        def described(image: int) -> Described:
+        def read_features(image: int) -> PhotoSide:
             if not opened.exists_descriptors(image):
-                return Described(cameras[image], np.zeros((0, 2)), np.zeros((0, LENGTH), np.uint8))
+                return PhotoSide(cameras[image], np.zeros((0, 2)), np.zeros((0, LENGTH), np.uint8))
             descriptors = np.asarray(opened.read_descriptors(image).data).reshape(-1, LENGTH)
             positions = _positions(opened, image)
-            return Described(cameras[image], positions, descriptors, image, alike)
+            return PhotoSide(cameras[image], positions, descriptors, image, alike)
 
-        ids = [(i + 1, j + 1) for i, j in pairs]
-        remaining = [pair for pair in ids if not opened.exists_matches(*pair)]
-        for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
-            progress.report(len(ids) - len(remaining) + start, len(ids), "matched pairs")
-            block = remaining[start : start + _PAIRS_PER_BLOCK]
-            jobs = [pool.submit(match, described(i), described(j), max_error) for i, j in block]
-            transaction = pycolmap.DatabaseTransaction(opened)
-            for pair, job in zip(block, jobs, strict=True):
-                opened.write_matches(*pair, job.result())
-            del transaction  # the destructor ends the transaction
+        def submit(i: int, j: int) -> Future[NDArray[np.uint32]]:
+            return pool.submit(match, read_features(i), read_features(j), max_error)
+
+        for done, block in _blocks(pairs, opened.exists_matches):
+            progress.report(done, len(pairs), "matched pairs")
+            _write_block(opened, block, submit, opened.write_matches)
 
 
 def verify_pairs(
@@ -101,7 +97,7 @@ def verify_pairs(
     threads: int,
     progress: WorkerProgress,
 ) -> None:
-    """Verify the matches of those ``pairs`` that are not verified yet; see `verified`.
+    """Verify the matches of those ``pairs`` that are not verified yet; see `verify_matches`.
 
     The lenses are those in the database.
     """
@@ -112,20 +108,41 @@ def verify_pairs(
         def side(image: int) -> Side:
             return cameras[image], _positions(opened, image)
 
-        ids = [(i + 1, j + 1) for i, j in pairs]
-        remaining = [pair for pair in ids if not opened.exists_two_view_geometry(*pair)]
-        for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
-            progress.report(len(ids) - len(remaining) + start, len(ids), "verified pairs")
-            block = remaining[start : start + _PAIRS_PER_BLOCK]
-            jobs = [
-                pool.submit(verified, side(i), side(j), opened.read_matches(i, j), max_error)
-                for i, j in block
-            ]
-            transaction = pycolmap.DatabaseTransaction(opened)
-            for pair, job in zip(block, jobs, strict=True):
-                opened.write_two_view_geometry(*pair, job.result())
-            del transaction  # the destructor ends the transaction
-        progress.report(len(ids), len(ids), "verified pairs")
+        def submit(i: int, j: int) -> Future[pycolmap.TwoViewGeometry]:
+            matches = opened.read_matches(i, j)
+            return pool.submit(verify_matches, side(i), side(j), matches, max_error)
+
+        for done, block in _blocks(pairs, opened.exists_two_view_geometry):
+            progress.report(done, len(pairs), "verified pairs")
+            _write_block(opened, block, submit, opened.write_two_view_geometry)
+        progress.report(len(pairs), len(pairs), "verified pairs")
+
+
+_Pair = tuple[int, int]  # two image ids
+
+
+def _blocks(
+    pairs: Sequence[tuple[int, int]], exists: Callable[[int, int], bool]
+) -> Iterator[tuple[int, list[_Pair]]]:
+    """The number of finished pairs, and the next ones of those that do not exist yet."""
+    ids = [(i + 1, j + 1) for i, j in pairs]
+    remaining = [pair for pair in ids if not exists(*pair)]
+    for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
+        yield len(ids) - len(remaining) + start, remaining[start : start + _PAIRS_PER_BLOCK]
+
+
+def _write_block(
+    database: pycolmap.Database,
+    block: Sequence[_Pair],
+    submit: Callable[[int, int], Future[Any]],
+    write: Callable[[int, int, Any], None],
+) -> None:
+    """Compute the results of some pairs in threads, and write them in one transaction."""
+    jobs = [submit(*pair) for pair in block]
+    transaction = pycolmap.DatabaseTransaction(database)
+    for pair, job in zip(block, jobs, strict=True):
+        write(*pair, job.result())
+    del transaction  # the destructor ends the transaction
 
 
 def _cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
@@ -139,7 +156,7 @@ def _positions(database: pycolmap.Database, image: int) -> _Floats:
     return np.asarray(database.read_keypoints(image)[:, :2], np.float64)
 
 
-def verified(
+def verify_matches(
     first: Side, second: Side, matches: NDArray[np.uint32], max_error: float
 ) -> pycolmap.TwoViewGeometry:
     """The matches of a pair of photos that agree with a relative pose, and the kind of the pair.

@@ -17,16 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
-from snowsplat.sfm.colmap.process.growing_map import read_placed
+from snowsplat.sfm.colmap.process.growing_map import read_poses
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.progress import Figures, Placed, Report
+from snowsplat.sfm.progress import Figures, Report, ShowPoses
 from snowsplat.util.errors import SettingError, UserError
 
 # Bytes by which the database may grow in one transaction.
 _DATABASE_GROWTH = 8_000_000
 _MODULE = "snowsplat.sfm.colmap.process.worker"
 _POLL_SECONDS = 0.5
-_Watchers = tuple[Report, Figures, Placed]
+_Watchers = tuple[Report, Figures, ShowPoses]
 
 
 class Crashed(Exception):
@@ -52,7 +52,7 @@ def estimate_poses(
     options: SfmOptions,
     report: Report,
     figures: Figures = lambda cpu_seconds, features: None,
-    placed: Placed = lambda photos, points: None,
+    show_poses: ShowPoses = lambda photos, points: None,
 ) -> SfmResult:
     """Estimate the pose of each photo in ``input/`` of a dataset, and points of the scene.
 
@@ -63,8 +63,8 @@ def estimate_poses(
     settings lead to the same pairs and matches, and to the same poses except for rounding. With
     more than 150 photos, the coordinate frame may differ, too.
 
-    ``report`` is called at least twice per second, also if nothing has changed. ``figures``
-    is called as often as there is progress, ``placed`` every two seconds while photos are placed.
+    ``report`` is called at least twice per second, also if nothing has changed. ``figures`` is
+    called as often as there is progress, ``show_poses`` every two seconds while photos get poses.
 
     Raises:
         UserError: fewer than 3 photos, an unknown camera model, no poses found (the message
@@ -90,7 +90,7 @@ def estimate_poses(
         "photos": [dataclasses.asdict(photo) for photo in photos],
         "options": dataclasses.asdict(options),
     }
-    threads, watchers = thread_count(options.threads), (report, figures, placed)
+    threads, watchers = thread_count(options.threads), (report, figures, show_poses)
     try:
         return _run({**job, "reduced": False}, log, threads, watchers)
     except Crashed as crash:
@@ -163,7 +163,7 @@ def _communicate(
     ``report`` is called in this thread, so it needs no lock and Ctrl-C interrupts it. A second
     thread reads the lines.
     """
-    report, figures, placed = watchers
+    report, figures, show_poses = watchers
     lines: queue.Queue[str | None] = queue.Queue()
 
     def listen() -> None:
@@ -191,8 +191,8 @@ def _communicate(
         if line is None or not line.endswith("\n"):
             break
         message = json.loads(line)
-        if "placed" in message:
-            placed(*read_placed(message["placed"]))
+        if "poses" in message:
+            show_poses(*read_poses(message["poses"]))
             continue
         answer = message
         if "progress" in answer:

@@ -23,11 +23,11 @@ _PAUSE = 2.0  # seconds between two messages
 _SHARE = 200.0
 
 
-class Placements:
+class PoseMessages:
     """Makes messages of a model that grows, at most one in two seconds."""
 
     def __init__(self, send: Callable[[dict[str, Any]], None]) -> None:
-        """``send`` is called with each message, a JSON value; see `read_placed`."""
+        """``send`` is called with each message, a JSON value; see `read_poses`."""
         self._send = send
         self._next = 0.0
 
@@ -63,7 +63,7 @@ def _message(model: pycolmap.Reconstruction) -> dict[str, Any]:
     }
 
 
-def read_placed(message: dict[str, Any]) -> tuple[list[PlacedPhoto], np.ndarray]:
+def read_poses(message: dict[str, Any]) -> tuple[list[PlacedPhoto], np.ndarray]:
     """The photos of a message, and its points (P, 3). The frame is that of COLMAP: its scale and
     its orientation are arbitrary."""
     photos = []

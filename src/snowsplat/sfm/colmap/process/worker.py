@@ -26,7 +26,7 @@ import pycolmap
 
 from snowsplat.sfm.colmap.features.extraction import SEED, Folders, WorkerProgress
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions, SfmResult, thread_count
-from snowsplat.sfm.colmap.process.growing_map import Placements
+from snowsplat.sfm.colmap.process.growing_map import PoseMessages
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import UserError
@@ -59,7 +59,7 @@ def main() -> None:
         progress = WorkerProgress(
             report=report,
             features=lambda mean: figures.update(features=mean),
-            placed=Placements(lambda message: send(placed=message)),
+            show_poses=PoseMessages(lambda message: send(poses=message)),
         )
         send(result=asdict(_run(job, progress)))
     except UserError as error:

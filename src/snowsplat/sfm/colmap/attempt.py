@@ -1,0 +1,208 @@
+"""One attempt to estimate poses: matches, a mapper, and the checks of what it has made."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pycolmap
+
+from snowsplat.sfm.colmap.checks.consistency import agreement_of_model
+from snowsplat.sfm.colmap.checks.diagnosis import Evidence, gather_evidence
+from snowsplat.sfm.colmap.checks.repair import repair
+from snowsplat.sfm.colmap.database import (
+    fingerprint_of,
+    open_database,
+    read_descriptors,
+    set_cameras,
+)
+from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress, extract_features
+from snowsplat.sfm.colmap.lenses.lens import Lens, Refine, misfit, settled, with_all_parameters
+from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
+from snowsplat.sfm.colmap.options import Effort, Mapper, detection_size
+from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
+from snowsplat.sfm.colmap.pairs.pair_matching import match_pairs, verify_pairs
+from snowsplat.sfm.colmap.pairs.retrieval import FEATURES, similarity
+from snowsplat.sfm.ingest.photo import Photo
+
+#: "plain": the incremental mapper with COLMAP's own order of registration.
+AnyMapper = Mapper | Literal["plain"]
+
+# Largest distance of a verified match from its epipolar line, in pixels of the resized photo in
+# which the features were detected.
+_MAX_ERROR = 4.0
+
+_MAPPERS = {
+    "incremental": "incremental mapping",
+    "plain": "incremental mapping in COLMAP's order",
+    "global": "global mapping",
+}
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A database with features and matches, and how they were made."""
+
+    database: Path
+    effort: Effort  # with which the features were detected
+    choice: PairChoice
+    scale: float  # size of a photo / size at which its features were detected (1 or more)
+
+    @property
+    def max_error(self) -> float:
+        """The largest distance of a verified match from its epipolar line, in pixels of a photo."""
+        return _MAX_ERROR * self.scale
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The result of an attempt."""
+
+    matched: Matched
+    lens: Lens  # with which the attempt began
+    mapping: Mapping  # for further work on the models
+    models: list[pycolmap.Reconstruction]
+    agreement: float  # of the first model with its matches; see `agreement_of`
+    excluded: dict[str, str]  # name -> reason, for photos that had a pose in a wrong place
+    doubts: list[str]  # about the lenses, as text for users
+    description: str  # as text for users
+
+    @property
+    def registered(self) -> int:
+        return self.models[0].num_reg_images() if self.models else 0
+
+    @property
+    def error(self) -> float:
+        """The mean reprojection error of the first model, in pixels of the photos."""
+        return self.models[0].compute_mean_reprojection_error() if self.models else float("inf")
+
+    @property
+    def misfit(self) -> float:
+        """`lens.misfit` of the first model."""
+        return misfit(self.models[0]) if self.models else float("inf")
+
+
+class AttemptRunner:
+    """Matches photos and makes attempts with the matches."""
+
+    def __init__(
+        self,
+        folders: Folders,
+        photos: list[Photo],
+        camera_model: str,
+        threads: int,
+        progress: WorkerProgress,
+    ) -> None:
+        self.folders = folders
+        self.photos = photos  # their groups may be changed between two attempts
+        self.camera_model = camera_model
+        self.threads = threads
+        self.progress = progress
+
+    def match(
+        self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
+    ) -> Matched:
+        """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
+        ``reserve``: whether the pairs of the reserve are matched, too."""
+        fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
+        open_database(database, self.photos, Lens(self.camera_model), fingerprint)
+        extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
+        indices = range(len(self.photos))
+        choice = choose_pairs(
+            self.photos,
+            pairing,
+            lambda: similarity([read_descriptors(database, i, FEATURES) for i in indices]),
+        )
+        scales = [
+            max(photo.width, photo.height) / detection_size(effort.image_size, photo.panorama)
+            for photo in self.photos
+        ]
+        scale = max(1.0, float(np.median(scales)))
+        matched = Matched(database, effort, choice.whole() if reserve else choice, scale)
+        self._match_pairs(matched)
+        return matched
+
+    def match_more(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
+        """Match and verify those pairs of ``choice`` that are not matched yet."""
+        if choice.pairs == matched.choice.pairs:
+            return matched
+        more = dataclasses.replace(matched, choice=choice)
+        self._match_pairs(more)
+        self.verify(more, lens)
+        return more
+
+    def _match_pairs(self, matched: Matched) -> None:
+        pairs, error = matched.choice.pairs, matched.max_error
+        match_pairs(matched.database, pairs, error, self.threads, self.progress)
+
+    def verify(self, matched: Matched, lens: Lens) -> None:
+        """Verify those matches of ``matched`` that are not verified yet. The cameras of ``lens``
+        replace those in the database."""
+        set_cameras(matched.database, self.photos, lens)
+        pairs, error = matched.choice.pairs, matched.max_error
+        verify_pairs(matched.database, pairs, error, self.threads, self.progress)
+
+    def evidence(self, matched: Matched) -> Evidence:
+        """What the matches tell about the photos."""
+        return gather_evidence(matched.database, self.photos, len(matched.choice.pairs))
+
+    def mapping(self, matched: Matched, lens: Lens) -> Mapping:
+        """The mapper for these matches."""
+        return Mapping(
+            matched.database,
+            self.folders.images,
+            matched.scale,
+            self.threads,
+            self.progress.report,
+            held=lens.held,
+            forward=lens.held,
+            show_poses=self.progress.show_poses,
+        )
+
+    def run(
+        self, how: str, matched: Matched, mapper: AnyMapper, lens: Lens, relaxed: bool = False
+    ) -> Attempt:
+        """Make an attempt. ``how`` describes it, as text for users; ``relaxed`` as in `Mapping`."""
+        set_cameras(matched.database, self.photos, lens)
+        mapping = self.mapping(matched, lens)
+        models = mapping.run(mapper, relaxed)
+        weak = ""
+        if models and models[0].num_reg_images() < len(self.photos):
+            before = models[0].num_reg_images()
+            models = mapping.extend(models)
+            added = models[0].num_reg_images() - before
+            weak = f", {added} of them with weak matches" if added else ""
+        check, excluded, doubts, agreement = "", dict[str, str](), list[str](), 0.0
+        if models:
+            repaired = repair(models[0], mapping, matched.max_error)
+            excluded = repaired.excluded
+            check = f"; {repaired.description}" if repaired.description else ""
+            refine = _refine_with(mapping)
+            found = settled(repaired.model, self.photos, lens, refine)
+            mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
+            if found.model:
+                model = with_all_parameters(found.model, self.photos, lens, refine, found.held)
+                models = usable_models([model, *models[1:]])
+            else:
+                models = []
+                check = f"; impossible: {', '.join(doubts)}"
+        if models:
+            pairs = repaired.pairs if models[0] is repaired.model else None
+            agreement = agreement_of_model(models[0], matched.database, matched.max_error, pairs)
+        effort, lens_text = matched.effort, f" ({lens.description})" if lens.description else ""
+        registered = models[0].num_reg_images() if models else 0
+        description = (
+            f"{how}{lens_text}: {effort.features} features per photo at {effort.image_size} "
+            f"pixels, {matched.choice.description}, {_MAPPERS[mapper]}: "
+            f"{registered} of {len(self.photos)} photos registered{weak}{check}"
+        )
+        return Attempt(matched, lens, mapping, models, agreement, excluded, doubts, description)
+
+
+def _refine_with(mapping: Mapping) -> Refine:
+    return lambda model, cameras, held: dataclasses.replace(mapping, held=held).with_cameras(
+        model, cameras
+    )
