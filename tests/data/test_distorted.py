@@ -229,7 +229,7 @@ def test_a_block_keeps_the_lens(tmp_path):
     folder = write(tmp_path / "whole")
     files = read_files(folder, hold_out=None)
     write_block_dataset(
-        tmp_path / "block", [image for image, _, _ in files.images], None, files.origin
+        tmp_path / "block", [image for image, _ in files.images], None, files.origin
     )
     (camera,) = read_model(tmp_path / "block/sparse/0").cameras.values()
     assert (camera.model, camera.params) == ("OPENCV", OPENCV)

@@ -34,7 +34,7 @@ from snowsplat.data.photos.colour_profile import to_srgb
 from snowsplat.data.photos.decode import ImageSource, load_image, load_mask
 from snowsplat.data.photos.decode import read_header as read_image_header
 from snowsplat.data.points_ply import read_points, write_points
-from snowsplat.data.readers import find_export, read_export
+from snowsplat.data.readers import PROGRAMS, PhotoFolder, find_poses
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
 from snowsplat.formats.lod import INDEX, LEVELS
@@ -130,10 +130,10 @@ def _root() -> tempfile.TemporaryDirectory[str]:
 
 def _export(file: str, make: Callable[[Path], object], json: bool = False) -> Reader:
     def read(folder: Path) -> object:
-        found = find_export(folder)
-        if found is None or found.cameras is None:
+        found = find_poses(folder)
+        if found is None or found.reader not in PROGRAMS:
             raise UserError("no cameras of another program")
-        return read_export(folder, found, "images")
+        return found.reader.read(found.files, PhotoFolder(folder))
 
     return Reader(f"export {file}", file, make, read, json)
 

@@ -154,7 +154,8 @@ class PosedImage:
     """
 
     name: str  # as `View.name`
-    camera: Camera
+    camera: Camera  # if the photo is distorted, only its size and pose are used
+    lens: Lens
     folder: Path  # of images; smaller copies may be in the sibling folders images_2, images_4 …
     file: str  # relative to ``folder``
     mask: Path | None = None
@@ -165,7 +166,14 @@ class PosedImage:
     depth_confidence: Path | None = None  # as `View.depth_confidence`
     normals: Path | None = None  # as `View.normals`
     frame: str | None = None  # images of one frame of a rig, taken at one time, share this name
-    lens: Lens | None = None  # of a distorted photo; ``camera`` then has its pose and size
+
+    @classmethod
+    def below(cls, root: Path, file: str, camera: Camera, lens: Lens) -> PosedImage:
+        """The image ``file``, a path relative to ``root``, the folder of the dataset."""
+        first, slash, _ = file.partition("/")
+        folder = root / first if slash else root
+        rest = (root / file).relative_to(folder).as_posix()
+        return cls(safe_name(file), camera, lens, folder, rest)
 
     @property
     def path(self) -> Path:

@@ -207,15 +207,15 @@ def _zip(path: Path) -> dict[str, Any]:
 
 
 def _is_export(path: Path) -> bool:
-    from snowsplat.data.readers import find_export  # torch
+    from snowsplat.data.readers import is_export  # torch
 
-    return find_export(path) is not None
+    return is_export(path)
 
 
 def _dataset(path: Path) -> dict[str, Any]:
     from snowsplat.data import load_dataset  # torch; the other kinds do not need it
     from snowsplat.data.judge.verdict import judge
-    from snowsplat.data.load import NoPosesError
+    from snowsplat.data.readers import NoPosesError
 
     try:
         dataset = load_dataset(path)

@@ -9,8 +9,8 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.load import NoPosesError, load_dataset
-from snowsplat.data.readers import find_export, read_export
+from snowsplat.data.load import load_dataset
+from snowsplat.data.readers import NoPosesError, find_poses, photo_folder, read_poses
 from snowsplat.pipeline.describe import describe
 from snowsplat.util.errors import SettingError, UserError
 
@@ -18,28 +18,19 @@ from . import exports
 from .exports import COLORS, HEIGHT, NAMES, POINTS, WIDTH
 
 
-def read(path, images="images"):
-    export = find_export(path)
-    assert export is not None
-    assert export.cameras is not None
-    return read_export(path, export, images)
-
-
 def pixels(image):
     """(P, 2): where a posed image shows `POINTS`, by the equations of COLMAP."""
-    camera = image.camera
+    camera, lens = image.camera, image.lens
     pose = camera.cam_from_world.numpy()
     cam = POINTS @ pose[:, :3].T + pose[:, 3]
-    if image.lens is None:
-        model, params = "PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy)
-    else:
-        model, params = image.lens.model, image.lens.params
-        assert (image.lens.width, image.lens.height) == (camera.width, camera.height)
-        assert params[:4] == (camera.fx, camera.fy, camera.cx, camera.cy)
-    if model == "BROWN":  # COLMAP does not have it
-        return image.lens.project(cam)
-    lens = pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
-    return np.asarray(lens.img_from_cam(cam))
+    assert (lens.width, lens.height) == (camera.width, camera.height)
+    assert lens.params[:4] == (camera.fx, camera.fy, camera.cx, camera.cy)
+    if lens.model == "BROWN":  # COLMAP does not have it
+        return lens.project(cam)
+    theirs = pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=lens.params
+    )
+    return np.asarray(theirs.img_from_cam(cam))
 
 
 CASES = {
@@ -70,22 +61,25 @@ CASES = {
 def test_points_are_projected_as_by_the_program(case, tmp_path):
     write, options = CASES[case]
     expected = write(tmp_path, **options)
-    posed, points, description = read(tmp_path)
-    assert len(posed) == len(NAMES)
-    for image in posed:
+    found = read_poses(tmp_path)
+    assert len(found.images) == len(NAMES)
+    for image in found.images:
         assert image.path.is_file()
         assert np.abs(pixels(image) - expected[image.path.name]).max() < 1e-6
-    if points is not None:
-        assert torch.allclose(points.xyz.float(), torch.from_numpy(POINTS).float(), atol=1e-5)
-    assert f"{len(NAMES)} of" in description
+    if found.points is not None:
+        xyz = found.points.xyz.float()
+        assert torch.allclose(xyz, torch.from_numpy(POINTS).float(), atol=1e-5)
+    assert f"{len(NAMES)} of" in found.description
 
 
 def test_the_description_tells_what_was_read(tmp_path):
     exports.metashape(tmp_path)
-    _, points, description = read(tmp_path)
-    assert description == ("Metashape cameras.xml, 4 of 5 photos aligned, points from points.ply")
-    assert points is not None
-    assert points.rgb.tolist() == COLORS.tolist()
+    found = read_poses(tmp_path)
+    assert found.description == (
+        "Metashape cameras.xml, 4 of 5 photos aligned, points from points.ply"
+    )
+    assert found.points is not None
+    assert found.points.rgb.tolist() == COLORS.tolist()
 
 
 def test_points_in_the_frame_of_the_chunk_are_moved_to_the_world(tmp_path):
@@ -93,7 +87,7 @@ def test_points_in_the_frame_of_the_chunk_are_moved_to_the_world(tmp_path):
     turn, shift, scale = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]), 2.5
     exports.points(tmp_path, (POINTS - shift) @ turn / scale)
     exports.painted_photos(tmp_path / "images")
-    _, points, _ = read(tmp_path)
+    points = read_poses(tmp_path).points
     assert points is not None
     assert torch.allclose(points.xyz.float(), torch.from_numpy(POINTS).float(), atol=1e-5)
 
@@ -101,9 +95,9 @@ def test_points_in_the_frame_of_the_chunk_are_moved_to_the_world(tmp_path):
 def test_points_in_another_frame_are_not_used(tmp_path, caplog):
     exports.realityscan(tmp_path)
     exports.points(tmp_path, POINTS + 100)
-    _, points, description = read(tmp_path)
-    assert points is None
-    assert "points" not in description
+    found = read_poses(tmp_path)
+    assert found.points is None
+    assert "points" not in found.description
     assert "are not where the cameras look" in caplog.text
 
 
@@ -111,7 +105,7 @@ def test_cameras_on_the_earth_get_a_local_frame(tmp_path):
     expected = exports.metashape(tmp_path)
     file = tmp_path / "cameras.xml"
     file.write_text(file.read_text().replace("1.0 2.0 3.0", "4200000.0 500000.0 4750000.0"))
-    posed, _, _ = read(tmp_path)
+    posed = read_poses(tmp_path).images
     centres = torch.stack([image.camera.position for image in posed])
     assert centres.mean(0).abs().max() < 1e-6
     a, b = centres[0] - centres[1], centres[0] - centres[2]
@@ -128,7 +122,7 @@ def test_a_document_type_is_refused(tmp_path):
     bomb = '<!DOCTYPE d [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>'
     file.write_text(f"{start}{bomb}<document{end}")
     with pytest.raises(UserError, match="has a document type"):
-        read(tmp_path)
+        read_poses(tmp_path)
 
 
 def test_the_message_about_an_unknown_encoding_is_short(tmp_path):
@@ -136,7 +130,7 @@ def test_the_message_about_an_unknown_encoding_is_short(tmp_path):
     file = tmp_path / "cameras.xml"
     file.write_text(file.read_text().replace("UTF-8", "UTF" + 500 * "-8"))
     with pytest.raises(UserError, match="not a complete XML file .'unknown encoding") as refused:
-        read(tmp_path)
+        read_poses(tmp_path)
     assert len(str(refused.value)) < len(str(file)) + 200
 
 
@@ -154,23 +148,21 @@ def test_keyframes_without_poses_are_photos(tmp_path):
     exports.polycam(tmp_path, corrected=False)
     for file in (tmp_path / "keyframes" / "cameras").iterdir():
         file.write_text(json.dumps({"fx": 500, "t_00": 1}))
-    export = find_export(tmp_path)
-    assert export is not None
-    assert export.cameras is None
-    assert export.photos == tmp_path / "keyframes" / "images"
+    assert find_poses(tmp_path) is None
+    assert photo_folder(tmp_path) == ("Polycam", tmp_path / "keyframes" / "images")
 
 
 def test_the_file_of_the_cameras_can_be_given(tmp_path):
     exports.bundler(tmp_path)
-    assert len(read(tmp_path / "bundle.out")[0]) == len(NAMES)
+    assert len(read_poses(tmp_path / "bundle.out").images) == len(NAMES)
 
 
 def test_a_list_that_starts_with_its_length(tmp_path):
     exports.bundler(tmp_path)
-    expected = [image.path.name for image in read(tmp_path)[0]]
+    expected = [image.path.name for image in read_poses(tmp_path).images]
     file = tmp_path / "list.txt"
     file.write_text(f"{len(NAMES) + 1}\n{file.read_text()}")
-    assert [image.path.name for image in read(tmp_path)[0]] == expected
+    assert [image.path.name for image in read_poses(tmp_path).images] == expected
 
 
 def test_photos_elsewhere_are_one_line(tmp_path):
@@ -179,16 +171,16 @@ def test_photos_elsewhere_are_one_line(tmp_path):
     with pytest.raises(
         UserError, match=r"none of its 4 photos .*'a\.png'.*; copy them to .*images"
     ):
-        read(tmp_path)
+        read_poses(tmp_path)
 
 
 def test_missing_photos_are_skipped(tmp_path, caplog):
     exports.openmvg(tmp_path)
     (tmp_path / "images" / "b.png").unlink()
-    posed, _, description = read(tmp_path)
-    assert [image.path.name for image in posed] == ["a.png", "c.png", "d.png"]
+    found = read_poses(tmp_path)
+    assert [image.path.name for image in found.images] == ["a.png", "c.png", "d.png"]
     assert "1 of 4 photos are missing (the first is '/b.png')" in caplog.text
-    assert "4 of 5 photos aligned" in description
+    assert "4 of 5 photos aligned" in found.description
 
 
 def test_photos_are_found_in_other_folders_and_with_other_suffixes(tmp_path):
@@ -196,7 +188,7 @@ def test_photos_are_found_in_other_folders_and_with_other_suffixes(tmp_path):
     (tmp_path / "images").rename(tmp_path / "Photos of Monday")
     (tmp_path / "Photos of Monday" / "a.png").rename(tmp_path / "Photos of Monday" / "A.PNG")
     exports.photos(tmp_path / "images_2", size=(WIDTH // 2, HEIGHT // 2))
-    names = {image.path.name for image in read(tmp_path)[0]}
+    names = {image.path.name for image in read_poses(tmp_path).images}
     assert names == {"A.PNG", "b.png", "c.png", "d.png"}
 
 
@@ -214,11 +206,11 @@ def test_equal_names_are_told_apart_by_their_folder(tmp_path):
     exports.alicevision(tmp_path)
     (tmp_path / "images").rename(tmp_path / "photos")
     exports.photos(tmp_path / "retouched")
-    posed, _, _ = read(tmp_path)  # the file has /home/me/photos/
+    posed = read_poses(tmp_path).images  # the file has /home/me/photos/
     assert {image.folder.name for image in posed} == {"photos"}
     (tmp_path / "photos").rename(tmp_path / "other")
     with pytest.raises(UserError, match=r"several photos named 'a\.png'"):
-        read(tmp_path)
+        read_poses(tmp_path)
 
 
 def test_no_photo_outside_of_the_folder_is_used(tmp_path):
@@ -229,7 +221,7 @@ def test_no_photo_outside_of_the_folder_is_used(tmp_path):
     file = folder / "reconstruction.json"
     file.write_text(file.read_text().replace('"a.png"', '"../images/a.png"'))
     with pytest.raises(UserError, match="none of its 4 photos"):
-        read(folder)
+        read_poses(folder)
 
 
 def test_positions_in_degrees_are_refused(tmp_path):
@@ -240,14 +232,14 @@ def test_positions_in_degrees_are_refused(tmp_path):
         line[1:3] = str(8.5 + float(line[1]) / 1e5), str(47.3 + float(line[2]) / 1e5)
     file.write_text("\n".join(map(",".join, lines)))
     with pytest.raises(UserError, match="longitude and latitude; export"):
-        read(tmp_path)
+        read_poses(tmp_path)
 
 
 def test_a_table_of_positions_alone_is_explained(tmp_path):
     exports.photos(tmp_path)
     (tmp_path / "cameras.csv").write_text("#name,x,y,alt\na.png,1,2,3\n")
     with pytest.raises(UserError, match="export the alignment as Internal/External"):
-        read(tmp_path)
+        read_poses(tmp_path)
 
 
 def test_lenses_with_k1_alone_are_in_doubt(tmp_path, caplog):
@@ -257,7 +249,7 @@ def test_lenses_with_k1_alone_are_in_doubt(tmp_path, caplog):
     for line in lines[1:]:
         line[11:] = ["0"] * 5
     file.write_text("\n".join(map(",".join, lines)))
-    read(tmp_path)
+    read_poses(tmp_path)
     assert "division model" in caplog.text
 
 
@@ -265,7 +257,7 @@ def test_compressed_depth_maps_are_named(tmp_path, caplog):
     exports.record3d(tmp_path)
     (tmp_path / "rgb").rename(tmp_path / "rgbd")
     (tmp_path / "rgbd" / "0.depth").write_bytes(b"bvx2")
-    read(tmp_path)
+    read_poses(tmp_path)
     assert "LZFSE" in caplog.text
 
 
@@ -286,10 +278,10 @@ def test_the_folder_of_an_unpacked_archive_may_be_inside(tmp_path):
     (tmp_path / "scan").mkdir()
     (tmp_path / "__MACOSX").mkdir()
     exports.polycam(tmp_path / "scan")
-    posed, _, _ = read(tmp_path)
+    posed = read_poses(tmp_path).images
     assert len(posed) == len(NAMES)
-    export = find_export(tmp_path)
-    assert export.photos == tmp_path / "scan" / "keyframes" / "corrected_images"
+    photos = tmp_path / "scan" / "keyframes" / "corrected_images"
+    assert photo_folder(tmp_path) == ("Polycam", photos)
 
 
 @pytest.mark.parametrize("name", ["garden.psx", "Garden.rcproj", "sfm_data.bin", "scan.r3d"])
@@ -306,7 +298,7 @@ def test_other_files_are_no_exports(tmp_path):
     (tmp_path / "prices.csv").write_text("name,price\na,1\n")
     (tmp_path / "metadata.json").write_text("{}")
     (tmp_path / "a.out").write_bytes(b"\x7fELF")
-    assert find_export(tmp_path) is None
+    assert find_poses(tmp_path) is None
 
 
 def test_a_dataset_is_loaded(tmp_path, caplog):

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from snowsplat.data.colmap import binary as binary_files
 from snowsplat.data.colmap import text as text_files
@@ -20,9 +21,14 @@ from snowsplat.data.colmap.types import (
 )
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.data.lens.lens import Lens
+from snowsplat.scene.camera import Camera
+from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
+
+# A quaternion whose squared norm differs from 1 by less than this was a unit quaternion.
+_ROUNDED = 1e-5
 
 
 #: The files of a binary (False) and of a text model (True), and their suffix.
@@ -138,3 +144,45 @@ def write_model(
     folder.mkdir(parents=True, exist_ok=True)
     tracks = [()] * len(xyz) if tracks is None else tracks
     _FILES[text][0].write_model(folder, cameras, images, xyz, rgb, tracks)
+
+
+def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
+    """The camera of an image, with its pose in float64. A distortion of its lens is left out.
+
+    Raises: UserError: the camera is missing or damaged.
+    """
+    colmap = model.cameras.get(image.camera_id)
+    if colmap is None:
+        raise UserError(
+            "{folder}: image {name} has camera {camera_id}, which the model does not contain; "
+            "copy the model again",
+            folder=model.folder,
+            name=image.name[:80],
+            camera_id=image.camera_id,
+        )
+    fx, fy, cx, cy = colmap.intrinsics
+    numbers = (fx, fy, cx, cy, *colmap.params)
+    if min(fx, fy) <= 0 or not all(abs(number) < 1e9 for number in numbers):
+        raise UserError(
+            "{folder}: the intrinsics of a camera are damaged ({model} {str}); copy the model "
+            "again",
+            folder=model.folder,
+            model=colmap.model,
+            str=" ".join(map(str, colmap.params)),
+        )
+    quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
+    if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
+        raise UserError(
+            "{folder}: the pose of image {name} is damaged; copy the model again",
+            folder=model.folder,
+            name=image.name[:80],
+        )
+    rotation = rotation_from_quat(quat)
+    # COLMAP and its scripts compute R and t = −R C from a quaternion as it is, without dividing by
+    # its norm. If C is far from 0, this R restores C even if the quaternion is rounded.
+    norm2 = quat.square().sum()
+    if abs(float(norm2) - 1.0) < _ROUNDED:
+        identity = torch.eye(3, dtype=torch.float64)
+        rotation = identity + norm2 * (rotation - identity)
+    pose = torch.cat([rotation, translation[:, None]], 1)
+    return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)

@@ -1,22 +1,19 @@
-"""Datasets of other programs and apps -> posed images and points. `KINDS` lists what is read.
+"""Readers of datasets: what tells the poses of photos -> posed images and points.
 
-Nothing here undistorts photos: `PosedImage.lens` tells the lens of a distorted photo.
+A reader is a module with a `Reader`, and a line in `READERS`. Nothing here undistorts photos:
+`PosedImage.lens` tells the lens of a photo.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
-from snowsplat.data.dataset import Points, PosedImage, safe_name
-from snowsplat.data.files.photo_files import warn_of_missing
+from snowsplat.data.files.photo_files import photos_below
 from snowsplat.data.readers import (
     alicevision,
     bundler,
+    colmap,
     llff,
     metashape,
     openmvg,
@@ -24,175 +21,125 @@ from snowsplat.data.readers import (
     polycam,
     realityscan,
     record3d,
+    transforms_json,
 )
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
-from snowsplat.scene.camera import Camera
+from snowsplat.data.readers.projects import advice
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import quoted
 
-logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Kind:
-    """How the files of a program are found and read.
-
-    Attributes:
-        name: of the program, for messages.
-        patterns: where in a dataset the files, or folders, are that describe its cameras.
-        is_one: whether a file or folder is one of them.
-        read: reads one of them. Errors are `UserError`.
-        photos: the folder of photos, if other images of the dataset are not photos.
-        metres_per_unit: of its world; None: it has any unit.
-    """
-
-    name: str
-    patterns: tuple[str, ...]
-    is_one: Callable[[Path], bool]
-    read: Callable[[Path, PhotoFolder], Reconstruction]
-    photos: Callable[[Path], Path | None] = lambda folder: None
-    metres_per_unit: float | None = None
-
-    def find(self, folder: Path) -> Iterator[Path]:
-        """The files that describe the cameras of a dataset, the best first.
-
-        They are in the order of the patterns; of those of one pattern, a larger file says more.
-        """
-        for pattern in self.patterns:
-            found = [path for path in sorted(folder.glob(pattern)) if self.is_one(path)]
-            yield from sorted(found, key=lambda path: -path.stat().st_size)
-
-
-#: In the order in which they are tried: files of an unmistakable kind first.
-KINDS = (
-    Kind("Metashape", ("*.xml",), metashape.is_metashape, metashape.read),
-    Kind("RealityScan", ("*.csv",), realityscan.is_realityscan, realityscan.read),
-    Kind("Polycam", polycam.PATTERNS, polycam.is_polycam, polycam.read, polycam.photos, 1.0),
-    Kind("Record3D", record3d.PATTERNS, record3d.is_record3d, record3d.read, record3d.photos, 1.0),
-    Kind("OpenMVG", ("sfm_data*.json",), openmvg.is_openmvg, openmvg.read),
-    Kind("AliceVision", ("*.sfm", "sfm.json"), alicevision.is_alicevision, alicevision.read),
-    Kind("Bundler", bundler.PATTERNS, bundler.is_bundler, bundler.read),
-    Kind("OpenSfM", opensfm.PATTERNS, opensfm.is_opensfm, opensfm.read),
-    Kind("LLFF", ("poses_bounds.npy",), llff.is_llff, llff.read),
+#: The exports of programs, in the order in which they are tried: unmistakable files first.
+PROGRAMS = (
+    metashape.READER,
+    realityscan.READER,
+    polycam.READER,
+    record3d.READER,
+    openmvg.READER,
+    alicevision.READER,
+    bundler.READER,
+    opensfm.READER,
+    llff.READER,
 )
+#: All readers; the first one that finds its files in a folder is used.
+READERS = (colmap.READER, transforms_json.READER, *PROGRAMS)
+
+
+class NoPosesError(UserError):
+    """A folder has no camera poses, so it is not a dataset; it may have photos."""
 
 
 @dataclass(frozen=True)
-class Export:
-    """The files of another program in a folder.
+class Poses:
+    """The files that tell the poses of a dataset, the first of which counts, and their reader."""
 
-    Attributes:
-        kind: the program.
-        cameras: the file or folder that describes the cameras; None: there is none with poses.
-        photos: the folder of the photos, if other images in the dataset are not photos.
+    reader: Reader
+    files: list[Path]
+
+
+def find_poses(root: Path, images: str = "images", *, deep: bool = True) -> Poses | None:
+    """What tells the poses of the images in a folder, or the file ``root``; None: nothing.
+
+    Args:
+        images: name of the folder of images.
+        deep: also models of COLMAP in other folders than ``sparse``, which may be those of other
+            photos.
+
+    Raises: UserError: there are several datasets.
     """
-
-    kind: Kind
-    cameras: Path | None
-    photos: Path | None
-
-
-def find_export(path: Path) -> Export | None:
-    """The program whose files are in a folder, or that wrote the file ``path``; None if unknown.
-
-    If there is only one folder in a folder, as unpacked archives have it, it is searched too.
-    """
-    if path.is_file():
-        return next((Export(kind, path, None) for kind in KINDS if kind.is_one(path)), None)
-    return _in_folder(path) or next(map(_in_folder, _only_folder(path)), None)
-
-
-def _in_folder(folder: Path) -> Export | None:
-    for kind in KINDS:
-        cameras = next(kind.find(folder), None)
-        photos = kind.photos(folder)
-        if cameras is not None or photos is not None:
-            return Export(kind, cameras, photos)
+    # Any JSON file may be a transforms.json.
+    for reader in (*PROGRAMS, transforms_json.READER) if root.is_file() else READERS:
+        if files := reader.find(root, images, deep):
+            return Poses(reader, files)
     return None
 
 
-def _only_folder(folder: Path) -> list[Path]:
-    """The subfolder, if a folder has one and no files; hidden ones do not count."""
+def poses_in(root: Path) -> Path | None:
+    """What tells the poses of the photos in a folder, relative to it, as sparse/0; or None."""
     try:
-        inside = [path for path in folder.iterdir() if not path.name.startswith((".", "__"))]
-    except OSError:
-        return []
-    return inside if len(inside) == 1 and inside[0].is_dir() else []
+        poses = find_poses(root) if root.is_dir() else None
+    except UserError:  # several datasets
+        return None
+    return None if poses is None else poses.files[0].relative_to(root)
 
 
-def read_export(
-    root: Path, export: Export, images: str
-) -> tuple[list[PosedImage], Points | None, str]:
-    """Read the posed images that are on disk, points, and a description.
+def is_export(path: Path) -> bool:
+    """Whether a file is the export of a program."""
+    return any(reader.find(path, "images", False) for reader in PROGRAMS)
 
-    Args:
-        root: the folder of the dataset, or the file of its cameras.
-        export: of `find_export`, with cameras.
-        images: name of the folder of images; another than ``images`` is the only one searched.
+
+def photo_folder(root: Path) -> tuple[str, Path] | None:
+    """The program whose capture is in a folder, and the folder of its photos, if other images of
+    the capture are not photos."""
+    for reader in PROGRAMS:
+        if (folder := reader.photos(root)) is not None:
+            return reader.name, folder
+        if reader.find(root, "images", False):
+            break
+    return None
+
+
+def read_poses(root: Path, images: str = "images") -> Reconstruction:
+    """Read the posed images and points of a dataset: a folder, or a file of poses.
+
+    ``images``: name of the folder of images.
 
     Raises:
+        NoPosesError: there are none.
         UserError: damaged files, an unsupported lens, or no images.
         SettingError: there is no folder ``images``.
     """
-    cameras = export.cameras
-    assert cameras is not None
-    folder = PhotoFolder(root.parent if root.is_file() else root, images)
-    found = export.kind.read(cameras, folder)
-    _check(export.kind.name, cameras, folder, found)
-    shown = f"{export.kind.name} {cameras.name}"
-    aligned = len(found.shots) + len(found.missing)
-    description = f"{shown}, {aligned} of {found.total} photos aligned"
-    if found.points_from:
-        description += f", points from {found.points_from}"
-    return [_posed(folder.root, shot) for shot in found.shots], found.points, description
+    if not root.exists():
+        raise UserError("{root}: no such folder", root=root)
+    poses = find_poses(root, images)
+    folder = root.parent if root.is_file() else root
+    if poses is None or poses.reader is colmap.READER:
+        _check_folder(root, images, poses)
+    if poses is not None:
+        return poses.reader.read(poses.files, PhotoFolder(folder, images))
+    if (known := advice(root)) is not None:
+        raise NoPosesError(
+            "{root}: no camera poses that can be read here; {known}", root=root, known=known
+        )
+    raise NoPosesError(
+        "{root}: no camera poses here (neither sparse/0 of COLMAP nor transforms.json); to "
+        "estimate the poses of photos, run: snowsplat sfm PHOTOS -o DATASET",
+        root=root,
+    )
 
 
-def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstruction) -> None:
-    if not found.shots:
-        if not found.missing:
-            none = f"none of its {found.total} photos is aligned" if found.total else "no photos"
-            raise UserError(
-                "{cameras}: {none}; align them in {program}, or estimate the poses: snowsplat "
-                "sfm PHOTOS -o DATASET",
-                cameras=cameras,
-                none=none,
-                program=program,
-            )
+def _check_folder(root: Path, images: str, poses: Poses | None) -> None:
+    """Raise `UserError` if a path is no folder, or a part of a dataset."""
+    if root.suffix.lower() == ".zip" and root.is_file():
         raise UserError(
-            "{cameras}: none of its {missing} photos (the first is {missing2}) is in {root}; "
-            "copy them to {root2}",
-            cameras=cameras,
-            missing=len(found.missing),
-            missing2=quoted(found.missing[0]),
-            root=folder.root,
-            root2=folder.root / "images",
+            "{root}: is a zip file; unpack it and use its folder, or if there are only photos in "
+            "it, run: snowsplat make {root} -o OUT",
+            root=root,
         )
-    aligned = len(found.missing) + len(found.shots)
-    warn_of_missing(cameras, found.missing, aligned, "photos")
-    if found.points is None:
-        with_depth = any(shot.depth is not None for shot in found.shots)
-        logger.warning(
-            "%s: no points%s; a PLY file of them in %s is a better start",
-            cameras,
-            ", but depth maps, which --init depth uses" if with_depth else "",
-            folder.root,
-        )
-
-
-def _posed(root: Path, shot: Shot) -> PosedImage:
-    lens = shot.lens
-    camera = Camera(
-        lens.width, lens.height, *lens.intrinsics, torch.from_numpy(shot.cam_from_world.copy())
-    )
-    first, slash, _ = shot.photo.partition("/")
-    folder = root / first if slash else root
-    return PosedImage(
-        safe_name(shot.photo),
-        camera,
-        folder,
-        (root / shot.photo).relative_to(folder).as_posix(),
-        depth=shot.depth,
-        depth_unit=shot.depth_unit,
-        depth_confidence=shot.depth_confidence,
-        lens=None if lens.is_pinhole else lens,
-    )
+    if root.is_file():
+        raise UserError("{root}: not a dataset; use its folder, or a transforms.json", root=root)
+    if poses is None or not ((root / images).is_dir() or photos_below(root)):
+        parents = root.absolute().parents[:2]
+        above = next((p for p in parents if find_poses(p, images, deep=False)), None)
+        if above is not None:
+            raise UserError(
+                "{root}: a part of a dataset; use the whole: {above}", root=root, above=above
+            )

@@ -15,7 +15,7 @@ from snowsplat.data.dataset import usable_points
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import fisheye, perspective
 from snowsplat.data.readers.points import points_beside
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
     damaged,
     head_of,
@@ -73,14 +73,14 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         cam = rigid(where, rotation, -rotation @ centre)
         if (photo := found.photo(photos, name)) is None:
             continue
-        found.shots.append(Shot(photo, lens, cam))
+        found.add(photos, photo, lens, cam)
     points = list(objects(f"{path}: structure", scene.get("structure") or []))
     if points:
         xyz = np.stack([numbers(path, point.get("X"), 3) for point in points])
         rgb = np.stack([numbers(path, p.get("color", [128] * 3), 3) for p in points])
         found.points = usable_points(path, xyz, np.clip(rgb, 0, 255))
-    elif found.shots:
-        points_beside(path.parent, photos, found)
+    elif found.images:
+        points_beside(path.parent, found)
     return found
 
 
@@ -115,3 +115,6 @@ def _lens(where: str, camera: dict[str, Any], version: tuple[float, ...]) -> Len
     if kind.startswith("fisheye"):
         return fisheye(where, width, height, intrinsics, k)
     return perspective(where, width, height, intrinsics, k[:3], k[3:] or (0.0, 0.0))
+
+
+READER = program("AliceVision", ("*.sfm", "sfm.json"), is_alicevision, read)

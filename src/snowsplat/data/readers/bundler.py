@@ -14,7 +14,7 @@ import numpy as np
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.photos.decode import read_header
 from snowsplat.data.readers.lenses import centred, perspective
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import head_of, load_text, numbers, rigid
 from snowsplat.util.errors import UserError
 
@@ -48,7 +48,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         size = header.width, header.height
         lens = perspective(where, *size, centred(*size, focal), (k1, k2))
         pose = rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
-        found.shots.append(Shot(photo, lens, pose))
+        found.add(photos, photo, lens, pose)
     xyz, rgb = [], []
     for _ in range(count):
         xyz.append(numbers(path, next(lines, "").split(), 3))
@@ -76,3 +76,6 @@ def _names(path: Path, root: Path, count: int) -> list[str]:
         path=path,
         count=count,
     )
+
+
+READER = program("Bundler", PATTERNS, is_bundler, read)

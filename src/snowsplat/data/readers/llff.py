@@ -12,7 +12,7 @@ import numpy as np
 
 from snowsplat.data.photos.image_file import reason_of
 from snowsplat.data.readers.lenses import centred, perspective
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import damaged, from_opengl, numbers
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
@@ -51,5 +51,8 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         down, right, back, position, (height, width, focal) = row[:15].reshape(3, 5).T
         lens = perspective(where, width, height, centred(width, height, focal))
         pose = from_opengl(where, np.column_stack([right, -down, back, position]))
-        found.shots.append(Shot(file, lens, pose))
+        found.add(photos, file, lens, pose)
     return found
+
+
+READER = program("LLFF", ("poses_bounds.npy",), is_llff, read)

@@ -17,7 +17,7 @@ import numpy as np
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
     damaged,
     head_of,
@@ -116,10 +116,10 @@ def _read_chunk(
         world_from_cam = rigid(
             path, world[:, :3] @ pose[:, :3], scale * world[:, :3] @ pose[:, 3] + world[:, 3]
         )
-        found.shots.append(Shot(photo, lens, inverse(world_from_cam)))
+        found.add(photos, photo, lens, inverse(world_from_cam))
     # The points may be in the frame of the chunk, or in that of the chunk in world units.
     similar = np.column_stack([scale * world[:, :3], world[:, 3]])
-    points_beside(path.parent, photos, found, (np.eye(4)[:3], similar, world))
+    points_beside(path.parent, found, (np.eye(4)[:3], similar, world))
     return found
 
 
@@ -212,3 +212,6 @@ def _lens(where: str, sensor: Element) -> Lens:
 def _size(where: str, resolution: Element) -> tuple[int, int]:
     sides = {key: resolution.get(key) for key in ("width", "height")}
     return size_of(where, number(where, sides, "width"), number(where, sides, "height"))
+
+
+READER = program("Metashape", ("*.xml",), is_metashape, read)

@@ -15,7 +15,7 @@ from snowsplat.data.dataset import usable_points
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
     damaged,
     head_of,
@@ -70,13 +70,13 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         cam = rigid(where, rotation, -rotation @ centre)
         if (photo := found.photo(photos, name)) is None:
             continue
-        found.shots.append(Shot(photo, lenses[key], cam))
+        found.add(photos, photo, lenses[key], cam)
     xyz = [
         numbers(f"{path}: structure", table(path, point.get("value")).get("X"), 3)
         for point in objects(f"{path}: structure", scene.get("structure") or [])
     ]
-    if found.shots:  # the points of the file have no colours
-        points_beside(path.parent, photos, found)
+    if found.images:  # the points of the file have no colours
+        points_beside(path.parent, found)
     if xyz and found.points is None:
         found.points = usable_points(path, np.stack(xyz), np.full((len(xyz), 3), 128))
     return found
@@ -127,3 +127,6 @@ def _lens(where: str, kind: str, data: dict[str, Any]) -> Lens:
     if kind == "fisheye":
         return fisheye(where, width, height, intrinsics, k)
     return perspective(where, width, height, intrinsics, k[:3], k[3:] or (0.0, 0.0))
+
+
+READER = program("OpenMVG", ("sfm_data*.json",), is_openmvg, read)

@@ -15,7 +15,7 @@ import numpy as np
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
     damaged,
     head_of,
@@ -75,7 +75,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             lenses[key] = _lens(f"{path}: camera {quoted(key)}", table(where, cameras[key]))
         rotation = _rotation(numbers(where, shot.get("rotation"), 3))
         pose = rigid(where, rotation, numbers(where, shot.get("translation"), 3))
-        found.shots.append(Shot(photo, lenses[key], pose))
+        found.add(photos, photo, lenses[key], pose)
     _read_points(path, table(f"{path}: points", scenes[largest].get("points") or {}), found)
     return found
 
@@ -127,3 +127,6 @@ def _lens(where: str, camera: dict[str, Any]) -> Lens:
     if kind in _FISHEYE:
         return fisheye(where, width, height, intrinsics, radial)
     return perspective(where, width, height, intrinsics, radial[:3], (value("p1"), value("p2")))
+
+
+READER = program("OpenSfM", PATTERNS, is_opensfm, read)

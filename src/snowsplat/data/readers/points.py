@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.dataset import usable_points
+from snowsplat.data.dataset import PosedImage, usable_points
 from snowsplat.data.photos.decode import ImageSource, load_thumbnail, read_header
 from snowsplat.data.points_ply import read_points
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import Reconstruction
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
 
@@ -27,7 +27,6 @@ _PICTURES, _SIDE, _COLOURS, _FEWEST_SEEN = 12, 320, 20_000, 20
 
 def points_beside(
     folder: Path,
-    photos: PhotoFolder,
     found: Reconstruction,
     frames: Sequence[np.ndarray] = (np.eye(4)[:3],),
 ) -> None:
@@ -52,12 +51,12 @@ def points_beside(
         rejected = path
         for matrix in frames:
             moved = xyz @ matrix[:, :3].T + matrix[:, 3]
-            if _share_seen(moved, found.shots) > _LEAST_SEEN:
+            if _share_seen(moved, found.images) > _LEAST_SEEN:
                 fitting.append((path, moved, rgb))
     if fitting:
         scores = [0.0]
         if len(fitting) > 1:
-            pictures = _pictures(photos, found.shots)
+            pictures = _pictures(found.images)
             scores = [_agreement(xyz, rgb, pictures) for _, xyz, rgb in fitting]
         path, moved, rgb = fitting[scores.index(max(scores))]
         found.points, found.points_from = usable_points(path, moved, rgb), path.name
@@ -69,47 +68,48 @@ def points_beside(
         )
 
 
-def _share_seen(xyz: np.ndarray, shots: Sequence[Shot]) -> float:
+def _share_seen(xyz: np.ndarray, images: Sequence[PosedImage]) -> float:
     """The share of the points that at least one photo shows, from a sample."""
     xyz = xyz[:: max(1, len(xyz) // _SAMPLE)]
     seen = np.zeros(len(xyz), bool)
-    for shot in shots[:: max(1, len(shots) // _SAMPLE)]:
-        seen[_positions(xyz, shot)[0]] = True
+    for image in images[:: max(1, len(images) // _SAMPLE)]:
+        seen[_positions(xyz, image)[0]] = True
     return float(seen.mean()) if len(seen) else 0.0
 
 
-def _positions(xyz: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+def _positions(xyz: np.ndarray, image: PosedImage) -> tuple[np.ndarray, np.ndarray]:
     """The indices (N,) of the points that a photo shows, and where (N, 2), relative to its size."""
-    cam = xyz @ shot.cam_from_world[:, :3].T + shot.cam_from_world[:, 3]
-    where = shot.lens.project(cam) / (shot.lens.width, shot.lens.height)
+    pose = image.camera.cam_from_world.numpy()
+    cam = xyz @ pose[:, :3].T + pose[:, 3]
+    where = image.lens.project(cam) / (image.lens.width, image.lens.height)
     seen = ((where >= 0) & (where < 1)).all(1)
     return np.flatnonzero(seen), where[seen]
 
 
-def _pictures(photos: PhotoFolder, shots: Sequence[Shot]) -> list[tuple[Shot, np.ndarray]]:
+def _pictures(images: Sequence[PosedImage]) -> list[tuple[PosedImage, np.ndarray]]:
     """Some of the photos, spread over all, as small pictures (4, h, w) uint8."""
-    chosen = shots[:: max(1, len(shots) // _PICTURES)]
+    chosen = images[:: max(1, len(images) // _PICTURES)]
     found = []
-    for shot in chosen:
-        path = photos.root / shot.photo
+    for image in chosen:
+        path = image.path
         header = read_header(path)
         source = ImageSource(path, header.width, header.height)
         try:
-            found.append((shot, load_thumbnail(source, _SIDE)))
+            found.append((image, load_thumbnail(source, _SIDE)))
         except UserError:  # the training says so
             continue
     return found
 
 
 def _agreement(
-    xyz: np.ndarray, rgb: np.ndarray, pictures: Sequence[tuple[Shot, np.ndarray]]
+    xyz: np.ndarray, rgb: np.ndarray, pictures: Sequence[tuple[PosedImage, np.ndarray]]
 ) -> float:
     """The mean correlation between the colours of points and of the pixels where they are."""
     step = max(1, len(xyz) // _COLOURS)
     xyz, rgb = xyz[::step], rgb[::step].astype(np.float32)
     values = [0.0]
-    for shot, picture in pictures:
-        seen, where = _positions(xyz, shot)
+    for image, picture in pictures:
+        seen, where = _positions(xyz, image)
         column, row = (where * picture.shape[:0:-1]).astype(np.int64).T
         a, b = rgb[seen], picture[:3, row, column].T.astype(np.float32)
         if len(seen) >= _FEWEST_SEEN:

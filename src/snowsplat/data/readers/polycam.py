@@ -14,7 +14,7 @@ import numpy as np
 
 from snowsplat.data.photos.decode import read_header
 from snowsplat.data.readers.lenses import perspective
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import from_opengl, load_json, number, table
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
@@ -72,7 +72,16 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         pose = from_opengl(file, np.reshape(entries, (3, 4)))
         depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
         confidence = keyframes / "confidence" / f"{file.stem}.png"
-        found.shots.append(
-            Shot(photo, lens, pose, depth, _MILLIMETRE, confidence if is_file(confidence) else None)
+        found.add(
+            photos,
+            photo,
+            lens,
+            pose,
+            depth,
+            _MILLIMETRE,
+            confidence if is_file(confidence) else None,
         )
     return found
+
+
+READER = program("Polycam", PATTERNS, is_polycam, read, photos, 1.0)

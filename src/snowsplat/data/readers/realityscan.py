@@ -18,7 +18,7 @@ import numpy as np
 from snowsplat.data.photos.decode import read_header
 from snowsplat.data.readers.lenses import perspective
 from snowsplat.data.readers.points import points_beside
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import damaged, from_opengl, head_of, load_text, number
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
@@ -78,9 +78,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         position = [number(where, values, key) for key in ("x", "y", "alt")]
         angles = [math.radians(number(where, values, k)) for k in ("heading", "pitch", "roll")]
         pose = np.column_stack([_rotation(*angles), position])
-        found.shots.append(Shot(photo, lens, from_opengl(where, pose)))
+        found.add(photos, photo, lens, from_opengl(where, pose))
     _warn(path, found, division)
-    points_beside(path.parent, photos, found)
+    points_beside(path.parent, found)
     return found
 
 
@@ -99,7 +99,7 @@ def _rotation(heading: float, pitch: float, roll: float) -> np.ndarray:
 
 
 def _warn(path: Path, found: Reconstruction, division: bool) -> None:
-    if len(found.shots) < 2:
+    if len(found.images) < 2:
         return
     if division:
         logger.warning(
@@ -107,7 +107,7 @@ def _warn(path: Path, found: Reconstruction, division: bool) -> None:
             "does not tell; they are read as Brown's model; align with Brown3 if that is wrong",
             path,
         )
-    centres = np.stack([-s.cam_from_world[:, :3].T @ s.cam_from_world[:, 3] for s in found.shots])
+    centres = np.stack([image.camera.position.numpy() for image in found.images])
     across, up = np.ptp(centres[:, :2], axis=0).max(), np.ptp(centres[:, 2])
     degrees = (np.abs(centres[:, :2]) <= (180.0, 90.0)).all() and across < 0.1
     if degrees and across < 0.01 * up:
@@ -116,3 +116,6 @@ def _warn(path: Path, found: Reconstruction, division: bool) -> None:
             "coordinate system Local Euclidean",
             path=path,
         )
+
+
+READER = program("RealityScan", ("*.csv",), is_realityscan, read)

@@ -1,19 +1,26 @@
-"""What a reader of this folder gets, a `PhotoFolder`, and what it returns, a `Reconstruction`."""
+"""What all readers have in common: `Reader`, the `PhotoFolder` that one gets, and the
+`Reconstruction` that it returns."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import torch
 
-from snowsplat.data.dataset import Points, safe_name
+from snowsplat.data.dataset import Points, PosedImage, safe_name
 from snowsplat.data.files.listing import folded
-from snowsplat.data.files.photo_files import photos_below
+from snowsplat.data.files.photo_files import photos_below, warn_of_missing
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
+from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
+
+logger = logging.getLogger(__name__)
 
 # Smaller copies of the photos, whose folder may have any name.
 _SMALLER = {"images_2", "images_4", "images_8"}
@@ -28,19 +35,22 @@ class PhotoFolder:
     Args:
         root: the folder that is searched; no photo outside of it is used.
         images: name of the folder of photos; photos elsewhere are used if it has the default name.
-
-    Raises: SettingError: there is no folder ``images``, and it does not have the default name.
     """
 
     def __init__(self, root: Path, images: str = "images") -> None:
         self.root = root
-        self._preferred = images
-        if images != "images" and not (root / images).is_dir():
-            raise SettingError(
-                "images", "no such folder: {images}; use the right one", images=root / images
-            )
+        self.images = images
         self._only = images != "images"
         self._by_name: dict[str, list[str]] | None = None
+
+    def check(self) -> None:
+        """Raise `SettingError` if there is no folder ``images``, and it has another name."""
+        if self._only and not (self.root / self.images).is_dir():
+            raise SettingError(
+                "images",
+                "no such folder: {images}; use the right one",
+                images=self.root / self.images,
+            )
 
     def find(self, name: str) -> str | None:
         """The file of a photo, relative to the root, with "/"; None if it is not there.
@@ -50,7 +60,7 @@ class PhotoFolder:
         name = safe_name(name)
         if not name:
             return None
-        for folder in (f"{self._preferred}/", *(() if self._only else ("",))):
+        for folder in (f"{self.images}/", *(() if self._only else ("",))):
             for suffix in ("", *IMAGE_SUFFIXES) if not is_photo(name) else ("",):
                 if is_file(self.root / (folder + name + suffix)) and is_photo(name + suffix):
                     return folder + name + suffix
@@ -60,8 +70,8 @@ class PhotoFolder:
 
     def sorted_files(self) -> list[str]:
         """The photos of the folder of images, or of the root if there is none, sorted by name."""
-        folder = self.root / self._preferred
-        prefix = f"{self._preferred}/" if folder.is_dir() else ""
+        folder = self.root / self.images
+        prefix = f"{self.images}/" if folder.is_dir() else ""
         names = (path.name for path in (folder if prefix else self.root).iterdir())
         return [prefix + name for name in sorted(names) if is_photo(name)]
 
@@ -75,7 +85,7 @@ class PhotoFolder:
             own = PurePosixPath(file).parts
             pairs = zip(wanted, own[-2::-1], strict=False)
             same = next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(wanted), len(own)))
-            return same, own[0] == self._preferred
+            return same, own[0] == self.images
 
         found = sorted(found, key=common, reverse=True)
         if common(found[0]) == common(found[1]):
@@ -93,7 +103,7 @@ class PhotoFolder:
         """The photos below the root, by their names and by their names without suffix."""
         if self._by_name is None:
             self._by_name = {}
-            below = f"{self._preferred}/" if self._only else ""
+            below = f"{self.images}/" if self._only else ""
             try:
                 photos = photos_below(self.root / below)
             except OSError:  # a folder that cannot be read
@@ -110,32 +120,26 @@ def _stem(name: str) -> str:
     return name.rpartition(".")[0] if is_photo(name) else name
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A photo with a pose."""
-
-    photo: str  # relative to the root of the `PhotoFolder`
-    lens: Lens
-    cam_from_world: np.ndarray  # (3, 4) float64, OpenCV axes
-    depth: Path | None = None
-    depth_unit: float = 1.0  # as `PosedImage.depth_unit`
-    depth_confidence: Path | None = None  # as `PosedImage.depth_confidence`
-
-
 @dataclass(eq=False)
 class Reconstruction:
-    """The photos and points of a file; readers add to it while they read.
+    """The posed images and points of a dataset; readers add to it while they read.
 
     Attributes:
+        images: those that are on disk.
+        points: None: the dataset has none.
+        description: the files that were read, for messages.
+        metres_per_unit: of the world; None: it is not known.
         total: number of photos in the file, with and without poses.
         missing: names of photos with poses that are not on disk.
         points_from: the file of the points, if it is another one.
     """
 
-    shots: list[Shot] = field(default_factory=list)
+    images: list[PosedImage] = field(default_factory=list)
+    points: Points | None = None
+    description: str = ""
+    metres_per_unit: float | None = None
     total: int = 0
     missing: list[str] = field(default_factory=list)
-    points: Points | None = None
     points_from: str = ""
 
     def photo(self, photos: PhotoFolder, name: str) -> str | None:
@@ -144,3 +148,131 @@ class Reconstruction:
         if photo is None:
             self.missing.append(name)
         return photo
+
+    def add(
+        self,
+        photos: PhotoFolder,
+        photo: str,
+        lens: Lens,
+        cam_from_world: np.ndarray,
+        depth: Path | None = None,
+        depth_unit: float = 1.0,
+        depth_confidence: Path | None = None,
+    ) -> None:
+        """Add a photo, by its file relative to the root of ``photos``, and its pose (3, 4) float64
+        in OpenCV axes; see `PosedImage`."""
+        camera = Camera(
+            lens.width, lens.height, *lens.intrinsics, torch.from_numpy(cam_from_world.copy())
+        )
+        image = PosedImage.below(photos.root, photo, camera, lens)
+        self.images.append(
+            replace(image, depth=depth, depth_unit=depth_unit, depth_confidence=depth_confidence)
+        )
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How the files are found and read that tell the poses of a dataset.
+
+    Attributes:
+        name: of the program or format, for messages.
+        find: the files or folders that describe the cameras of the dataset in a folder, or the file
+            itself; the best first. Its other arguments are the name of the folder of images, and
+            whether to search folders that may be those of other photos.
+        read: reads what ``find`` has found.
+        photos: the folder of photos, if other images of the dataset are not photos.
+    """
+
+    name: str
+    find: Callable[[Path, str, bool], list[Path]]
+    read: Callable[[list[Path], PhotoFolder], Reconstruction]
+    photos: Callable[[Path], Path | None] = lambda folder: None
+
+
+def program(
+    name: str,
+    patterns: Sequence[str],
+    is_one: Callable[[Path], bool],
+    read: Callable[[Path, PhotoFolder], Reconstruction],
+    photos: Callable[[Path], Path | None] = lambda folder: None,
+    metres_per_unit: float | None = None,
+) -> Reader:
+    """The reader of the export of a program.
+
+    Args:
+        name: of the program.
+        patterns: where in a dataset the files, or folders, are that describe its cameras; of those
+            of one pattern, a larger file says more.
+        is_one: whether a file or folder is one of them.
+        read: reads one of them.
+        photos: see `Reader`.
+        metres_per_unit: of its world; None: it has any unit.
+    """
+
+    def find(root: Path, images: str = "images", deep: bool = True) -> list[Path]:
+        if root.is_file():
+            return [root] if is_one(root) else []
+        for folder in (root, *_only_folder(root)):
+            for pattern in patterns:
+                found = [path for path in sorted(folder.glob(pattern)) if is_one(path)]
+                if found:
+                    return sorted(found, key=lambda path: -path.stat().st_size)
+        return []
+
+    def read_first(files: list[Path], folder: PhotoFolder) -> Reconstruction:
+        folder.check()
+        cameras = files[0]
+        found = read(cameras, folder)
+        _check(name, cameras, folder, found)
+        aligned = len(found.images) + len(found.missing)
+        found.description = f"{name} {cameras.name}, {aligned} of {found.total} photos aligned"
+        if found.points_from:
+            found.description += f", points from {found.points_from}"
+        found.metres_per_unit = metres_per_unit
+        return found
+
+    def photos_in(root: Path) -> Path | None:
+        return next(filter(None, map(photos, (root, *_only_folder(root)))), None)
+
+    return Reader(name, find, read_first, photos_in)
+
+
+def _only_folder(folder: Path) -> list[Path]:
+    """The subfolder, if a folder has one and no files; hidden ones do not count."""
+    try:
+        inside = [path for path in folder.iterdir() if not path.name.startswith((".", "__"))]
+    except OSError:
+        return []
+    return inside if len(inside) == 1 and inside[0].is_dir() else []
+
+
+def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstruction) -> None:
+    if not found.images:
+        if not found.missing:
+            none = f"none of its {found.total} photos is aligned" if found.total else "no photos"
+            raise UserError(
+                "{cameras}: {none}; align them in {program}, or estimate the poses: snowsplat "
+                "sfm PHOTOS -o DATASET",
+                cameras=cameras,
+                none=none,
+                program=program,
+            )
+        raise UserError(
+            "{cameras}: none of its {missing} photos (the first is {missing2}) is in {root}; "
+            "copy them to {root2}",
+            cameras=cameras,
+            missing=len(found.missing),
+            missing2=quoted(found.missing[0]),
+            root=folder.root,
+            root2=folder.root / "images",
+        )
+    aligned = len(found.missing) + len(found.images)
+    warn_of_missing(cameras, found.missing, aligned, "photos")
+    if found.points is None:
+        with_depth = any(image.depth is not None for image in found.images)
+        logger.warning(
+            "%s: no points%s; a PLY file of them in %s is a better start",
+            cameras,
+            ", but depth maps, which --init depth uses" if with_depth else "",
+            folder.root,
+        )

@@ -18,7 +18,7 @@ import torch
 from snowsplat.data.maps.map_file import MAP_SUFFIXES
 from snowsplat.data.photos.decode import is_photo
 from snowsplat.data.readers.lenses import Intrinsics, perspective
-from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, Shot
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
     damaged,
     from_opengl,
@@ -96,7 +96,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         depth = next((name for name in names if is_file(name)), None)
         compressed |= depth is None and is_file(file.with_suffix(".depth"))
         photo = file.relative_to(photos.root).as_posix()
-        found.shots.append(Shot(photo, lens, cam, depth))
+        found.add(photos, photo, lens, cam, depth)
     if compressed:
         logger.warning(
             "%s: the depth maps are compressed (LZFSE), which is not supported; not used; export "
@@ -132,3 +132,6 @@ def _intrinsics(path: Path, values: dict[str, Any]) -> Intrinsics:
     k = numbers(f"{path}: K", values.get("K"), 9).reshape(3, 3).T
     k = k.T if k[2, 0] or k[2, 1] else k
     return float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
+
+
+READER = program("Record3D", PATTERNS, is_record3d, read, photos, 1.0)

@@ -22,7 +22,7 @@ import math
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +34,7 @@ from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, warn_of_missing
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.data.points_ply import read_points as read_points_ply
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
 from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_of
 from snowsplat.data.readers.values import load_json
 from snowsplat.scene.camera import Camera
@@ -57,7 +58,7 @@ _Json = dict[str, Any]
 _Split = Literal["train", "test"]
 
 
-def find_transforms(root: Path) -> list[Path]:
+def find(root: Path, images: str = "images", deep: bool = True) -> list[Path]:
     """The transforms files of a dataset: [training, test], [all images], or [] if there are none.
 
     ``root`` is a folder or a JSON file.
@@ -72,19 +73,17 @@ def find_transforms(root: Path) -> list[Path]:
     return [single] if single.is_file() else []
 
 
-def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], Points | None, str]:
-    """Read posed images that are on disk, points, and a description.
+def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
+    """Read posed images that are on disk, and points.
 
-    Args:
-        files: the result of `find_transforms`.
-        images: a folder to use instead of ``images``, for example ``images_4``.
+    The folder of images of ``photos`` is used instead of ``images``, for example ``images_4``.
 
     Raises: UserError: a file is damaged or of another kind, or no image is there.
     """
     root = files[0].parent
     shown = " + ".join(path.name for path in files)
     frames, first_scene = _frames(files)
-    found = _files_of(root / shown, root, [frame.name for frame in frames], images)
+    found = _files_of(root / shown, root, [frame.name for frame in frames], photos.images)
     split = _without_overlap(root, files, frames, found)
     posed: dict[str, PosedImage] = {}
     seen: set[tuple[str, _Split | None]] = set()
@@ -112,7 +111,7 @@ def read_transforms(files: list[Path], images: str) -> tuple[list[PosedImage], P
             hint=hint,
         )
     warn_of_missing(root / shown, missing, len(frames))
-    return list(posed.values()), _points(root, first_scene), shown
+    return Reconstruction(list(posed.values()), _points(root, first_scene), shown)
 
 
 @dataclass(frozen=True)
@@ -179,18 +178,12 @@ def _posed_image(
     camera = _camera(where, values, root / file)
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     lens = lens_of(where, values, camera.width, camera.height, intrinsics)
-    first, slash, _ = file.partition("/")
-    folder = root / first if first and slash else (root / file).parent
-    return PosedImage(
-        safe_name(file),
-        camera,
-        folder,
-        (root / file).relative_to(folder).as_posix(),
-        _mask(where, root, values.maps[0]),  # masks belong to frames, not to files
-        split,
+    return replace(
+        PosedImage.below(root, file, camera, lens),
+        mask=_mask(where, root, values.maps[0]),  # masks belong to frames, not to files
+        split=split,
         depth=_depth_map(root, values.maps[0]),
         depth_unit=number_of(where, values, "integer_depth_scale") or 1.0,
-        lens=None if lens.is_pinhole else lens,
     )
 
 
@@ -430,3 +423,6 @@ def _points(root: Path, scene: _Json) -> Points | None:
         logger.warning("%s: applied_transform is not valid; COLMAP's points are not used", root)
         return None
     return usable_points(models[0], xyz.numpy(), points.rgb.numpy())
+
+
+READER = Reader("transforms.json", find, read)

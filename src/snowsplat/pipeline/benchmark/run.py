@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from snowsplat.data.readers.transforms_json import find_transforms
+from snowsplat.data.readers import transforms_json
 from snowsplat.evaluation.lpips import Lpips, is_packaged
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
@@ -120,7 +120,7 @@ def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
     """
 
     def is_dataset(path: Path) -> bool:
-        return (path / "sparse").is_dir() or bool(find_transforms(path))
+        return (path / "sparse").is_dir() or bool(transforms_json.find(path))
 
     if not folder.is_dir():
         raise UserError("{folder}: no such folder", folder=folder)

@@ -50,7 +50,7 @@ def write_block_dataset(
             _link(image.path, folder / f"images_{image.divided}" / name)
             continue
         camera, lens = image.camera, image.lens
-        if lens is None:
+        if lens.is_pinhole:
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
             lens = Pinhole(camera.width, camera.height, intrinsics)
         lens, error = lens.as_colmap()

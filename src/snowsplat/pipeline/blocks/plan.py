@@ -182,10 +182,10 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
             blocks=options.blocks,
             train=len(whole.train),
         )
-    posed = [image for image, _, _ in files.images]
+    posed = [image for image, _ in files.images]
     if any(image.divided > 1 for image in posed):
         original = read_dataset_files(replace(settings, resolution=-1))
-        posed += [image for image, _, _ in original.images]
+        posed += [image for image, _ in original.images]
     axes, contents = block_content(whole, options.blocks, options.margin)
     sizes = sorted(view.camera.width * view.camera.height for view in whole.train)
     config = config.capped(sizes[len(sizes) // 2], len(sizes))

@@ -11,9 +11,8 @@ from typing import Literal
 
 from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
-from snowsplat.data.load import poses_in
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
-from snowsplat.data.readers import find_export
+from snowsplat.data.readers import photo_folder, poses_in
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
@@ -154,25 +153,26 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
                 f"{shown(path)}: has camera poses already ({shown(poses)}), which are estimated "
                 f"again; to use them: snowsplat make {shown(path)}"
             )
-        elif (export := find_export(path)) is not None and export.photos is not None:
+        elif (capture := photo_folder(path)) is not None:
+            program, photos = capture
             notes.append(
-                f"{shown(path)}: a capture of {export.kind.name} without camera poses; the photos "
-                f"in {shown(export.photos.relative_to(path).as_posix())} are used"
+                f"{shown(path)}: a capture of {program} without camera poses; the photos "
+                f"in {shown(photos.relative_to(path).as_posix())} are used"
             )
-        photo_folder = _photos_of_dataset(path)
-        found = _search(photo_folder)
-        chosen = photos_or_films(photo_folder, found.photos, found.videos)
+        photos_in = _photos_of_dataset(path)
+        found = _search(photos_in)
+        chosen = photos_or_films(photos_in, found.photos, found.videos)
         prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
         left_out += found.left_out
-        left_out += [(shown(photo_folder / file), reason) for file, reason in chosen.left_out]
+        left_out += [(shown(photos_in / file), reason) for file, reason in chosen.left_out]
         for relative in chosen.photos:
             name = str(PurePosixPath(prefix) / shown(relative))
-            add(Source(photo_folder / relative, "photo", name, found.masks.of.get(relative)))
+            add(Source(photos_in / relative, "photo", name, found.masks.of.get(relative)))
         unused += found.masks.unused
         for relative in chosen.videos:
             stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
             video = prefix if len(chosen.videos) == 1 else _free(stem, folders)
-            add(Source(photo_folder / relative, "video", video))
+            add(Source(photos_in / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
     return Sources(tuple(inputs), files, left_out, unused, notes, posed)
@@ -299,9 +299,8 @@ def _maps_beside(photos: Sequence[str]) -> dict[str, str]:
 
 def _photos_of_dataset(root: Path) -> Path:
     """The folder of the photos of a dataset; ``root`` itself if it is no dataset or has none."""
-    export = find_export(root)
-    if export is not None and export.photos is not None:
-        return export.photos
+    if (capture := photo_folder(root)) is not None:
+        return capture[1]
     poses = poses_in(root)
     # A model deeper in the folder may be that of a few of the photos.
     near = poses is not None and (len(poses.parts) == 1 or poses.parts[0] in _MODEL_FOLDERS)

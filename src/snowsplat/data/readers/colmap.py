@@ -10,53 +10,57 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
-from snowsplat.data.colmap.model import count_images, read_model
-from snowsplat.data.colmap.places import workspace_of
+from snowsplat.data.colmap.model import count_images, posed_camera, read_model
+from snowsplat.data.colmap.places import find_models, find_models_below, workspace_of
 from snowsplat.data.colmap.tracks import points_with_tracks
-from snowsplat.data.colmap.types import ColmapImage, ColmapModel
-from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
+from snowsplat.data.colmap.types import ColmapModel
+from snowsplat.data.dataset import PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, photos_below, warn_of_missing
+from snowsplat.data.frame.placement import read_placement
 from snowsplat.data.points_ply import read_points as read_points_ply
-from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.data.readers import transforms_json
+from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
+from snowsplat.scene.length import stored_metres
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
 
-# A quaternion whose squared norm differs from 1 by less than this was a unit quaternion.
-_ROUNDED = 1e-5
+
+def find(root: Path, images: str, deep: bool = True) -> list[Path]:
+    """The folders of the models of a dataset, the largest first."""
+    models = find_models(root / "sparse")
+    if not deep or transforms_json.find(root):
+        return models
+    models = models or find_models(root) or find_models(root / "colmap" / "sparse")
+    if not (models and (root / images).is_dir()):  # dense/0/sparse, sfm …
+        models = find_models_below(root, images) or models
+    return models
 
 
-def read_colmap(
-    root: Path, models: list[Path], images: str
-) -> tuple[list[PosedImage], Points | None, str]:
-    """Read the first of ``models``: posed images that are on disk, points, and a description.
-
-    Args:
-        root: the folder of the dataset.
-        models: folders of models inside ``root``, from `find_models`.
-        images: name of the folder of images inside ``root``.
+def read(models: list[Path], photos: PhotoFolder) -> Reconstruction:
+    """Read the first of ``models``: posed images that are on disk, and points.
 
     Raises: UserError: damaged files, or no images.
     """
-    folder = models[0]
+    root, folder = photos.root, models[0]
     name = folder.relative_to(root).as_posix()
     if len(models) > 1:
         _warn_of_other_models(root, models)
     model = read_model(folder)
     if not model.images:
         raise UserError("{folder}: the COLMAP model has no images; run COLMAP again", folder=folder)
-    posed, names = _images_on_disk(workspace_of(folder, root, images), images, model)
+    posed, names = _images_on_disk(workspace_of(folder, root, photos.images), photos.images, model)
     points = points_with_tracks(model, names)
     ply = folder / "points3D.ply"
     if points is None and ply.is_file():
         points = usable_points(ply, *read_points_ply(ply))
     if points is None:
         logger.warning("%s: the model has no points; training starts from random ones", folder)
-    return posed, points, f"COLMAP model {name} ({'text' if model.text else 'binary'})"
+    placement = read_placement(root) if folder == root / "sparse" / "0" else None
+    metres = None if placement is None else stored_metres(placement.metres_per_unit)
+    description = f"COLMAP model {name} ({'text' if model.text else 'binary'})"
+    return Reconstruction(posed, points, description, metres)
 
 
 def _warn_of_other_models(root: Path, models: Sequence[Path]) -> None:
@@ -108,10 +112,10 @@ def _images_on_disk(
             PosedImage(
                 safe_name(name),
                 camera,
+                lens,
                 where,
                 file,
                 frame=None if frame is None else str(frame),
-                lens=None if lens.is_pinhole else lens,
             )
         )
     warn_of_missing(folder, missing, len(model.images))
@@ -142,43 +146,4 @@ def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
     )
 
 
-def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:
-    """The camera of an image, with its pose in float64. A distortion of its lens is left out.
-
-    Raises: UserError: the camera is missing or damaged.
-    """
-    colmap = model.cameras.get(image.camera_id)
-    if colmap is None:
-        raise UserError(
-            "{folder}: image {name} has camera {camera_id}, which the model does not contain; "
-            "copy the model again",
-            folder=model.folder,
-            name=image.name[:80],
-            camera_id=image.camera_id,
-        )
-    fx, fy, cx, cy = colmap.intrinsics
-    numbers = (fx, fy, cx, cy, *colmap.params)
-    if min(fx, fy) <= 0 or not all(abs(number) < 1e9 for number in numbers):
-        raise UserError(
-            "{folder}: the intrinsics of a camera are damaged ({model} {str}); copy the model "
-            "again",
-            folder=model.folder,
-            model=colmap.model,
-            str=" ".join(map(str, colmap.params)),
-        )
-    quat, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
-    if not (0.5 < float(quat.norm()) < 2.0 and float(translation.abs().max()) < 1e15):
-        raise UserError(
-            "{folder}: the pose of image {name} is damaged; copy the model again",
-            folder=model.folder,
-            name=image.name[:80],
-        )
-    rotation = rotation_from_quat(quat)
-    # COLMAP and its scripts compute R and t = −R C from a quaternion as it is, without dividing by
-    # its norm. If C is far from 0, this R restores C even if the quaternion is rounded.
-    norm2 = quat.square().sum()
-    if abs(float(norm2) - 1.0) < _ROUNDED:
-        identity = torch.eye(3, dtype=torch.float64)
-        rotation = identity + norm2 * (rotation - identity)
-    pose = torch.cat([rotation, translation[:, None]], 1)
-    return Camera(colmap.width, colmap.height, fx, fy, cx, cy, pose)
+READER = Reader("COLMAP", find, read)
