@@ -106,28 +106,6 @@ def experiment():
     del sys.modules["cholesky"]
 
 
-def test_the_shapes_of_the_experiment_start_equal(experiment):
-    """Each parameterisation begins with the same isotropic Gaussians."""
-    log_scales = normal(4, 1)
-    for shape in experiment.SHAPES.values():
-        M = shape.factor(shape.parameters(log_scales))
-        expected = (2 * log_scales).exp()[:, :, None] * torch.eye(3).double()
-        assert torch.allclose(M @ M.transpose(1, 2), expected)
-
-
-def test_triangular_factors_of_the_experiment(experiment):
-    """Both Cholesky factors are lower triangular, and every entry has its own parameter."""
-    p = [normal(2, 3), normal(2, 3, seed=1)]
-    below = torch.tensor([[1, 0], [2, 0], [2, 1]])
-    for name in ("Cholesky", "Cholesky, scaled rows"):
-        M = experiment.SHAPES[name].factor(p)
-        assert torch.equal(M, M.tril())
-        assert torch.allclose(M.diagonal(dim1=1, dim2=2), p[0].exp())
-        entries = M[:, below[:, 0], below[:, 1]]
-        scale = p[0].exp()[:, below[:, 0]] if "scaled" in name else 1.0
-        assert torch.allclose(entries, p[1] * scale)
-
-
 def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
     n = 12
     means = normal(n, 3) * 0.7 + torch.tensor([0.0, 0.0, 4.0])
@@ -145,16 +123,6 @@ def test_the_projection_of_the_experiment_is_that_of_the_operation(experiment):
     assert len(rows) > 5
     assert len(found) == n  # all are in front of the camera
     assert torch.allclose(found.packed[rows], expected.packed, atol=1e-12)
-
-
-def test_the_rate_with_the_best_mean_is_chosen(experiment):
-    def row(rate: float, seed: int, psnr: float) -> object:
-        return experiment.Result("R S", rate, seed, psnr, 2.0)
-
-    results = [row(0.01, 0, 20), row(0.03, 0, 21), row(0.1, 0, 30), row(0.3, 0, 40)]
-    results += [row(0.01, 1, 20), row(0.03, 1, 20), row(0.1, 1, -math.inf)]
-    results += [row(0.01, 2, 20.5), row(0.03, 2, 20)]
-    assert experiment.chosen(results) == [results[1], results[5], results[8]]
 
 
 def test_the_table_of_the_experiment(experiment):
