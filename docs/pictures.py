@@ -1,10 +1,12 @@
-"""Makes the pictures of the README and of the documentation from the results of the demo.
+"""Makes the pictures of the README and of the documentation.
 
-    snowsplat demo -o out/demo
-    python docs/pictures.py out/demo
+    python -c "from snowsplat.synthetic.photographer import write_synthetic_photos as write; \
+        write('out/table', 36, 1024, 768)"
+    snowsplat make out/table -o out/scenes/table
+    python docs/pictures.py out/scenes/table
 
 Needs Chromium. Writes to docs/pictures: scene.webp (a moving picture: the camera moves around the
-scene), globe.webp (a moving picture: the scene in a snow globe), web.webp and live.webp (the two
+scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture: the scene in a snow globe), web.webp and live.webp (the two
 viewers) and report.webp (the report of the training).
 """
 
@@ -30,8 +32,8 @@ from tests.browser import Browser, Page  # noqa: E402
 PICTURES = Path(__file__).with_name("pictures")
 WIDTH, HEIGHT = 1280, 800
 #: The moving picture: a size and rate that make it small enough for a page that is often opened.
-FILM = snowsplat.VideoOptions(path="ellipse", seconds=6.0, fps=12.0, size="640x400")
-FILM_QUALITY = 50
+FILM = snowsplat.VideoOptions(path="ellipse", seconds=5.0, fps=10.0, size="560x350")
+FILM_QUALITY = 42
 GLOBE = snowsplat.GlobeOptions(name="snowsplat", size="400", fps=10.0)
 GLOBE_QUALITY = 30
 
@@ -79,6 +81,21 @@ def shoot(page: Page, target: Path) -> None:
     Image.fromarray(page.screenshot()).save(target, quality=85, method=6)
 
 
+def studio(made: Path, browser: Browser, target: Path) -> None:
+    """The page of a scene in the studio of its folder."""
+    command = [sys.executable, "-m", "snowsplat", "studio", str(made.parent), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        url = next(line.split()[-1] for line in process.stdout if "http://" in line)
+        page = browser.open(f"{url}#{made.name}")
+        page.wait_for("!!document.querySelector('iframe')", 200)
+        page.wait_for("!!document.querySelector('iframe').contentWindow.app", 200)
+        page.evaluate("window.scrollTo(0, 60)")
+        shoot(page, target)
+        page.close()
+        process.terminate()
+
+
 @contextmanager
 def training(dataset: Path) -> Iterator[str]:
     """The address of the page of a training run, which ends with the context."""
@@ -98,13 +115,13 @@ def training(dataset: Path) -> Iterator[str]:
             process.terminate()
 
 
-def main(demo: Path) -> None:
-    made = demo / "made"
+def main(made: Path) -> None:
     PICTURES.mkdir(exist_ok=True)
     film(made, PICTURES / "scene.webp")
     globe(made, PICTURES / "globe.webp")
     with Browser(WIDTH, HEIGHT, frames=5.0) as browser, TemporaryDirectory() as folder:
         shoot(browser.open((made / "scene" / "report.html").as_uri()), PICTURES / "report.webp")
+        studio(made, browser, PICTURES / "studio.webp")
         html = Path(folder) / "scene.html"
         snowsplat.convert(made, html)
         page = browser.open(f"{html.as_uri()}?webgl")
