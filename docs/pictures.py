@@ -6,8 +6,9 @@
     python docs/pictures.py out/scenes/table
 
 Needs Chromium. Writes to docs/pictures: scene.webp (a moving picture: the camera moves around the
-scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture: the scene in a snow globe), web.webp and live.webp (the two
-viewers) and report.webp (the report of the training).
+scene), studio.webp (the page of the scene in the studio), globe.webp (a moving picture: the scene
+in a snow globe), web.webp and live.webp (the two viewers) and report.webp (the report of the
+training).
 """
 
 from __future__ import annotations
