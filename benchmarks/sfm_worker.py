@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.sfm.colmap import SfmOptions
-from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
+from snowsplat.sfm.make_dataset import DatasetOptions, make_dataset
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import UserError
 

@@ -15,7 +15,7 @@ def import_all() -> None:
     import snowsplat.pipeline.videos
     import snowsplat.scene.edit
     import snowsplat.sfm.colmap.reconstruct
-    import snowsplat.sfm.dataset_folder
+    import snowsplat.sfm.make_dataset
     import snowsplat.sfm.orient
     import snowsplat.sfm.report.dataset_report
     import snowsplat.sfm.undistort

@@ -202,7 +202,7 @@ def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkey
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("snowsplat.sfm.dataset_folder.undistort", full)
+    monkeypatch.setattr("snowsplat.sfm.make_dataset.undistort", full)
     result = run("sfm", photos, "-o", out, *QUICK)
     assert (result.code, result.err.count("\n")) == (2, 1)
     assert "the disk is full; free some space, then run the same command again" in result.err

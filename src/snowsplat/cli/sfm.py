@@ -16,7 +16,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
-    from snowsplat.sfm.dataset_folder import DatasetOptions
+    from snowsplat.sfm.make_dataset import DatasetOptions
 
 
 @dataclass
@@ -83,7 +83,7 @@ class Sfm(Reports):
         inputs, folder = self._inputs_and_folder()
         from snowsplat.data.frame.placement import placement_of
         from snowsplat.evaluation.verdict import Verdict
-        from snowsplat.sfm.dataset_folder import make_dataset
+        from snowsplat.sfm.make_dataset import make_dataset
 
         options = self._options()
         with TerminalObserver(self.quiet) as observer:
@@ -134,8 +134,8 @@ class Sfm(Reports):
     def _options(self) -> DatasetOptions:
         from snowsplat.pipeline.compute import Compute
         from snowsplat.sfm.colmap import SfmOptions
-        from snowsplat.sfm.dataset_folder import DatasetOptions
         from snowsplat.sfm.ingest.inputs import GatherOptions
+        from snowsplat.sfm.make_dataset import DatasetOptions
 
         Compute(threads=self.threads)  # raises an error if there are fewer than 1
         lens: dict[str, Any] = {}

@@ -31,6 +31,7 @@ from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import stamps_of
 from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.project.dataset_folder import REPORT
 from snowsplat.project.project import MAKE_RECORD as RECORD
 from snowsplat.project.training_folder import (
     DATASET,
@@ -40,10 +41,9 @@ from snowsplat.project.training_folder import (
 )
 from snowsplat.sfm.colmap import SfmOptions
 from snowsplat.sfm.cost import measure_speed
-from snowsplat.sfm.dataset_folder import DatasetOptions, make_dataset
 from snowsplat.sfm.ingest.inputs import GatherOptions
 from snowsplat.sfm.ingest.search.sources import find_sources
-from snowsplat.sfm.report.dataset_report import REPORT
+from snowsplat.sfm.make_dataset import DatasetOptions, make_dataset
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint

@@ -53,10 +53,24 @@ class DatasetFolder:
     def distorted_masks(self) -> Path:
         return self.distorted / "masks"
 
+    def mask_of(self, photo: str) -> Path:
+        """The mask of a photo in `photos`."""
+        return self.distorted_masks / f"{photo}.png"
+
+    @property
+    def database(self) -> Path:
+        """The features and matches of the photos in `photos`, in a database of COLMAP."""
+        return self.distorted / "database.db"
+
+    @property
+    def distorted_models(self) -> Path:
+        """The COLMAP models of the photos in `photos`, "0", "1" …: the largest first."""
+        return self.distorted / "sparse"
+
     @property
     def distorted_model(self) -> Path:
-        """The COLMAP model of the photos in `photos`."""
-        return self.distorted / "sparse" / "0"
+        """The largest COLMAP model of the photos in `photos`."""
+        return self.distorted_models / "0"
 
     @property
     def images(self) -> Path:

@@ -6,6 +6,6 @@
     images    removes the distortion, orients the scene   orient/, undistort  images/, sparse/0/
     report    writes dataset_report.html                  report/
 
-Each stage reads the files of the earlier stages and writes its own. `dataset_folder.make_dataset`
+Each stage reads the files of the earlier stages and writes its own. `make_dataset.make_dataset`
 runs the stages in this order and skips those that are already finished.
 """

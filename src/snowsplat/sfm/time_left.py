@@ -174,7 +174,7 @@ class Later:
 
 
 class SfmTimeLeft:
-    """Adds the time left to the progress of the stages of `dataset_folder.make_dataset`."""
+    """Adds the time left to the progress of the stages of `make_dataset.make_dataset`."""
 
     def __init__(
         self, photos: Photos, size: int | None, effort: EffortName, threads: int, later: Later

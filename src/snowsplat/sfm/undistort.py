@@ -33,6 +33,7 @@ from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.data.photos.decode import resize_area
 from snowsplat.data.photos.image_file import open_image, reason_of
 from snowsplat.data.photos.image_loader import available_memory
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -116,12 +117,12 @@ def undistort(
     """
     import pycolmap
 
-    model = pycolmap.Reconstruction(dataset / "distorted" / "sparse" / "0")
+    model = pycolmap.Reconstruction(DatasetFolder(dataset).distorted_model)
     known = {photo.name: photo for photo in photos}
     views = dict[int, Sequence[LensView]]()
     for number, camera in model.cameras.items():
         masked = [
-            dataset / "distorted" / "masks" / f"{image.name}.png"
+            DatasetFolder(dataset).mask_of(image.name)
             for image in (model.images[i] for i in sorted(model.reg_image_ids()))
             if image.camera_id == number and image.name in known and known[image.name].mask
         ]
@@ -139,7 +140,7 @@ def undistort(
     for name in (name for name, times in count.items() if times > 1):
         raise UserError(
             "{name}: is the name of a photo and of a part of one; rename this photo",
-            name=dataset / "images" / name,
+            name=DatasetFolder(dataset).images / name,
         )
     divisors = _DIVISORS if resize else ()
     folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
@@ -238,12 +239,12 @@ def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> lis
 
 def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> int:
     """Write the images, their smaller copies and their masks; returns the number of masks."""
-    source = dataset / "input" / job.name
+    source = DatasetFolder(dataset).photos / job.name
     opaque = None
     with _open_photo(source, job) as opened:
         form = "JPEG" if opened.format == "MPO" else str(opened.format)
         if not job.resampled:
-            with _atomic_path_in_new_folder(dataset / "images" / job.name) as temporary:
+            with _atomic_path_in_new_folder(DatasetFolder(dataset).images / job.name) as temporary:
                 shutil.copyfile(source, temporary)
         if job.resampled or divisors or job.mask:
             photo = _decode(opened, source)
@@ -251,7 +252,7 @@ def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> int:
         for name, view in job.views if job.resampled or divisors else ():
             image = undistort_image(photo, view)
             if job.resampled:
-                _save(image, dataset / "images" / name, form)
+                _save(image, DatasetFolder(dataset).images / name, form)
             for divisor in divisors:
                 folder = dataset / f"images_{divisor}"
                 _save(_reduced(image, divisor), folder / name, form)
@@ -266,7 +267,7 @@ def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int
     """
     mask = None
     if job.mask:
-        path = dataset / "distorted" / "masks" / f"{job.name}.png"
+        path = DatasetFolder(dataset).mask_of(job.name)
         with _open_photo(path, job) as opened:
             mask = _decode(opened, path).convert("L")
         if opaque is not None:
@@ -279,7 +280,7 @@ def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int
         if view.rotation is not None:
             made = _with_blank(made, view)
         if made is not None:
-            _save(made, dataset / "masks" / f"{name}.png", "PNG")
+            _save(made, DatasetFolder(dataset).masks / f"{name}.png", "PNG")
             written += 1
     return written
 

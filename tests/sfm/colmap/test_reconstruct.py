@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap import reconstruct
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
+from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.colmap.options import SfmOptions
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation, best_attempt
@@ -26,7 +27,7 @@ from snowsplat.sfm.progress import silent
 def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registered, enough):
     progress = WorkerProgress(silent)
     options = SfmOptions(seconds=seconds)
-    job = PoseEstimation(Folders(tmp_path), [], options, 1, progress)
+    job = PoseEstimation(DatasetFolder(tmp_path), [], options, 1, progress)
     job.started = time.monotonic() - elapsed
     job.attempts = [SimpleNamespace(registered=registered)]
     job.evidence = SimpleNamespace(usable=10)
@@ -44,7 +45,7 @@ def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registe
 )
 def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
     progress = WorkerProgress(silent)
-    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, progress)
+    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, progress)
     job.attempts = [
         SimpleNamespace(
             registered=n, agreement=share, error=1.0, lens=Lens(), doubts=[], misfit=1.0
@@ -57,7 +58,7 @@ def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
 
 
 def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
-    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
+    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
     fisheye = Lens(fisheyes=frozenset([1]))
     job.attempts = [
         SimpleNamespace(registered=n, agreement=share, error=e, lens=lens, doubts=[], misfit=e)
@@ -70,7 +71,7 @@ def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
 
 def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_path):
     """A few photos of a flat field: with a wrong focal length, the poses are bent."""
-    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
+    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
     job.attempts = [
         SimpleNamespace(registered=5, agreement=0.79, error=0.69, misfit=1.10e-3, lens=Lens()),
         SimpleNamespace(registered=5, agreement=0.75, error=0.61, misfit=1.00e-3, lens=Lens()),
@@ -96,7 +97,7 @@ def test_the_focal_length_in_exif_is_held_if_the_lens_contradicts_it(
 ):
     """Even if the poses agree with the matches: a bent model of a street may."""
     monkeypatch.setattr(reconstruct, "exif_focals", lambda photos: known)
-    job = PoseEstimation(Folders(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
+    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
     job.attempts = [
         SimpleNamespace(
             registered=9, agreement=0.95, error=1.0, lens=Lens(), doubts=doubts, misfit=1.0

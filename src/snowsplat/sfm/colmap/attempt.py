@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.checks.consistency import agreement_of_model
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, gather_evidence
 from snowsplat.sfm.colmap.checks.repair import repair
@@ -19,7 +20,7 @@ from snowsplat.sfm.colmap.database import (
     read_descriptors,
     set_cameras,
 )
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress, extract_features
+from snowsplat.sfm.colmap.features.extraction import WorkerProgress, extract_features
 from snowsplat.sfm.colmap.lenses.lens import Lens, Refine, misfit, settled, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
 from snowsplat.sfm.colmap.options import Effort, Mapper, detection_size
@@ -90,13 +91,13 @@ class AttemptRunner:
 
     def __init__(
         self,
-        folders: Folders,
+        dataset: DatasetFolder,
         photos: list[Photo],
         camera_model: str,
         threads: int,
         progress: WorkerProgress,
     ) -> None:
-        self.folders = folders
+        self.dataset = dataset
         self.photos = photos  # their groups may be changed between two attempts
         self.camera_model = camera_model
         self.threads = threads
@@ -107,9 +108,9 @@ class AttemptRunner:
     ) -> Matched:
         """Detect the features of ``effort``, and match the pairs of the effort ``pairing``.
         ``reserve``: whether the pairs of the reserve are matched, too."""
-        fingerprint = fingerprint_of(self.folders.images, self.photos, effort)
+        fingerprint = fingerprint_of(self.dataset.photos, self.photos, effort)
         open_database(database, self.photos, Lens(self.camera_model), fingerprint)
-        extract_features(self.folders, database, self.photos, effort, self.threads, self.progress)
+        extract_features(self.dataset, database, self.photos, effort, self.threads, self.progress)
         indices = range(len(self.photos))
         choice = choose_pairs(
             self.photos,
@@ -153,7 +154,7 @@ class AttemptRunner:
         """The mapper for these matches."""
         return Mapping(
             matched.database,
-            self.folders.images,
+            self.dataset.photos,
             matched.scale,
             self.threads,
             self.progress.report,

@@ -38,6 +38,7 @@ import shutil
 import time
 from collections.abc import Sequence
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import AnyMapper, Attempt, AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CONSISTENT
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
@@ -48,7 +49,7 @@ from snowsplat.sfm.colmap.database import (
     set_cameras,
     verified_pairs,
 )
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
+from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses import camera_groups
 from snowsplat.sfm.colmap.lenses.fisheye import LensEvidence, lens_evidence
 from snowsplat.sfm.colmap.lenses.lens import (
@@ -91,18 +92,18 @@ class PoseEstimation:
 
     def __init__(
         self,
-        folders: Folders,
+        dataset: DatasetFolder,
         photos: list[Photo],
         options: SfmOptions,
         threads: int,
         progress: WorkerProgress,
     ) -> None:
-        self.folders = folders
-        self.strong_database = folders.distorted / "database_strong.db"  # with more features
+        self.dataset = dataset
+        self.strong_database = dataset.distorted / "database_strong.db"  # with more features
         self.options = options
         self.threads = threads
         self.progress = progress
-        self.runner = AttemptRunner(folders, photos, options.camera_model, threads, progress)
+        self.runner = AttemptRunner(dataset, photos, options.camera_model, threads, progress)
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
         self.attempts: list[Attempt] = []
@@ -117,7 +118,7 @@ class PoseEstimation:
 
         Raises: UserError: no camera poses were found.
         """
-        shutil.rmtree(self.folders.sparse, ignore_errors=True)
+        shutil.rmtree(self.dataset.distorted_models, ignore_errors=True)
         given = self.photos
         self._make_attempts(effort)
         best = best_attempt(self.attempts)
@@ -130,8 +131,8 @@ class PoseEstimation:
         for model in best.models:
             best.mapping.align_features(model, best.matched.effort.image_size)
             best.mapping.add_points(model)
-            model.extract_colors_for_all_images(self.folders.images, self.threads)
-        write_models(best.models, self.folders.sparse)
+            model.extract_colors_for_all_images(self.dataset.photos, self.threads)
+        write_models(best.models, self.dataset.distorted_models)
         names = [names_in(model) for model in best.models]
         evidence = self.runner.evidence(best.matched)
         result = result_of(
@@ -144,7 +145,7 @@ class PoseEstimation:
             held=best.mapping.held,
         )
         if best.matched.database == self.strong_database:
-            replace_database(self.folders.database, by=self.strong_database)
+            replace_database(self.dataset.database, by=self.strong_database)
         remove_database(self.strong_database)
         doubts = list(best.doubts)
         if best.agreement < CONSISTENT:
@@ -191,7 +192,7 @@ class PoseEstimation:
         self.log.append(attempt.description)
 
     def _try_first(self, effort: Effort) -> None:
-        database = self.folders.database
+        database = self.dataset.database
         self.matched = self.runner.match(database, effort, effort, reserve=False)
         self.lens_evidence = lens_evidence(database, self.photos, self.matched.scale)
         self.lens = self._first_lens()
@@ -244,7 +245,7 @@ class PoseEstimation:
     def _try_more_pairs(self, effort: Effort) -> None:
         if self._found and self.evidence.matched_all:
             return
-        self.matched = self.runner.match(self.folders.database, effort, effort.stronger())
+        self.matched = self.runner.match(self.dataset.database, effort, effort.stronger())
         self.runner.verify(self.matched, self.lens)
         self._try("with more pairs and weaker matches", "incremental", weak=True)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.options import SfmResult
 from snowsplat.sfm.colmap.process.check_model import can_be_read
 from snowsplat.sfm.ingest.photo import Photo
@@ -76,7 +77,8 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
     Raises: UserError: there is no model, or the first one is damaged, has none of ``photos``, or
     has photos outside of ``input/``.
     """
-    sparse = dataset / "distorted" / "sparse"
+    folder = DatasetFolder(dataset)
+    sparse = folder.distorted_models
     numbered = sorted(
         (p for p in sparse.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name)
     )
@@ -91,15 +93,12 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
     names = names_in(models[0])
     for name in names:
         # `undistort` uses these names as paths.
-        if inside(dataset / "input", name) is None:
+        if inside(folder.photos, name) is None:
             raise _cannot_skip(
-                f"the model in {numbered[0]} has a photo {quoted(name)} outside of "
-                f"{dataset / 'input'}"
+                f"the model in {numbered[0]} has a photo {quoted(name)} outside of {folder.photos}"
             )
     if not names & {photo.name for photo in photos}:
-        raise _cannot_skip(
-            f"the model in {numbered[0]} has none of the photos in {dataset / 'input'}"
-        )
+        raise _cannot_skip(f"the model in {numbered[0]} has none of the photos in {folder.photos}")
     unregistered = {
         p.name: "it is not in the existing model" for p in photos if p.name not in names
     }

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.maps.mask_look import doubt_about_masks
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.ingest.content.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.photo import Photo
@@ -87,7 +88,7 @@ def gather(
     """
     _check(options)
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
-    folder = dataset / "input"
+    folder = DatasetFolder(dataset).photos
     for note in sources.notes:
         logger.warning("%s", note)
     skipped = list(sources.left_out)
@@ -252,7 +253,7 @@ def _check_disk_space(
     options: GatherOptions,
 ) -> None:
     """Raises UserError if ``input/`` certainly does not fit on the disk (by a low estimate)."""
-    device = (dataset / "input").stat().st_dev
+    device = DatasetFolder(dataset).photos.stat().st_dev
     needed = 0.0
     for plan in planned:
         width, height = plan.header.size(options.size)

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from snowsplat.evaluation.verdict import Grade, Reason, Verdict
-from snowsplat.sfm.ingest.search.sources import RECORD
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.report.coverage import Coverage
 from snowsplat.sfm.report.photo_problems import PROBLEMS, Problem
 from snowsplat.util.messages import as_message, message, plural
-from snowsplat.util.safe_json import read_json
 
 #: With fewer photos, no photo is left to check the poses and to hold out.
 _TOO_FEW = 8
@@ -78,11 +77,8 @@ def capture_verdict(
 
 def recorded_verdict(dataset: Path) -> Verdict | None:
     """The verdict that the record of a dataset contains; None: there is none."""
-    try:
-        values = read_json(dataset / RECORD)["stages"]["report"]["result"]["verdict"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return Verdict.from_json(values)
+    values = DatasetFolder(dataset).result("report").get("verdict")
+    return None if values is None else Verdict.from_json(values)
 
 
 def _lost(sfm: Mapping[str, Any]) -> list[Reason]:

@@ -17,6 +17,7 @@ from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.frame.placement import Placement, placement_of
 from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.evaluation import verdict
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.report.more_photos import Advice, advice
@@ -28,7 +29,6 @@ from snowsplat.util.html import bar, cards, page, picture, table, text
 from snowsplat.util.messages import message
 from snowsplat.util.safe_json import printable
 
-REPORT = "dataset_report.html"
 _MAX_PICTURES = 24  # evenly spaced over the photos
 _PICTURE_HEIGHT = 480  # pixels, of the pictures that can be opened
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
@@ -79,7 +79,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         _timing(facts),
         _next_step(dataset) if facts["alone"] else "",
     ]
-    path = dataset / REPORT
+    path = DatasetFolder(dataset).report
     write_text(path, page(f"{name} – dataset", body, _STYLE + verdict.STYLE))
     return path
 
@@ -94,7 +94,7 @@ def draw_from_above(dataset: Path) -> str:
 
 def _points(dataset: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions (P, 3) float64, and colours (P, 3) uint8."""
-    points = read_points(dataset / "sparse" / "0")
+    points = read_points(DatasetFolder(dataset).model)
     if points is None:
         return np.empty((0, 3)), np.empty((0, 3), np.uint8)
     return points.xyz.numpy().astype(np.float64), points.rgb.numpy()
@@ -102,7 +102,7 @@ def _points(dataset: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _photos_with_poses(dataset: Path, gathered: Sequence[dict[str, Any]]) -> list[PlacedPhoto]:
     sequences = {photo["name"]: photo["sequence"] for photo in gathered}
-    model = read_model(dataset / "sparse" / "0")
+    model = read_model(DatasetFolder(dataset).model)
     photos, drawn = [], set[str]()
     for image in model.images:
         camera = posed_camera(model, image)
@@ -237,17 +237,17 @@ def _strip(dataset: Path, names: Sequence[str]) -> str:
     count = min(len(names), _MAX_PICTURES)
     chosen = [names[i * len(names) // count] for i in range(count)]
     images = "".join(
-        picture(_reduced(dataset / "images" / name), name)
+        picture(_reduced(DatasetFolder(dataset).images / name), name)
         for name in chosen
-        if (dataset / "images" / name).is_file()
+        if (DatasetFolder(dataset).images / name).is_file()
     )
     return f'<h2>Images</h2>\n<div class="strip">{images}</div>'
 
 
 def _file_of(dataset: Path, photo: str) -> Path:
     """The undistorted photo, or the photo itself if it became several views."""
-    path = dataset / "images" / photo
-    return path if path.is_file() else dataset / "input" / photo
+    path = DatasetFolder(dataset).images / photo
+    return path if path.is_file() else DatasetFolder(dataset).photos / photo
 
 
 def _reduced(path: Path) -> Image.Image:

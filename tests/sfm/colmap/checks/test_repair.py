@@ -8,12 +8,13 @@ import pycolmap
 import pytest
 import torch
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.scene.geometry import similarity_from_points
 from snowsplat.sfm.colmap.attempt import AttemptRunner, Matched
 from snowsplat.sfm.colmap.checks.consistency import CheckedPair, check_pairs
 from snowsplat.sfm.colmap.checks.repair import _false_pairs, _parts, repair
 from snowsplat.sfm.colmap.database import closing_database, copy_for_mapping, verified_pairs
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
+from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.colmap.options import EFFORTS
@@ -244,7 +245,7 @@ def test_an_attempt_is_checked_and_described(mapping, scene, monkeypatch, tmp_pa
     monkeypatch.setattr(Mapping, "extend", lambda self, models, relaxed=True: models)
     progress = WorkerProgress(silent)
     photos = look_alikes.photos()
-    runner = AttemptRunner(Folders(tmp_path), photos, "auto", 1, progress)
+    runner = AttemptRunner(DatasetFolder(tmp_path), photos, "auto", 1, progress)
     choice = PairChoice(sorted(scene.matches), "neighbours")
     matched = Matched(mapping.database, EFFORTS["draft"], choice, 1.0)
     attempt = runner.run("as configured", matched, "global", Lens("SIMPLE_PINHOLE"))

@@ -7,10 +7,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import Matched
 from snowsplat.sfm.colmap.checks.diagnosis import gather_evidence
 from snowsplat.sfm.colmap.database import set_cameras
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
+from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.camera_groups import (
     better,
     describe,
@@ -45,14 +46,14 @@ def mapped(folder, walk, grouping=list):
 def attempted(folder, walk, exif=None):
     """The attempts of `PoseEstimation` up to that with several focal lengths."""
     photos = walk.photos(exif)
-    folders = Folders(folder)
-    folders.distorted.mkdir()
-    walk.write(folders.database, exif, RADIAL)
+    dataset = DatasetFolder(folder)
+    dataset.distorted.mkdir()
+    walk.write(dataset.database, exif, RADIAL)
     progress = WorkerProgress(silent)
-    job = PoseEstimation(folders, photos, SfmOptions("SIMPLE_RADIAL"), 1, progress)
-    matched = Matched(folders.database, EFFORTS["draft"], PairChoice(list(walk.matches), ""), 1.0)
+    job = PoseEstimation(dataset, photos, SfmOptions("SIMPLE_RADIAL"), 1, progress)
+    matched = Matched(dataset.database, EFFORTS["draft"], PairChoice(list(walk.matches), ""), 1.0)
     job.matched, job.mapper, job.lens = matched, "incremental", RADIAL
-    job.evidence = gather_evidence(folders.database, photos, 100)
+    job.evidence = gather_evidence(dataset.database, photos, 100)
     job._try("as configured")
     job._try_zooms()
     return job
@@ -79,7 +80,7 @@ def test_photos_of_two_zooms_get_two_cameras(tmp_path):
 def test_photos_of_one_zoom_keep_their_camera(tmp_path, walk):
     job = attempted(tmp_path, walk)
     assert set(camera_ids(job.photos)) == {1}
-    with pycolmap.Database.open(job.folders.database) as database:
+    with pycolmap.Database.open(job.dataset.database) as database:
         assert database.num_cameras() == 1
 
 

@@ -7,9 +7,10 @@ import numpy as np
 import pycolmap
 import pytest
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.checks.consistency import agreement, agreement_of_model
 from snowsplat.sfm.colmap.database import closing_database
-from snowsplat.sfm.colmap.features.extraction import Folders, WorkerProgress
+from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.fisheye import lens_evidence
 from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
@@ -84,7 +85,7 @@ def test_photos_of_a_fisheye_lens_are_placed(tmp_path, lens):
 def test_a_lens_whose_picture_is_a_disc_begins_near_its_focal_length(tmp_path):
     walk = walks.sideways(8, 700, WIDE)
     photos = [replace(photo, circle=240.0) for photo in walk.photos(None)]
-    job = PoseEstimation(Folders(tmp_path), photos, SfmOptions(), 1, WorkerProgress(silent))
+    job = PoseEstimation(DatasetFolder(tmp_path), photos, SfmOptions(), 1, WorkerProgress(silent))
     lens = job._first_lens()  # without evidence from matches
     assert lens.fisheyes == {1}
     database = walk.write(tmp_path / "database.db", None, lens)

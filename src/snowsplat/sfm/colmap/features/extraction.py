@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pycolmap
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.database import closing_database
 from snowsplat.sfm.colmap.features.panorama import detect_in_panorama
 from snowsplat.sfm.colmap.features.sift import Features, detect_sift, photos_at_once
@@ -18,16 +19,6 @@ from snowsplat.sfm.progress import Report
 
 #: The seed of all random numbers in COLMAP.
 SEED = 1
-
-
-class Folders:
-    """Paths inside a dataset."""
-
-    def __init__(self, dataset: Path) -> None:
-        self.images, self.distorted = dataset / "input", dataset / "distorted"
-        self.masks = self.distorted / "masks"
-        self.database = self.distorted / "database.db"
-        self.sparse = self.distorted / "sparse"
 
 
 @dataclass(frozen=True)
@@ -44,7 +35,7 @@ class WorkerProgress:
 
 
 def extract_features(
-    folders: Folders,
+    dataset: DatasetFolder,
     database: Path,
     photos: list[Photo],
     effort: Effort,
@@ -54,11 +45,11 @@ def extract_features(
     """Detect features in all photos that have none in ``database`` yet, and write them there."""
 
     def detect(photo: Photo) -> Features:
-        mask = folders.masks / f"{photo.name}.png" if photo.mask else None
+        mask = dataset.mask_of(photo.name) if photo.mask else None
         size = detection_size(effort.image_size, photo.panorama)
         count = feature_count(effort.features, photo.panorama)
         detect_in = detect_in_panorama if photo.panorama else detect_sift
-        return detect_in(folders.images / photo.name, mask, size, count)
+        return detect_in(dataset.photos / photo.name, mask, size, count)
 
     at_once = photos_at_once(effort.image_size, threads)
     with closing_database(database) as opened, ThreadPoolExecutor(at_once) as pool:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
 from snowsplat.sfm.colmap.process.growing_map import read_poses
 from snowsplat.sfm.ingest.photo import Photo
@@ -81,7 +82,7 @@ def estimate_poses(
             "camera_model",
             f"unknown value {options.camera_model!r}; use one of auto, " + ", ".join(CAMERA_MODELS),
         )
-    distorted = dataset.absolute() / "distorted"
+    distorted = DatasetFolder(dataset.absolute()).distorted
     distorted.mkdir(parents=True, exist_ok=True)
     log = distorted / "colmap.log"
     log.unlink(missing_ok=True)

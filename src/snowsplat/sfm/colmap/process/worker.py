@@ -24,7 +24,8 @@ from typing import Any, TextIO
 
 import pycolmap
 
-from snowsplat.sfm.colmap.features.extraction import SEED, Folders, WorkerProgress
+from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.sfm.colmap.features.extraction import SEED, WorkerProgress
 from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions, SfmResult, thread_count
 from snowsplat.sfm.colmap.process.growing_map import PoseMessages
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
@@ -96,8 +97,8 @@ def _run(job: dict[str, Any], progress: WorkerProgress) -> SfmResult:
     if job["reduced"]:
         effort, threads = effort.reduced(), 1
     photos = [Photo(**photo) for photo in job["photos"]]
-    folders = Folders(Path(job["dataset"]))
-    return PoseEstimation(folders, photos, options, threads, progress).run(effort)
+    dataset = DatasetFolder(Path(job["dataset"]))
+    return PoseEstimation(dataset, photos, options, threads, progress).run(effort)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.maps.mask_look import MaskLook, look_of
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.ingest.content.panorama import (
     NOT_TWICE_AS_WIDE,
     Panorama,
@@ -155,7 +156,7 @@ def _write_photo(
     plan: Planned, dataset: Path, longest: int | None, in_place: bool
 ) -> tuple[Photo, MaskLook | None]:
     source, header = plan.source, plan.header
-    target = dataset / "input" / plan.name
+    target = DatasetFolder(dataset).photos / plan.name
     ready = header.is_ready(longest)
     if ready and not header.transparent:
         image = decode_small(source.path, CONTENT_SIDE)
@@ -179,7 +180,7 @@ def _write_photo(
         else:
             save(image, target, source.path)
     if used is not None:
-        write_mask(dataset / "distorted" / "masks" / f"{plan.name}.png", used)
+        write_mask(DatasetFolder(dataset).mask_of(plan.name), used)
     exif = header.exif
     scale = max(width, height) / max(header.width, header.height)
     folder = str(PurePosixPath(plan.name).parent)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from snowsplat.data.photos.colour_profile import plain_pixels
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.ingest.content.fixed_parts import (
     ENOUGH_PHOTOS,
     FIXED_SIDE,
@@ -50,6 +51,7 @@ def set_fixed_parts_aside(
 
     Raises: OSError: a file cannot be read or written.
     """
+    folder = DatasetFolder(dataset)
     groups: dict[tuple[object, ...], list[Photo]] = {}
     for photo in photos:
         key = (photo.group, photo.width, photo.height, photo.sequence)
@@ -61,7 +63,7 @@ def set_fixed_parts_aside(
                 continue
             count = min(len(group), ENOUGH_PHOTOS)
             chosen = [group[round(i * (len(group) - 1) / (count - 1))] for i in range(count)]
-            copies = list(pool.map(lambda photo: _copy(dataset / "input" / photo.name), chosen))
+            copies = list(pool.map(lambda photo: _copy(folder.photos / photo.name), chosen))
             parts = find_fixed_parts(np.stack(copies))
             if parts is None:
                 continue
@@ -79,11 +81,11 @@ def set_fixed_parts_aside(
             ) -> Photo:
                 fixed = parts.overlays if cropped else parts.fixed
                 if parts.backdrop is not None:
-                    fixed = parts.backdrop.seen_in(_copy(dataset / "input" / photo.name))
+                    fixed = parts.backdrop.seen_in(_copy(folder.photos / photo.name))
                 if parts.circle is not None:
                     radius = parts.circle * photo.width / fixed.shape[1]
                     photo = replace(photo, circle=radius)
-                return _cropped_and_masked(photo, dataset, box, fixed)
+                return _crop_and_mask(photo, folder, box, fixed)
 
             for photo in pool.map(work, group):
                 changed[photo.name] = photo
@@ -97,11 +99,11 @@ def _copy(path: Path) -> NDArray[np.uint8]:
         return grey_copy(image, FIXED_SIDE)
 
 
-def _cropped_and_masked(
-    photo: Photo, dataset: Path, box: tuple[int, int, int, int], fixed: NDArray[np.bool_]
+def _crop_and_mask(
+    photo: Photo, folder: DatasetFolder, box: tuple[int, int, int, int], fixed: NDArray[np.bool_]
 ) -> Photo:
     """The photo, cropped to ``box``, with the pixels masked that are ``fixed`` in its copy."""
-    path = dataset / "input" / photo.name
+    path = folder.photos / photo.name
     size = box[2] - box[0], box[3] - box[1]
     if size != (photo.width, photo.height):
         # The file may be a link to the original, which must not be changed.
@@ -112,7 +114,7 @@ def _cropped_and_masked(
         os.replace(new, path)
     still = Image.fromarray(fixed).resize((photo.width, photo.height), Image.Resampling.NEAREST)
     used = ~np.asarray(still, bool)[box[1] : box[3], box[0] : box[2]]
-    mask_path = dataset / "distorted" / "masks" / f"{photo.name}.png"
+    mask_path = folder.mask_of(photo.name)
     if photo.mask:
         with Image.open(mask_path) as mask:
             used &= np.asarray(mask.convert("L").crop(box)) > 0

@@ -40,8 +40,6 @@ _UNREAD = (
 _UNREAD_SUFFIXES = frozenset(
     f".{name}" for name in _UNREAD.split() if name.upper() not in OPTIONAL_FORMATS
 )
-#: The record of the stages of a dataset.
-RECORD = "sfm.json"
 # Folders in a dataset in which programs keep models of all its images.
 _MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
 _LONGEST_NAME = 200  # bytes of a name in input/

@@ -1,15 +1,6 @@
-"""The folder of a dataset, made from photos in four stages: photos, poses, images, report.
+"""Makes the folder of a dataset (`DatasetFolder`) from photos: photos, poses, images, report.
 
-    DATASET/input/                the photos or video frames, upright
-    DATASET/distorted/            COLMAP database, models of the original photos, log of COLMAP
-    DATASET/images/, sparse/0/    the input of training: undistorted images and their cameras
-    DATASET/masks/                masks, if there are any
-    DATASET/images_2/, _4, _8     smaller copies, if requested
-    DATASET/sfm.json              settings and results of each stage
-    DATASET/dataset_report.html   the same as a page, with a map of cameras and points
-
-The layout is that of the reference implementation's convert.py. An interrupted run resumes where
-it stopped; see `snowsplat.util.stages`.
+An interrupted run resumes where it stopped; see `snowsplat.util.stages`.
 """
 
 from __future__ import annotations
@@ -28,17 +19,18 @@ from typing import Any, Protocol
 import numpy as np
 
 from snowsplat.data.frame.placement import PLACEMENT
+from snowsplat.project.dataset_folder import IMAGE_FOLDERS, RECORD, REPORT, DatasetFolder
 from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
 from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.ingest.search.sources import RECORD, Sources, find_sources
+from snowsplat.sfm.ingest.search.sources import Sources, find_sources
 from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.report.capture_verdict import capture_verdict
 from snowsplat.sfm.report.coverage import measure_coverage
-from snowsplat.sfm.report.dataset_report import REPORT, write_report
+from snowsplat.sfm.report.dataset_report import write_report
 from snowsplat.sfm.report.photo_problems import problems
 from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.sfm.survey import survey
@@ -52,8 +44,7 @@ from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("photos", "poses", "images", "report")
-_IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
-_OUTPUT_NAMES = ("distorted", *_IMAGE_FOLDERS, RECORD, REPORT)
+_OUTPUT_NAMES = ("distorted", *IMAGE_FOLDERS, RECORD, REPORT)
 
 
 @dataclass(frozen=True)
@@ -123,7 +114,7 @@ def make_dataset(
         OSError: a file cannot be read or written.
     """
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
-    in_place = sources.contain(folder / "input")
+    in_place = sources.contain(DatasetFolder(folder).photos)
     with one_run(folder):
         _check_free(folder, in_place, sources, options, overwrite)
         with _remove_on_failure(folder):
@@ -196,11 +187,11 @@ def _run(
         return _undistort(folder, photos, options, report)
 
     of_images = {"resize": options.resize, "marker": options.marker}
-    stage("images", of_images, _IMAGE_FOLDERS, make_images)
+    stage("images", of_images, IMAGE_FOLDERS, make_images)
 
     def write(report: Report) -> dict[str, Any]:
-        sfm, coverage = outcomes["poses"].result, measure_coverage(folder / "sparse" / "0")
-        bad = problems(folder / "input", coverage.names)
+        sfm, coverage = outcomes["poses"].result, measure_coverage(DatasetFolder(folder).model)
+        bad = problems(DatasetFolder(folder).photos, coverage.names)
         verdict, values = capture_verdict(coverage, sfm, bad), asdict(options)
         facts = {
             "inputs": stages.about["inputs"],
@@ -246,12 +237,12 @@ def _undistort(
 ) -> dict[str, Any]:
     import pycolmap
 
-    for name in _IMAGE_FOLDERS:
+    for name in IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
-    model = pycolmap.Reconstruction(folder / "distorted" / "sparse" / "0")
+    model = pycolmap.Reconstruction(DatasetFolder(folder).distorted_model)
     marker: tuple[MarkerScale | None, list[str]] = (None, [])
     if options.marker is not None:
-        marker = scale_of_markers(model, photos, folder / "input", options.marker)
+        marker = scale_of_markers(model, photos, DatasetFolder(folder).photos, options.marker)
     oriented = orientation(model, photos, marker)
     scene_from_sfm, threads = oriented.scene_from_sfm, options.sfm.threads
     made = undistort(folder, photos, scene_from_sfm, options.resize, report, threads=threads)
@@ -358,7 +349,7 @@ def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
     """The photos that the stage "photos" found. Raises UserError if its record is damaged."""
     try:
         photos = from_json(Gathered, gathered).photos
-        if not all(inside(folder / "input", photo.name) for photo in photos):
+        if not all(inside(DatasetFolder(folder).photos, photo.name) for photo in photos):
             raise ValueError("a photo outside of input/")
     except ValueError:
         raise UserError(
