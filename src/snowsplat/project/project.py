@@ -147,6 +147,12 @@ class Project:
         return is_made and self.made.get("last_part") is True
 
 
+def is_output(folder: Path) -> bool:
+    """Whether a folder is a dataset or an output folder that snowsplat has written."""
+    records = folder / MAKE_RECORD, DatasetFolder(folder).record, TrainingFolder(folder).cfg_args
+    return any(record.is_file() for record in records)
+
+
 def _training_in(path: Path) -> TrainingFolder:
     """The training in a folder: ``path`` itself or, if `make` created it, a folder in it."""
     folder, made = TrainingFolder(path), TrainingFolder(path / SCENE)

@@ -87,6 +87,10 @@ class TrainingFolder:
     path: Path
 
     @property
+    def cfg_args(self) -> Path:
+        return self.path / _CFG_ARGS
+
+    @property
     def cameras(self) -> Path:
         return self.path / _CAMERAS
 
@@ -228,7 +232,7 @@ class TrainingFolder:
             source_path=dataset.path,
             white_background=training["background"] == "white",
         )
-        write_text(self.path / _CFG_ARGS, repr(namespace))
+        write_text(self.cfg_args, repr(namespace))
 
     def training_settings(self) -> dict[str, Any]:
         """All settings of the training, see `config_to_json`. Raises UserError: damaged."""
@@ -246,7 +250,7 @@ class TrainingFolder:
         Raises:
             UserError: missing or damaged settings.
         """
-        ours, theirs = self.path / _CONFIG, self.path / _CFG_ARGS
+        ours, theirs = self.path / _CONFIG, self.cfg_args
         try:
             if ours.is_file():
                 whole = read_json(ours)
@@ -288,7 +292,7 @@ class TrainingFolder:
         relative path does.
         """
         try:
-            former = Path(str(read_cfg_args(self.path / _CFG_ARGS)["model_path"]))
+            former = Path(str(read_cfg_args(self.cfg_args)["model_path"]))
         except (OSError, KeyError, ValueError, SyntaxError):
             return dataset
         here = self.path.absolute()

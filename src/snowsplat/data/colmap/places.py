@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from snowsplat.data.colmap.model import count_images, model_is_text
-from snowsplat.data.files.listing import is_output
+from snowsplat.project.project import is_output
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 

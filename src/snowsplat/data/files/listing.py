@@ -53,9 +53,6 @@ _CHANGED = re.compile(r"(corrected|undistorted|resized|downscaled)[_-](?P<origin
 # More files than this are not listed, to bound memory and time: it may be a whole disk.
 _MOST_FILES = 500_000
 
-# Folders that contain one of these files are outputs of snowsplat: datasets, scenes, trainings.
-_OUTPUT_FILES = ("sfm.json", "make.json", "cfg_args")
-
 FolderKind = Literal["masks", "maps", "thumbnails", "photos"]
 
 
@@ -69,11 +66,6 @@ def folder_kind(name: str) -> FolderKind:
     if name in _MAPS:
         return "maps"
     return "thumbnails" if name in _THUMBNAILS else "photos"
-
-
-def is_output(folder: Path) -> bool:
-    """Whether a folder is a dataset or an output folder that snowsplat has written."""
-    return any((folder / file).is_file() for file in _OUTPUT_FILES)
 
 
 def original_of(name: str, siblings: Iterable[str], *, divided: bool = True) -> str | None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from snowsplat.util.safe_json import from_json, read_json
+from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.util.safe_json import from_json
 
 #: The entry of the result of the stage "images" in sfm.json.
 PLACEMENT = "placement"
@@ -73,10 +74,7 @@ def placement_of(images: Mapping[str, Any]) -> Placement | None:
 
 def read_placement(dataset: Path) -> Placement | None:
     """The placement of the dataset in a folder; None if `sfm` did not make it, or see above."""
-    try:
-        return placement_of(read_json(dataset / "sfm.json")["stages"]["images"]["result"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    return placement_of(DatasetFolder(dataset).result("images"))
 
 
 def _short(value: float) -> str:

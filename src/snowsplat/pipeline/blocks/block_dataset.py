@@ -15,6 +15,7 @@ from snowsplat.data.colmap import ColmapImage, write_model
 from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.perspective import Pinhole
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import Origin, opposite
 
@@ -59,9 +60,9 @@ def write_block_dataset(
         pose = camera.seen_from(opposite(origin)).cam_from_world
         quat = quat_from_rotation(pose[:, :3]).tolist()
         images.append(ColmapImage(name, number, (*quat, *pose[:, 3].tolist())))
-        _link(image.path, folder / "images" / name)
+        _link(image.path, DatasetFolder(folder).images / name)
         if image.mask is not None:
-            _link(image.mask, folder / "masks" / f"{name}.png")
+            _link(image.mask, DatasetFolder(folder).masks / f"{name}.png")
         # A COLMAP dataset cannot state a unit; without points, the maps would be misunderstood.
         if image.depth is not None and (image.depth_unit == 1.0 or points is not None):
             _link(image.depth, folder / "depths" / f"{name}{image.depth.suffix}")
@@ -76,7 +77,7 @@ def write_block_dataset(
         )
     nothing = np.zeros((0, 3))
     write_model(
-        folder / "sparse" / "0",
+        DatasetFolder(folder).model,
         {number: camera for camera, number in cameras.items()},
         images,
         nothing if points is None else points.xyz.double().numpy() + origin,

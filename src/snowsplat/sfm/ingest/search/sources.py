@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from snowsplat.data.files.listing import files_below, folder_kind, is_output, original_of
+from snowsplat.data.files.listing import files_below, folder_kind, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
 from snowsplat.data.readers import photo_folder, poses_in
+from snowsplat.project.project import is_output
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
