@@ -30,9 +30,11 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops import reference
 from snowsplat.pipeline import mesh as pipeline_mesh
-from snowsplat.pipeline.mesh import MeshOptions, surface_of
+from snowsplat.pipeline.mesh import surface_of
+from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.scene.mesh import Mesh
 
 _SAMPLES = 60_000

@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from snowsplat.sfm.colmap import SfmOptions
-from snowsplat.sfm.make_dataset import DatasetOptions, make_dataset
+from snowsplat.sfm.make_dataset import make_dataset
+from snowsplat.sfm.options import DatasetOptions, SfmOptions
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import UserError
 

@@ -36,7 +36,8 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.sh_constants import SH_C0
-from snowsplat.sfm.make_dataset import DatasetOptions, make_dataset
+from snowsplat.sfm.make_dataset import make_dataset
+from snowsplat.sfm.options import DatasetOptions
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.training.settings.recipes import recipe
 

@@ -34,9 +34,9 @@ from torch import Tensor
 
 from snowsplat.evaluation.metrics import compare
 from snowsplat.extras.image.compact_file import decode, encode
-from snowsplat.extras.image.fit import FitOptions, Fitter
+from snowsplat.extras.image.fit import Fitter
 from snowsplat.extras.image.fit_image import load_photo
-from snowsplat.extras.image.model import Blending
+from snowsplat.extras.image.options import Blending, FitOptions
 
 METHODS = ("front-to-back", "additive", "jpeg", "primitive")
 

@@ -24,8 +24,8 @@ from snowsplat.data import load_dataset
 from snowsplat.data.colmap import ColmapImage, write_model
 from snowsplat.data.lens.models import lens_of
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.lift.lift import LiftOptions, lift
-from snowsplat.extras.lift.lift_photo import DepthSource
+from snowsplat.extras.lift.lift import lift
+from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.extras.lift.refine_photo import refine_photo
 from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit
 from snowsplat.scene.camera import Camera

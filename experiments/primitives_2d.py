@@ -31,8 +31,9 @@ from siren import fit_siren, hidden_size
 from torch import Tensor
 
 from snowsplat.evaluation.metrics import compare
-from snowsplat.extras.image.fit import FitOptions, Fitter
+from snowsplat.extras.image.fit import Fitter
 from snowsplat.extras.image.fit_image import load_photo
+from snowsplat.extras.image.options import FitOptions
 
 RATES = (0.4, 1.0, 2.5)
 _TRIAL = 60  # steps of the fit that measures the time of a step

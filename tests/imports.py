@@ -1,6 +1,7 @@
 """Loads all modules of the command line, for a process whose forks run it."""
 
 import gc
+from contextlib import suppress
 
 
 def import_all() -> None:
@@ -9,6 +10,7 @@ def import_all() -> None:
 
     import snowsplat.cli.main
     import snowsplat.evaluation.metrics
+    import snowsplat.extras
     import snowsplat.formats
     import snowsplat.pipeline.make
     import snowsplat.pipeline.run.memory_use
@@ -27,9 +29,12 @@ def import_all() -> None:
     import snowsplat.viewer.http.server
     import snowsplat.viewer.http.static
     import snowsplat.viewer.web.scene
+    from snowsplat.util.errors import UserError
 
+    snowsplat.extras.register()
     for name in snowsplat.cli.main.SUBCOMMANDS:
-        snowsplat.cli.main.parse([name])
+        with suppress(UserError):  # arguments are missing
+            snowsplat.cli.main.parse([name])
     Image.init()  # imports the readers of all formats
     # Forks need not examine, and thereby copy, the objects that exist now.
     gc.collect()

@@ -12,10 +12,12 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import snowsplat
+from snowsplat import extras
 from snowsplat.cli import main as cli
 
 from .cache import cached
 
+extras.register()
 ROOT = Path(__file__).resolve().parents[1]
 
 pytestmark = [

@@ -9,15 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
+from snowsplat import extras
 from snowsplat.cli import main as cli
 from snowsplat.formats import read_gaussians, write_gaussians
-from snowsplat.pipeline.convert import Edits, convert
+from snowsplat.pipeline.convert import convert
+from snowsplat.pipeline.options.convert import Edits
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from .sfm.colmap import scenes
 
+extras.register()
 ROOT = Path(__file__).resolve().parents[1]
 GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
 START = [ROOT / "docs" / name for name in ("index.md", "installation.md", "quick-start.md")]

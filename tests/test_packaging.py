@@ -288,7 +288,7 @@ def test_make_takes_the_small_build_of_pytorch_without_a_driver(
 
 def test_command_is_installed():
     pyproject = (REPOSITORY / "pyproject.toml").read_text()
-    assert 'snowsplat = "snowsplat.cli.main:main"' in pyproject
+    assert 'snowsplat = "snowsplat.__main__:main"' in pyproject
     result = run(
         sys.executable,
         "-m",

@@ -18,7 +18,7 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "snowsplat"
 LANGUAGE = "zh"
 # The calls whose first text is a message. For others: the positions of the texts.
 _ERRORS = ("UserError", "InUse", "Diverged", "OtherScene", "ProcessLost", "NoPosesError", "NoSpace")
-_CALLS = ("message", "warning", "info", *_ERRORS, "UnknownScene")
+_CALLS = ("message", "needed", "warning", "info", *_ERRORS, "UnknownScene")
 KEYWORDS = dict.fromkeys(_CALLS) | {"plural": (1, 2), "SettingError": (2,), "_InUse": (2,)}
 
 Key = str | tuple[str, str]

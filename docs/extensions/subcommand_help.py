@@ -16,8 +16,10 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from snowsplat import extras
 from snowsplat.cli import main
 
+extras.register()
 # In a terminal of this width, no line is wrapped.
 _WIDTH = 4000
 _ENTRY = re.compile(r"│ (?P<name>\S.*?)(?:  +(?P<text>.*?))? *│$")

@@ -25,31 +25,38 @@ from snowsplat.util.lazy import lazy_names
 if TYPE_CHECKING:
     from snowsplat.data import Dataset, Points, View, load_dataset
     from snowsplat.evaluation.metrics import evaluate_views
-    from snowsplat.extras.globe.make_globe import GlobeOptions, make_globe
-    from snowsplat.extras.image.fit import FitOptions
+    from snowsplat.extras.globe.make_globe import make_globe
+    from snowsplat.extras.globe.options import GlobeOptions
     from snowsplat.extras.image.fit_image import decode_image, fit_image
-    from snowsplat.extras.lift.lift import LiftOptions
-    from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, lift_photo
+    from snowsplat.extras.image.options import FitOptions
+    from snowsplat.extras.lift.lift_photo import LiftResult, lift_photo
+    from snowsplat.extras.lift.options import DepthSource, LiftOptions
     from snowsplat.extras.lift.refine_photo import refine_photo
     from snowsplat.formats import read_gaussians
-    from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
+    from snowsplat.pipeline.benchmark.run import benchmark
     from snowsplat.pipeline.blocks.merge import merge_blocks
-    from snowsplat.pipeline.blocks.plan import PlanOptions, plan_blocks
+    from snowsplat.pipeline.blocks.plan import plan_blocks
     from snowsplat.pipeline.blocks.train import train_blocks
     from snowsplat.pipeline.clean import clean
     from snowsplat.pipeline.compute import Compute
-    from snowsplat.pipeline.convert import Edits, convert
+    from snowsplat.pipeline.convert import convert
     from snowsplat.pipeline.describe import describe
     from snowsplat.pipeline.evaluate import evaluate
-    from snowsplat.pipeline.make import MakeOptions, make
+    from snowsplat.pipeline.make import make
     from snowsplat.pipeline.observer import Observer
+    from snowsplat.pipeline.options.benchmark import BenchmarkOptions, PlanOptions
+    from snowsplat.pipeline.options.convert import Edits
+    from snowsplat.pipeline.options.make import MakeOptions
+    from snowsplat.pipeline.options.publish import PublishOptions
+    from snowsplat.pipeline.options.train import TrainOptions
+    from snowsplat.pipeline.options.video import VideoOptions
     from snowsplat.pipeline.output.scene_files import write_gaussians
     from snowsplat.pipeline.output.scene_source import load_trained
-    from snowsplat.pipeline.publish import PublishOptions, publish
+    from snowsplat.pipeline.publish import publish
     from snowsplat.pipeline.render import render_images
     from snowsplat.pipeline.run.train_result import TrainingStopped
-    from snowsplat.pipeline.train import TrainOptions, resume, train
-    from snowsplat.pipeline.videos import VideoOptions, render_video
+    from snowsplat.pipeline.train import resume, train
+    from snowsplat.pipeline.videos import render_video
     from snowsplat.scene.camera import Camera
     from snowsplat.scene.gaussians import Gaussians
     from snowsplat.scene.rasterization import rasterization
@@ -65,23 +72,23 @@ _MODULES = {
     "Camera": "scene.camera",
     "Compute": "pipeline.compute",
     "Dataset": "data",
-    "DepthSource": "extras.lift.lift_photo",
-    "Edits": "pipeline.convert",
-    "FitOptions": "extras.image.fit",
+    "DepthSource": "extras.lift.options",
+    "Edits": "pipeline.options.convert",
+    "FitOptions": "extras.image.options",
     "Gaussians": "scene.gaussians",
-    "GlobeOptions": "extras.globe.make_globe",
-    "LiftOptions": "extras.lift.lift",
+    "GlobeOptions": "extras.globe.options",
+    "LiftOptions": "extras.lift.options",
     "LiftResult": "extras.lift.lift_photo",
-    "MakeOptions": "pipeline.make",
+    "MakeOptions": "pipeline.options.make",
     "Observer": "pipeline.observer",
     "Part": "training.parts.part",
     "Points": "data",
     "TrainConfig": "training.settings.config",
-    "TrainOptions": "pipeline.train",
+    "TrainOptions": "pipeline.options.train",
     "Trainer": "training.core.trainer",
     "TrainingStopped": "pipeline.run.train_result",
     "UserError": "util.errors",
-    "VideoOptions": "pipeline.videos",
+    "VideoOptions": "pipeline.options.video",
     "View": "data",
     "convert": "pipeline.convert",
     "decode_image": "extras.image.fit_image",
@@ -95,10 +102,10 @@ _MODULES = {
     "load_trained": "pipeline.output.scene_source",
     "make": "pipeline.make",
     "make_globe": "extras.globe.make_globe",
-    "BenchmarkOptions": "pipeline.benchmark.run",
+    "BenchmarkOptions": "pipeline.options.benchmark",
     "benchmark": "pipeline.benchmark.run",
-    "PlanOptions": "pipeline.blocks.plan",
-    "PublishOptions": "pipeline.publish",
+    "PlanOptions": "pipeline.options.benchmark",
+    "PublishOptions": "pipeline.options.publish",
     "merge_blocks": "pipeline.blocks.merge",
     "parts_of": "training.parts.list",
     "plan_blocks": "pipeline.blocks.plan",

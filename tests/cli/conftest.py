@@ -8,10 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from snowsplat import extras
 from snowsplat.cli.main import main
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from ..fork_server import Process, popen
+
+extras.register()
 
 
 @dataclass

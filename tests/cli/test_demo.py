@@ -11,7 +11,7 @@ from snowsplat.cli import view
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline import demo
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.make import MakeOptions
+from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.synthetic import light
 

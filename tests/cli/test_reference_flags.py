@@ -5,7 +5,7 @@ import re
 import pytest
 
 from snowsplat.cli import main as cli
-from snowsplat.cli.flag_errors import _flags
+from snowsplat.cli.flag_errors import spellings
 from snowsplat.cli.reference_flags import PROGRAMS
 
 # The command lines of the programs, from their documentation: a value where a flag takes one.
@@ -77,7 +77,7 @@ def test_a_flag_is_done_or_without_effect_or_refused(subcommand, words, capsys):
     if flag.outcome == "refused":
         with pytest.raises(cli.UserError, match=rf"^{name}: .*use {REFUSED[name]}"):
             cli.parse(arguments)
-        assert REFUSED[name] in dict(_flags(cli.load_subcommand(subcommand)))
+        assert REFUSED[name] in spellings(cli.load_subcommand(subcommand))
         return
     parsed = cli.parse(arguments)
     noted = capsys.readouterr().err.splitlines()
@@ -96,10 +96,10 @@ def parsed(*arguments: str) -> object:
 
 def test_flags_that_are_replaced():
     train = parsed("train", "garden", "-o", "out", "--random_background", "--antialiasing")
-    assert (train.background, train.antialias) == ("random", "on")
-    assert parsed("render", "out", "--antialiasing").antialias == "on"
+    assert train.options.settings == {"background": "random", "antialias": True}
+    assert parsed("render", "out", "--antialiasing").options.antialias is True
     page = parsed("train", "g", "-o", "out", "--view", "--ip=0.0.0.0", "--port", "6009")
-    assert (page.host, page.port) == ("0.0.0.0", 6009)
+    assert (page.address.host, page.address.port) == ("0.0.0.0", 6009)
     evaluate = parsed("evaluate", "-m", "a", "b", "--split", "train")
     assert [str(path) for path in evaluate.model_paths] == ["a", "b"]
     assert evaluate.split == "train"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli.reports import plain
+from snowsplat.cli.command import plain
 from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand
 from snowsplat.evaluation.metrics import Evaluation
 

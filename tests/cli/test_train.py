@@ -7,12 +7,11 @@ import shutil
 import signal
 import time
 import weakref
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from snowsplat.cli.config_flags import SETTINGS, ConfigFlags
+from snowsplat.cli.main import parse
 from snowsplat.cli.train import Train
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.run.train_result import TrainResult
@@ -22,6 +21,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.names import setting_names
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.util.flags import flags_of
 
 QUICK = ("--iterations", 30, "--threads", 1)
 
@@ -114,18 +114,15 @@ def test_the_reference_spelling_of_flags(run, dataset, tmp_path):
 
 
 def test_every_setting_is_a_flag_and_a_setting_of_some_recipe():
-    flags = {field.name for field in fields(Train)}
-    settings = [name for name, _, _ in SETTINGS]
+    settings = [flag.name for flag in flags_of(Train) if "settings" in flag.path]
     assert len(settings) >= 34
-    for name in settings:
-        assert name in flags
-        assert name in setting_names(recipe("default"))
+    assert set(settings) <= setting_names(recipe("default")).keys()
 
 
 @pytest.mark.parametrize(("value", "expected"), [("on", True), ("off", False)])
 def test_flags_with_the_values_on_and_off(value, expected):
-    assert ConfigFlags(abs_grad=value).config_settings() == {"abs_grad": expected}
-    assert ConfigFlags().config_settings() == {}
+    given = parse(["train", "garden", "-o", "out", "--abs-grad", value]).options.settings
+    assert given == {"abs_grad": expected}
 
 
 def test_a_setting_of_another_recipe(refused, dataset, tmp_path):

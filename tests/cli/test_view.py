@@ -13,7 +13,7 @@ import pytest
 
 from snowsplat.cli import view
 from snowsplat.cli.main import main
-from snowsplat.cli.page_flags import for_other_computers
+from snowsplat.cli.pages import for_other_computers
 from snowsplat.formats import read_gaussians, write_gaussians
 
 from ..browser import Browser

@@ -15,7 +15,8 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.extras.image.fit import FitOptions, Fitter
+from snowsplat.extras.image.fit import Fitter
+from snowsplat.extras.image.options import FitOptions
 from snowsplat.ops import reference
 
 from ..browser import Browser, Page, chromium

@@ -19,11 +19,13 @@ from snowsplat.formats.ply import read_ply
 from snowsplat.pipeline.blocks.cells import Cell, cut, ground_axes
 from snowsplat.pipeline.blocks.content import block_content
 from snowsplat.pipeline.blocks.merge import merge_blocks
-from snowsplat.pipeline.blocks.plan import Plan, PlanOptions, plan_blocks
+from snowsplat.pipeline.blocks.plan import Plan, plan_blocks
 from snowsplat.pipeline.blocks.train import train_blocks
 from snowsplat.pipeline.evaluate import evaluate
+from snowsplat.pipeline.options.benchmark import PlanOptions
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError

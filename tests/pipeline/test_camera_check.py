@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli.train_flags import TrainFlags
+from snowsplat.cli.main import parse
 from snowsplat.pipeline.describe import describe
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.train import train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 
@@ -52,5 +53,4 @@ def test_info(wrong: Path, tmp_path: Path) -> None:
 
 
 def test_flag() -> None:
-    assert TrainFlags(trust_cameras=True).options().trust_cameras
-    assert not TrainFlags().options().trust_cameras
+    assert parse(["train", "garden", "-o", "out", "--trust-cameras"]).options.trust_cameras

@@ -7,8 +7,9 @@ import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.pipeline.clean import clean
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.util.errors import UserError
 

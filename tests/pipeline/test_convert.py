@@ -8,9 +8,10 @@ import torch
 
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.formats.spz import spz_version
-from snowsplat.pipeline.convert import Edits, convert
-from snowsplat.pipeline.decimate import file_size, gaussians_to_keep
-from snowsplat.pipeline.videos import VideoSize, cameras_along
+from snowsplat.pipeline.convert import convert
+from snowsplat.pipeline.options.convert import Edits, file_size, gaussians_to_keep
+from snowsplat.pipeline.options.video import VideoSize
+from snowsplat.pipeline.videos import cameras_along
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.scene.gaussians import Gaussians

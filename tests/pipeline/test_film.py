@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from snowsplat.pipeline.film import film, film_preview, write_keys
+from snowsplat.pipeline.options.video import VideoSize
 from snowsplat.pipeline.output.scene_source import load_viewable
-from snowsplat.pipeline.videos import VideoSize, cameras_along
+from snowsplat.pipeline.videos import cameras_along
 from snowsplat.project import page_film
 from snowsplat.project.page_film import PageFilm
 from snowsplat.scene.camera_json import read_cameras

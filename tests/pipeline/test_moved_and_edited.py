@@ -11,8 +11,9 @@ from PIL import Image, ImageOps
 from snowsplat.pipeline import make
 from snowsplat.pipeline.make_plan import MakePlan
 from snowsplat.pipeline.observer import SILENT
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_dataset_of
-from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.sfm.ingest.search.sources import Sources
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

@@ -7,9 +7,11 @@ import pytest
 from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.convert import Edits, convert
+from snowsplat.pipeline.convert import convert
+from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import cameras_of
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.project.project import Project
 from snowsplat.scene import edit
 from snowsplat.scene.render import render

@@ -13,10 +13,11 @@ import torch
 
 from snowsplat.data import load_dataset
 from snowsplat.pipeline.evaluate import evaluate
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.run.refined_cameras import with_refined, write_refined
 from snowsplat.pipeline.run.train_result import TrainResult
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.training.parts import pose_refinement
 from snowsplat.util.errors import UserError
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from snowsplat.pipeline.observer import Observer, Observers
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.pipeline.step_logs import COLUMNS, LOGS, CsvLog
-from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train import resume, train
 from snowsplat.util.errors import UserError
 
 SETTINGS = {"iterations": 12, "initial_points": 200, "init": "points", "checkpoint_every": 5}

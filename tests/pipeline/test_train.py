@@ -12,10 +12,11 @@ from snowsplat.data import load
 from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run.train_result import TrainingStopped
-from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train import resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.parts import unexplained

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snowsplat.pipeline.videos import VideoOptions, VideoSize
+from snowsplat.pipeline.options.video import VideoOptions, VideoSize
 from snowsplat.util.errors import UserError
 
 from ..trajectory.rigs import camera_at

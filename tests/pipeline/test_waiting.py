@@ -9,10 +9,12 @@ from tests.gaussians import gaussians_in_box
 from snowsplat.extras.globe.make_globe import make_globe
 from snowsplat.formats import write_gaussians
 from snowsplat.pipeline.clean import clean
-from snowsplat.pipeline.convert import Edits, convert
+from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.publish import publish
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.pipeline.view import viewed_scene
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.train import train
 from snowsplat.pipeline.watch import NewestScene
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.watchers import FOLDER, socket_in
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.train import train
 from snowsplat.pipeline.watch import watch
 
 from ..viewer.clients import Visitor

@@ -21,7 +21,8 @@ from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.train import train
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import project
 from snowsplat.synthetic.toy_dataset import write_toy_dataset

@@ -13,8 +13,9 @@ import torch
 
 from snowsplat.cli.main import main
 from snowsplat.pipeline.compute import Compute
-from snowsplat.pipeline.make import MakeOptions
-from snowsplat.pipeline.train import TrainOptions, train
+from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.train import train
 from snowsplat.training.settings import (
     DENSITY_CONTROLS,
     RECIPES,

@@ -16,7 +16,8 @@ from snowsplat.data.dataset import Dataset
 from snowsplat.data.load import load_dataset
 from snowsplat.pipeline.observer import SILENT
 from snowsplat.scene.render import render
-from snowsplat.sfm.make_dataset import DatasetOptions, make_dataset
+from snowsplat.sfm.make_dataset import make_dataset
+from snowsplat.sfm.options import DatasetOptions
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.recipes import recipe

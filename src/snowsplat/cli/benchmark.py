@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
-import tyro
-
-from snowsplat.cli.config_flags import RECIPE, RECIPE_FLAG, RecipeName
-from snowsplat.cli.flags import flag
-from snowsplat.cli.reports import JsonFlag, Reports
-from snowsplat.util.errors import UserError
+from snowsplat.cli.command import Exit, JsonCommand
+from snowsplat.pipeline.options.benchmark import BenchmarkOptions
 from snowsplat.util.messages import message
+from snowsplat.util.settings import group, needed
 
 
-@dataclass
-class Benchmark(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Benchmark(JsonCommand):
     """Train and evaluate all scenes of a folder by the protocol of the papers.
 
     Examples:
@@ -33,56 +29,27 @@ class Benchmark(Reports):
       each trains the scenes that no other one trains.
     """
 
-    folder: Annotated[Path | None, tyro.conf.Positional, flag("FOLDER")] = None
-    """Contains one folder for each scene."""
-    output: Annotated[Path | None, flag("OUT", "-o")] = None
-    """A folder for the scenes and the tables."""
-    suite: Annotated[
-        Literal["mipnerf360", "tandt", "db", "blender", "custom"] | None,
-        flag("{mipnerf360,tandt,db,blender,custom}", default="by the names of the scenes"),
-    ] = None
-    """The benchmark suite."""
-    scenes: Annotated[tuple[str, ...], flag("[NAME ...]", default="all")] = ()
-    """Only these scenes."""
-    recipe: Annotated[RecipeName, RECIPE_FLAG] = "default"
-    """The recipe of the training."""
-    iterations: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Number of training steps."""
-    max_gaussians: Annotated[int | None, flag("N", default=RECIPE)] = None
-    """Maximum number of Gaussians; 0: no limit."""
-    resolution: Annotated[int | None, flag("N", "-r", default="set by the suite")] = None
-    """1, 2, 4 or 8: divide the size of the photos by this number; another number: the width."""
-    lpips: Annotated[Path | None, flag("{vgg,alex,FILE}", default="not measured")] = None
-    """Network for LPIPS, or a file with its weights, see snowsplat evaluate."""
-    jobs: Annotated[int, flag("N", default="1")] = 1
-    """Number of scenes trained at the same time. They share the CPU; job i uses GPU i."""
-    device: Annotated[Literal["cpu", "cuda"] | None, flag("{cpu,cuda}", default="a GPU")] = None
-    """Device for the training."""
-    json: JsonFlag = False
+    folder: Path = needed(
+        "benchmark needs a folder that contains the scenes",
+        "FOLDER",
+        "Contains one folder for each scene.",
+        argument=True,
+    )
+    output: Path = needed(
+        "benchmark needs a folder for the results; add -o OUT",
+        "OUT",
+        "A folder for the scenes and the tables.",
+        "-o",
+    )
+    options: BenchmarkOptions = group(BenchmarkOptions)
 
-    def run(self) -> int:
-        """Returns the exit code: 2 if a scene could not be trained, otherwise 0."""
-        if self.folder is None:
-            raise UserError("benchmark needs a folder that contains the scenes")
-        if self.output is None:
-            raise UserError("benchmark needs a folder for the results; add -o OUT")
-        from snowsplat.pipeline.benchmark.run import BenchmarkOptions, benchmark
+    def run(self) -> Exit:
+        """The exit code is 2 if a scene could not be trained."""
+        from snowsplat.pipeline.benchmark.run import benchmark
 
-        given = {"iterations": self.iterations, "max_gaussians": self.max_gaussians}
-        options = BenchmarkOptions(
-            self.suite,
-            self.scenes,
-            self.recipe,
-            {name: value for name, value in given.items() if value is not None},
-            self.resolution,
-            self.lpips,
-            self.jobs,
-            self.device,
-        )
         report = benchmark(
-            self.folder, self.output, options, on_line=lambda line: print(line, flush=True)
+            self.folder, self.output, self.options, on_line=lambda line: print(line, flush=True)
         )
-        self.report = report
         print(
             message(
                 "\n{report}\n\n{output}: the results as a page",
@@ -90,4 +57,4 @@ class Benchmark(Reports):
                 output=self.output / "index.html",
             )
         )
-        return 2 if report.failures else 0
+        return Exit(2 if report.failures else 0, report)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import tyro
-
-from snowsplat.cli.flags import Threads, flag, switch
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.reports import JsonFlag, Reports
-from snowsplat.util.errors import UserError
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.options import common
 from snowsplat.util.messages import message
+from snowsplat.util.settings import group, needed
+
+_NEEDED = message("clean needs a scene and the name of a file to write")
 
 
-@dataclass
-class Clean(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Clean(JsonCommand):
     """Remove floaters: Gaussians that hang in front of the surfaces.
 
     Examples:
@@ -32,24 +33,19 @@ class Clean(Reports):
       The suffix of FILE selects the format, as for snowsplat convert.
     """
 
-    scene: Annotated[Path | None, tyro.conf.Positional, flag("SCENE")] = None
-    """The output folder of train or make, or a scene file of any format."""
-    target: Annotated[Path | None, tyro.conf.Positional, flag("FILE")] = None
-    """The file to write."""
-    dataset: Annotated[Path | None, flag("DATASET", "-s", default="as trained")] = None
-    """Folder of the dataset: for a scene file, or if it was moved after the training."""
-    overwrite: Annotated[bool, switch()] = False
-    """Replace FILE if it exists already."""
-    threads: Threads = None
-    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
-    """Device to compute on."""
-    json: JsonFlag = False
+    scene: Path = needed(
+        _NEEDED,
+        "SCENE",
+        "The output folder of train or make, or a scene file of any format.",
+        argument=True,
+    )
+    target: Path = needed(_NEEDED, "FILE", "The file to write.", argument=True)
+    dataset: Path | None = common.dataset()
+    overwrite: bool = common.overwrite()
+    compute: Compute = group(Compute, only=("device", "threads"))
 
-    def run(self) -> int:
-        if self.scene is None or self.target is None:
-            raise UserError("clean needs a scene and the name of a file to write")
+    def run(self) -> dict[str, Any]:
         from snowsplat.pipeline.clean import clean
-        from snowsplat.pipeline.compute import Compute
 
         with TerminalObserver() as observer:
             done = clean(
@@ -57,7 +53,7 @@ class Clean(Reports):
                 self.target,
                 dataset=self.dataset,
                 overwrite=self.overwrite,
-                compute=Compute(self.device, self.threads),
+                compute=self.compute,
                 observer=observer,
             )
         before, after = done.psnr
@@ -74,5 +70,4 @@ class Clean(Reports):
             )
         )
         print(see_and_share(self.target))
-        self.report = {"file": self.target, "bytes": self.target.stat().st_size, **vars(done)}
-        return 0
+        return {"file": self.target, "bytes": self.target.stat().st_size, **vars(done)}

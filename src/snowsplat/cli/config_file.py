@@ -1,71 +1,72 @@
-"""The flag `--config FILE`: flags in a file, or the `config.json` of an earlier training."""
+"""The flag `--config FILE`: values of flags in a file, or the `config.json` of a training."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
-import tyro
-
-from snowsplat.cli.flag_errors import spellings
+from snowsplat.cli.command import Command
 from snowsplat.util.errors import UserError
+from snowsplat.util.flags import Flag, flags_of
 from snowsplat.util.safe_json import from_json, printable, read_json
-from snowsplat.util.settings import kinds_of, suggestion
+from snowsplat.util.settings import kinds_of, setting, suggestion
 
 if TYPE_CHECKING:
     from snowsplat.project.training_folder import DatasetSettings
     from snowsplat.training.settings.config import TrainConfig
 
-_FLAG = "--config"
+#: The flag that names the file.
+KEY = "config"
 
 
-def expanded(kind: Any, arguments: Sequence[str]) -> list[str]:
-    """The arguments with the flags of a file in the place of ``--config FILE``.
+def config(more: str = "") -> Path | None:
+    """The file, as a field. ``more``: what else it can be."""
+    return setting(
+        None,
+        f"A JSON or TOML file with values of these flags{more}. Flags have priority.",
+        metavar="FILE",
+    )
 
-    Flags among the arguments have priority. A `config.json` is left to `training_in`.
 
-    ``kind``: the dataclass of the subcommand.
+def with_file(command: type[Command], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Given values of flags, and those of the file of `KEY` that are not given.
+
+    A `config.json` is left to `training_in`.
 
     Raises: UserError: the file is not readable, or contains what is no flag of the subcommand.
     """
-    rest, added = list(arguments), list[str]()
-    known = spellings(kind)
-    given = {known[name][0] for name in map(_spelling, arguments) if name in known}
-    if "config" not in given:
-        return rest
-    at = [_spelling(argument) for argument in rest].index(_FLAG)
-    separate = "=" not in rest[at]
-    if separate and at + 1 == len(rest):
-        return rest  # the parser says that the value is missing
-    file = Path(rest[at + 1] if separate else rest[at].partition("=")[2])
+    file = given[KEY]
     content = _content(file)
     if "training" in content:
-        if kind.__name__ != "Train":
+        if command.__name__ != "Train":
             raise UserError(
                 "{file}: is the configuration of a training; use it with train", file=file
             )
-        return rest
+        return dict(given)
+    flags = {spelling: flag for flag in flags_of(command) for spelling in flag.spellings}
+    values = {name: value for name, value in given.items() if name != KEY}
     for key, value in content.items():
-        spelling = _spelling(f"--{key}")
-        if spelling not in known or spelling in (_FLAG, "--help"):
-            names = [name[2:] for name in known if name.startswith("--")]
+        spelling = f"--{key}".replace("_", "-")
+        flag = flags.get(spelling)
+        if flag is None or flag.key == KEY:
+            names = [name[2:] for name in flags if name.startswith("--")]
             advice = suggestion(spelling[2:], names) or "; remove it"
             raise UserError(
                 "{file}: {name}: unknown{advice}", file=file, name=printable(key), advice=advice
             )
-        name, hint, _ = known[spelling]
-        if name not in given and value is not None:
-            try:
-                extras = get_args(get_type_hints(kind, include_extras=True)[name])
-                repeated = tyro.conf.UseAppendAction in extras
-                added += _arguments(spelling, value, hint, repeated)
-            except ValueError as error:
-                raise UserError(
-                    "{file}: {name}: {error}", file=file, name=printable(key), error=error
-                ) from None
-    return [*rest[:at], *rest[at + 1 + separate :], *added]
+        if flag.key in values or value is None:
+            continue
+        try:
+            if (read := _value(flag, value)) is not None:
+                values[flag.key] = read
+        except ValueError as error:
+            raise UserError(
+                "{file}: {name}: {error}", file=file, name=printable(key), error=error
+            ) from None
+    return values
 
 
 def training_in(file: Path) -> tuple[TrainConfig, DatasetSettings]:
@@ -109,29 +110,31 @@ def _toml(file: Path) -> Any:
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
 
-def _spelling(argument: str) -> str:
-    return argument.partition("=")[0].replace("_", "-") if argument.startswith("-") else argument
-
-
-def _arguments(spelling: str, value: Any, hint: Any, repeated: bool) -> Iterator[str]:
-    """The arguments that set a flag to a value of JSON.
-
-    ``repeated``: whether the flag is given once for each item of a list.
+def _value(flag: Flag, value: Any) -> Any:
+    """What the command line gives for a value of JSON; None: nothing.
 
     Raises: ValueError: the flag cannot have the value.
     """
-    kinds = kinds_of(hint)
-    if bool in kinds:
+    if flag.type is bool:
         if not isinstance(value, bool):
             raise ValueError("use true or false")
-        return iter([spelling] * value)
-    if isinstance(value, bool) and any(
-        get_origin(each) is Literal and "on" in get_args(each) for each in kinds
-    ):
-        value = "on" if value else "off"
+        return value or None
     values = value if isinstance(value, list) else [value]
     if any(isinstance(each, dict | list) for each in values):
         raise ValueError("a table is no value of a flag")
-    if isinstance(value, list) and not repeated:
-        return iter([spelling, *map(str, values)])
-    return (f"{spelling}={each}" for each in values)
+    kinds = [kind for kind in kinds_of(flag.type) if kind is not NoneType]
+    if get_origin(kinds[0]) is tuple:
+        return tuple(_item(each, [get_args(kinds[0])[0]]) for each in values)
+    return _item(value, kinds)
+
+
+def _item(value: Any, kinds: list[Any]) -> Any:
+    if isinstance(value, bool) and any("on" in get_args(k) for k in kinds if _is_literal(k)):
+        return "on" if value else "off"
+    if Path in kinds:
+        return Path(str(value))
+    return str(value) if str in kinds else value
+
+
+def _is_literal(kind: Any) -> bool:
+    return get_origin(kind) is Literal

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any
 
-import tyro
-
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.reports import JsonFlag, Reports
+from snowsplat.pipeline.options import common
+from snowsplat.pipeline.options.convert import Edits
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
-
-Vector = tuple[float, float, float]
-Box = tuple[float, float, float, float, float, float]
+from snowsplat.util.settings import argument, group, setting, switch
 
 
-@dataclass
-class Convert(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Convert(JsonCommand):
     """Write a scene in another file format; crop, decimate, transform or merge scenes.
 
     Examples:
@@ -58,60 +55,61 @@ class Convert(Reports):
       result is then trained to look like the whole scene from its cameras.
     """
 
-    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("SCENE [MORE …] FILE")] = ()
-    """One or more scenes, followed by the file to write. A scene is a file of any format, an output
-    folder, of which the last scene is used, or a folder with a lod-meta.json or a SOG meta.json."""
-    sh_degree: Annotated[int | None, flag("N", default="that of the scene")] = None
-    """Reduce the spherical harmonics (view-dependent colour) to this degree, 0 to 3."""
-    crop: Annotated[Box | None, flag("X0 Y0 Z0 X1 Y1 Z1", default="all")] = None
-    """Keep only the Gaussians whose centres are in this box."""
-    decimate: Annotated[str | None, flag("N|P%|SIZE", default="all")] = None
-    """Number or percentage of Gaussians, or the size of FILE, e.g. 10MB. Neighbours are merged."""
-    refine: Annotated[Path | None, flag("DATASET")] = None
-    """With --decimate: train the result for a moment on the photos of the scene."""
-    rotate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
-    """Rotate by these angles in degrees, first about x, then about y, then about z."""
-    scale: Annotated[float, flag("F", default="1")] = 1.0
-    """Scale by this factor about the origin."""
-    scale_to: Annotated[str | None, flag("LENGTH")] = None
-    """The true distance of the two places of --between, e.g. 0.45m, 45cm, 17.7in: scale the scene
-    so that one unit is one metre."""
-    between: Annotated[tuple[str, str], flag("A B")] = ("", "")
-    """With --scale-to: two points X,Y,Z, or the names of two photos of an output folder."""
-    translate: Annotated[Vector, flag("X Y Z", default="0 0 0")] = (0.0, 0.0, 0.0)
-    """Translate by this offset."""
-    spz_version: Annotated[Literal[2, 3, 4] | None, flag("{2,3,4}", default="3")] = None
-    """Version of an .spz file: 2 for older viewers, with coarser rotations; 4 for the newest
-    viewers, faster to load."""
-    georeferenced: Annotated[bool, switch()] = False
-    """Write positions in the world, as doubles (.ply), for a scene that is far away from 0. Without
-    it, they are relative to the origin that is noted in the file or beside it."""
-    overwrite: Annotated[bool, switch()] = False
-    """Replace FILE if it exists already."""
-    json: JsonFlag = False
+    paths: tuple[Path, ...] = argument(
+        (),
+        "SCENE [MORE …] FILE",
+        "One or more scenes, followed by the file to write. A scene is a file of any format, an "
+        "output folder, of which the last scene is used, or a folder with a lod-meta.json or a SOG "
+        "meta.json.",
+    )
+    edits: Edits = group(Edits)
+    refine: Path | None = setting(
+        None,
+        "With --decimate: train the result for a moment on the photos of the scene.",
+        metavar="DATASET",
+    )
+    scale_to: str | None = setting(
+        None,
+        "The true distance of the two places of --between, e.g. 0.45m, 45cm, 17.7in: scale the "
+        "scene so that one unit is one metre.",
+        metavar="LENGTH",
+    )
+    between: tuple[str, str] = setting(
+        ("", ""),
+        "With --scale-to: two points X,Y,Z, or the names of two photos of an output folder.",
+        "",
+        metavar="A B",
+    )
+    spz_version: int | None = setting(
+        None,
+        "Version of an .spz file: 2 for older viewers, with coarser rotations; 4 for the newest "
+        "viewers, faster to load.",
+        "3",
+        least=2,
+        most=4,
+        allowed="2, 3 or 4",
+        metavar="{2,3,4}",
+    )
+    georeferenced: bool = switch(
+        "Write positions in the world, as doubles (.ply), for a scene that is far away from 0. "
+        "Without it, they are relative to the origin that is noted in the file or beside it."
+    )
+    overwrite: bool = common.overwrite()
 
-    def run(self) -> int:
+    def run(self) -> dict[str, Any]:
         if len(self.paths) < 2:
             raise UserError("convert needs a scene and the name of a file to write")
         *sources, target = self.paths
-        from snowsplat.pipeline.convert import Edits, convert
+        from snowsplat.pipeline.convert import convert
         from snowsplat.pipeline.true_scale import KnownDistance
 
         if self.scale_to is None and any(self.between):
             raise UserError("--between: how far is it? add --scale-to LENGTH, such as 0.45m")
-        edits = Edits(
-            crop=self.crop,
-            rotate=self.rotate,
-            scale=self.scale,
-            translate=self.translate,
-            decimate=self.decimate,
-            sh_degree=self.sh_degree,
-        )
         with TerminalObserver() as observer:
             format = convert(
                 sources,
                 target,
-                edits,
+                self.edits,
                 dataset=self.refine,
                 spz_version=self.spz_version,
                 georeferenced=self.georeferenced,
@@ -121,7 +119,6 @@ class Convert(Reports):
             )
         size = format.size(target)
         written = f"{format_bytes(size)} of {format.name}"
-        self.report = {"file": target, "bytes": size, "format": format.name, "lost": format.loses}
         print(
             message(
                 "{target}: {written}; lost in this format: {loses}",
@@ -132,4 +129,4 @@ class Convert(Reports):
         )
         page = format.name == "HTML"
         print(f"to see it: open {target} in a browser" if page else see_and_share(target))
-        return 0
+        return {"file": target, "bytes": size, "format": format.name, "lost": format.loses}

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from snowsplat.cli.flags import flag, switch, with_flags
+from snowsplat.cli.command import Command, Exit
 from snowsplat.cli.make import print_summary
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
 from snowsplat.cli.view import View
+from snowsplat.util.flags import command_line, with_flags, words
 from snowsplat.util.messages import message
+from snowsplat.util.settings import setting, switch
 
 if TYPE_CHECKING:
     from snowsplat.synthetic.compare_poses import PoseErrors
 
 
-@dataclass
-class Demo:
+@dataclass(frozen=True, kw_only=True)
+class Demo(Command):
     """Try snowsplat: make a scene from rendered photos of a synthetic scene.
 
     Examples:
@@ -35,13 +36,19 @@ class Demo:
       interrupted, run it again to resume.
     """
 
-    output: Annotated[Path, flag("OUT", "-o", default="./snowsplat_demo")] = Path("snowsplat_demo")
-    """Output folder. It is created if it does not exist."""
-    open: Annotated[bool, switch()] = False
-    """Show the finished scene in the browser until Ctrl-C, as snowsplat view does."""
+    output: Path = setting(
+        Path("snowsplat_demo"),
+        "Output folder. It is created if it does not exist.",
+        "./snowsplat_demo",
+        metavar="OUT",
+        aliases=("-o",),
+    )
+    open: bool = switch(
+        "Show the finished scene in the browser until Ctrl-C, as snowsplat view does."
+    )
 
-    def run(self) -> int:
-        """Returns the exit code: 0; 1 if the poses are wrong; 130 after Ctrl-C."""
+    def run(self) -> Exit | None:
+        """The exit code is 1 if the poses are wrong, and 130 after Ctrl-C."""
         from snowsplat.pipeline.demo import demo
 
         try:
@@ -49,9 +56,13 @@ class Demo:
                 result = demo(self.output, observer=observer)
         except KeyboardInterrupt as stopped:
             print(with_flags(str(stopped) or "stopped"))
-            words = ["snowsplat", "demo", "-o", str(self.output)] + ["--open"] * self.open
-            print(message("resume with: {words}", words=shlex.join(words)))
-            return 130
+            print(
+                message(
+                    "resume with: {command_line}",
+                    command_line=command_line("demo", words(Demo, self.given)),
+                )
+            )
+            return Exit(130)
         print_summary(result.made)
         _print_errors(result.errors)
         if not result.accurate:
@@ -60,13 +71,14 @@ class Demo:
                 "other programs run",
                 file=sys.stderr,
             )
-            return 1
+            return Exit(1)
         scene = result.made.folder.path.parent
         if not self.open:
             print(message("\n{see_and_share}", see_and_share=see_and_share(scene)))
             print("with your own photos: snowsplat make PHOTOS")
-            return 0
-        return View(scene).run()
+            return None
+        View(path=scene).run()
+        return None
 
 
 def _print_errors(errors: PoseErrors) -> None:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
-from snowsplat.cli.flags import switch
+from snowsplat.cli.command import Exit, JsonCommand
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import printable
 
 
-@dataclass
-class Doctor:
+@dataclass(frozen=True, kw_only=True)
+class Doctor(JsonCommand):
     """Show what snowsplat uses of this computer, and what is missing.
 
     Examples:
@@ -24,10 +24,7 @@ class Doctor:
       code is 1 if something is missing without which nothing works, otherwise 0.
     """
 
-    json: Annotated[bool, switch()] = False
-    """Print JSON, which other programs can read."""
-
-    def run(self) -> int:
+    def run(self) -> Exit:
         """Returns the exit code: 0, or 1 if something essential is missing."""
         from snowsplat.pipeline.doctor import examine
 
@@ -37,15 +34,15 @@ class Doctor:
             if not self.json:  # at once: importing the packages takes a few seconds
                 print(printable(f"{finding.name:22}  {finding.text}"), flush=True)
         problems = [finding for finding in findings if finding.problem]
-        if self.json:
-            facts: dict[str, Any] = {finding.name: finding.values for finding in findings}
-            facts["problems"] = [f"{finding.name}: {finding.text}" for finding in problems]
-            print(json.dumps(facts, indent=2))
-        else:
-            names = ", ".join(finding.name for finding in problems)
+        names = ", ".join(finding.name for finding in problems)
+        if not self.json:
+            missing = f"see above: {names}" if problems else None
             print(
-                f"\nsee above: {names}"
-                if problems
-                else "\nnothing is missing; to try it: snowsplat demo"
+                message(
+                    "\n{missing}",
+                    missing=missing or "nothing is missing; to try it: snowsplat demo",
+                )
             )
-        return int(any(finding.essential for finding in problems))
+        facts: dict[str, Any] = {finding.name: finding.values for finding in findings}
+        facts["problems"] = [f"{finding.name}: {finding.text}" for finding in problems]
+        return Exit(int(any(finding.essential for finding in problems)), facts)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from snowsplat.cli.flags import flag
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step
-from snowsplat.cli.reports import JsonFlag, Reports
-from snowsplat.cli.scene_flags import SceneFlags
+from snowsplat.cli.scene_choice import SceneChoice
 from snowsplat.util.messages import message
+from snowsplat.util.settings import group, setting
 
 if TYPE_CHECKING:
     from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 
 
-@dataclass
-class Evaluate(SceneFlags, Reports):
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(JsonCommand):
     """Compare a scene with the held-out photos: PSNR, SSIM and, with weights, LPIPS.
 
     Examples:
@@ -38,29 +38,33 @@ class Evaluate(SceneFlags, Reports):
       python -m snowsplat.evaluation.lpips vgg lpips_vgg.safetensors
     """
 
-    split: Annotated[Literal["test", "train"], flag("{test,train}", default="test")] = "test"
-    """test: the held-out photos; train: the training photos."""
-    lpips: Annotated[Path | None, flag("{vgg,alex,FILE}", default="not measured")] = None
-    """Measure LPIPS with this network, or with the weights in a safetensors file (of AlexNet or
-    VGG16, and of the linear layers)."""
+    scene: SceneChoice = group(SceneChoice)
+    split: Literal["test", "train"] = setting(
+        "test",
+        "test: the held-out photos; train: the training photos.",
+        metavar="{test,train}",
+    )
+    lpips: Path | None = setting(
+        None,
+        "Measure LPIPS with this network, or with the weights in a safetensors file (of AlexNet or "
+        "VGG16, and of the linear layers).",
+        "not measured",
+        metavar="{vgg,alex,FILE}",
+    )
+    model_paths: tuple[Path, ...] = setting(
+        (), "Several output folders, one after the other.", metavar="OUT [OUT ...]"
+    )
 
-    model_paths: Annotated[tuple[Path, ...], flag("OUT [OUT ...]")] = ()
-    """Several output folders, one after the other."""
-    json: JsonFlag = False
+    def run(self) -> Any:
+        several = [replace(self.scene, model_path=path) for path in self.model_paths]
+        return [self._evaluate(each) for each in several] or self._evaluate(self.scene)
 
-    def run(self) -> int:
-        several = [
-            replace(self, model_path=path, model_paths=())._evaluate() for path in self.model_paths
-        ]
-        self.report = several or self._evaluate()
-        return 0
-
-    def _evaluate(self) -> dict[str, Any]:
+    def _evaluate(self, chosen: SceneChoice) -> dict[str, Any]:
         """Print the figures of one folder; returns them."""
         from snowsplat.evaluation.lpips import Lpips
         from snowsplat.pipeline.evaluate import evaluate, views_of
 
-        scene = self.load()
+        scene = chosen.load()
         views = views_of(scene, self.split)
         network = None if self.lpips is None else Lpips.load(self.lpips)
         width = max(4, *(len(view.name) for view in views))
@@ -85,8 +89,8 @@ class Evaluate(SceneFlags, Reports):
         which = f"{len(views)} {self.split} views of {evaluation.size}"
         step = f"iteration {scene.iteration}, " if scene.iteration else ""  # a file has none
         print(message("{step}{which}: {where}", step=step, which=which, where=where))
-        out = self.output_path()
-        photos = [] if self.dataset is None else ["--dataset", self.dataset]
+        out = chosen.path()
+        photos = [] if chosen.dataset is None else ["--dataset", chosen.dataset]
         print(next_step("to see the renders", "render", out, *photos, "--split", self.split))
         about = {"folder": out, "iteration": scene.iteration, "split": self.split}
         return about | {"size": evaluation.size, **evaluation.as_json()}

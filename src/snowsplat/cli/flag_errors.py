@@ -8,32 +8,30 @@ is explained as it is in Python, with the declaration of the setting.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
-
-import tyro
+from typing import Any, Literal, get_args, get_origin
 
 from snowsplat.cli import other_trainers
+from snowsplat.cli.command import Command
 from snowsplat.cli.subcommands import SUBCOMMANDS
 from snowsplat.training.settings.recipes import RECIPES
+from snowsplat.util.flags import flags_of
 from snowsplat.util.safe_json import printable
-from snowsplat.util.settings import Setting, allowed, kinds_of, shown
+from snowsplat.util.settings import allowed, kinds_of, shown
 from snowsplat.util.settings import suggestion as similar
 
 _FLAG = re.compile(r"-[^\d.]")
 _FRAME = "│|╭╮╰╯─┌┐└┘+-= "
 
 
-def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
+def explained(command: type[Command], arguments: Sequence[str], message: str) -> str:
     """Why the arguments of a subcommand are invalid, on one line.
 
-    Args:
-        kind: the dataclass of the subcommand.
-        message: what tyro has printed; it is used if the arguments do not show the reason.
+    ``message``: what tyro has printed; it is used if the arguments do not show the reason.
     """
-    flags, subcommand = spellings(kind), kind.__name__.lower()
+    flags, subcommand = spellings(command), command.__name__.lower()
     names = [each.partition("=")[0] for each in arguments if _FLAG.match(each)]
     unknown = {name: name.replace("_", "-") for name in names}
     advised = {
@@ -51,7 +49,7 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         if spelling not in flags:
             advice = similar(spelling, list(flags)) or "; leave it out"
             return f"{printable(name)}: unknown flag{advice}"
-        _, hint, declared = flags[spelling]
+        hint, valid = flags[spelling]
         kinds = [each for each in kinds_of(hint) if each is not NoneType]
         if kinds == [bool]:
             continue
@@ -59,12 +57,12 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
         if get_origin(kinds[0]) is tuple:
             kinds = [get_args(kinds[0])[0]]
         elif not texts:
-            return f"{spelling}: needs a value; use {allowed(hint, declared)}"
+            return f"{spelling}: needs a value; use {valid}"
         else:
             texts = texts[:1]
         for text in texts:
             if not any(_is_of(text, each) for each in kinds):
-                return f"{spelling}: {shown(text)} is not valid; use {allowed(hint, declared)}"
+                return f"{spelling}: {shown(text)} is not valid; use {valid}"
     if extra := re.search(r"Unrecognized options: (.*)", message):
         usage = SUBCOMMANDS[subcommand].usage
         what = f"{printable(extra[1].strip(_FRAME))}: too many names"
@@ -76,28 +74,14 @@ def explained(kind: Any, arguments: Sequence[str], message: str) -> str:
     return " ".join(lines[:end]).rstrip(".") or "invalid flags"
 
 
-def spellings(kind: Any) -> dict[str, tuple[str, Any, Setting]]:
-    """Each spelling of a flag of a subcommand -> its field, its type, and its declaration.
-
-    ``kind``: the dataclass of the subcommand.
-    """
-    return dict(_flags(kind))
-
-
-def _flags(kind: Any) -> Iterator[tuple[str, tuple[str, Any, Setting]]]:
-    from snowsplat.cli.config_flags import SETTINGS  # analysed only if there is an error
-
-    settings = {name: declared for name, _, declared in SETTINGS}
-    yield from ((name, ("help", bool, Setting())) for name in ("-h", "--help"))
-    for name, hint in get_type_hints(kind, include_extras=True).items():
-        extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-        if tyro.conf.Positional in extras:
-            continue
-        type_ = get_args(hint)[0] if extras else hint
-        aliases = [each for extra in extras for each in getattr(extra, "aliases", None) or ()]
-        declared = settings.get(name, Setting()) if get_origin(type_) is not Literal else Setting()
-        for spelling in ("--" + name.replace("_", "-"), *aliases):
-            yield spelling, (name, type_, declared)
+def spellings(command: type[Command]) -> dict[str, tuple[Any, str]]:
+    """Each spelling of a flag of a subcommand -> the type of its value, and what is allowed."""
+    known: dict[str, tuple[Any, str]] = {"-h": (bool, ""), "--help": (bool, "")}
+    for flag in flags_of(command):
+        # The declaration is that of the setting, the type that of the command line.
+        declared = (flag.declared,) if flag.type == flag.hint or flag.declared.parse else ()
+        known |= dict.fromkeys(flag.spellings, (flag.type, allowed(flag.type, *declared)))
+    return known
 
 
 def _values(arguments: Sequence[str]) -> list[str]:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Any
 
-import tyro
-
-from snowsplat.cli.flags import flag, switch
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.util.byte_size import format_bytes
-from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import printable
+from snowsplat.util.settings import needed
 
 
-@dataclass
-class Info:
+@dataclass(frozen=True, kw_only=True)
+class Info(JsonCommand):
     """Describe photos, a video, a dataset, a scene, a checkpoint or an output folder.
 
     Examples:
@@ -38,26 +35,21 @@ class Info:
       the camera poses take.
     """
 
-    # The type is not `Path | None`: to check it, tyro would import another package, which takes a
-    # tenth of a second.
-    path: Annotated[Optional[Path], tyro.conf.Positional, flag("FILE|OUT|DATASET")] = None  # noqa: UP045
-    """A scene file of any format, a checkpoint, an output folder, a dataset, photos or a video."""
-    json: Annotated[bool, switch()] = False
-    """Print JSON, which other programs can read."""
+    path: Path = needed(
+        "info needs a file or folder; add one",
+        "FILE|OUT|DATASET",
+        "A scene file of any format, a checkpoint, an output folder, a dataset, photos or a video.",
+        argument=True,
+    )
 
-    def run(self) -> int:
-        """Returns the exit code, 0."""
-        if self.path is None:
-            raise UserError("info needs a file or folder; add one")
+    def run(self) -> dict[str, Any]:
         from snowsplat.pipeline.describe import describe
 
         facts = describe(self.path)
-        if self.json:
-            print(json.dumps(facts, indent=2))
-        else:
+        if not self.json:
             _print(facts)
             print("\n".join(_next(facts, self.path)))
-        return 0
+        return facts
 
 
 def _next(facts: dict[str, Any], path: Path) -> list[str]:

@@ -5,9 +5,10 @@ Exit codes: 0 success; 2 an error in the flags or the input, reported as one lin
 output has closed it. Any other failure is a defect of the program and shows a traceback.
 """
 
+from __future__ import annotations
+
 import difflib
 import errno
-import inspect
 import io
 import logging
 import os
@@ -15,24 +16,22 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stderr
-from dataclasses import make_dataclass
-from typing import Annotated, Any, Union
-
-import tyro
+from typing import TYPE_CHECKING, Any
 
 from snowsplat._version import __version__
-from snowsplat.cli.flags import with_flags
-from snowsplat.cli.help_text import join_lines_of_field_docstrings
 from snowsplat.cli.next_steps import next_step
-from snowsplat.cli.page_flags import has_screen
+from snowsplat.cli.pages import has_screen
 from snowsplat.cli.reference_flags import translated
-from snowsplat.cli.reports import run
 from snowsplat.cli.subcommands import SUBCOMMANDS, advice, load_subcommand, overview
 from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError, message_of
+from snowsplat.util.flags import with_flags
 from snowsplat.util.interrupts import ended_by_signals
 from snowsplat.util.messages import as_message, language_of_environment, message, use
 from snowsplat.util.safe_json import printable
+
+if TYPE_CHECKING:
+    from snowsplat.cli.command import Command
 
 # Former names of subcommands, still accepted but not listed.
 _FORMER_NAMES = {"capture": "sfm"}
@@ -68,11 +67,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     try:
         with ended_by_signals():
-            return run(parse(arguments))
+            command = parse(arguments)
+            from snowsplat.cli.command import run
+
+            return run(command)
     except SettingError as error:
-        return _fail(f"`{error.setting}`: {error.problem}", 2)
+        return _fail(_with_flags(f"`{error.setting}`: {error.problem}", arguments), 2)
     except UserError as error:
-        return _fail(error, 2)
+        return _fail(_with_flags(str(error), arguments), 2)
     except KeyboardInterrupt:
         return _fail("stopped", 130)
     except BrokenPipeError:  # the reader of the output has closed it, as `| head` does
@@ -90,8 +92,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"{what}; {remedy}" if remedy else what, 2)
 
 
-def parse(arguments: Sequence[str]) -> Any:
-    """Parse the arguments into the dataclass of their subcommand.
+def parse(arguments: Sequence[str]) -> Command:
+    """The subcommand with the values of its arguments.
 
     Exits the process, as argparse does, after printing a help text.
     Raises: UserError: an unknown subcommand, or invalid or refused flags.
@@ -103,17 +105,18 @@ def parse(arguments: Sequence[str]) -> Any:
     rest, notes = translated(name, rest)
     for note in notes:
         _print_error(note)
-    if name in SUBCOMMANDS and "--config" in (text.partition("=")[0] for text in rest):
-        from snowsplat.cli.config_file import expanded
+    from snowsplat.cli import parser
 
-        rest = expanded(load_subcommand(name), rest)
-    union: Any = Union[tuple(_choices(name))]  # noqa: UP007 (made at run time)
+    # Importing and analysing all of them takes longer than everything else that a help text needs.
+    # Only completion scripts and suggestions for a misplaced flag need the flags of all.
+    commands = {
+        each: load_subcommand(each) if each == name or name.startswith("-") else None
+        for each in SUBCOMMANDS
+    }
     printed = io.StringIO()
     try:
         with redirect_stderr(printed):
-            return tyro.cli(
-                union, prog="snowsplat", args=[name, *rest], config=(tyro.conf.FlagCreatePairsOff,)
-            )
+            given = parser.parse(name, rest, commands)
     except SystemExit as ended:
         if name.startswith("-") or not ended.code:
             sys.stderr.write(printed.getvalue())
@@ -121,24 +124,18 @@ def parse(arguments: Sequence[str]) -> Any:
         from snowsplat.cli.flag_errors import explained
 
         raise UserError(explained(load_subcommand(name), rest, printed.getvalue())) from None
+    command = load_subcommand(name)
+    if "config" in given:
+        from snowsplat.cli.config_file import with_file
+
+        given = with_file(command, given)
+    return command.of(given)
 
 
-def _choices(called: str) -> list[Any]:
-    """What tyro chooses from: the subcommand ``called``, and the others without their flags.
-
-    Importing and analysing all of them takes longer than everything else that a help text needs.
-    Only completion scripts and suggestions for a misplaced flag need the flags of all subcommands.
-    """
-    choices = []
-    for name in SUBCOMMANDS:
-        if name == called or called.startswith("-"):
-            kind = load_subcommand(name)
-            join_lines_of_field_docstrings(kind)
-        else:
-            kind = make_dataclass(name.capitalize(), [])
-        text = inspect.cleandoc(kind.__doc__ or "")
-        choices.append(Annotated[kind, tyro.conf.subcommand(name, description=text)])
-    return choices
+def _with_flags(message: str, arguments: Sequence[str]) -> str:
+    """A message with the flags of the subcommand that was called."""
+    name = _FORMER_NAMES.get(arguments[0], arguments[0])
+    return with_flags(message, load_subcommand(name) if name in SUBCOMMANDS else None)
 
 
 def _unknown_subcommand(name: str) -> str:
@@ -168,7 +165,7 @@ def _locked_folder(error: OSError) -> str | None:
 
 
 def _fail(text: object, code: int) -> int:
-    _print_error(with_flags(str(text)))
+    _print_error(text)
     return code
 
 

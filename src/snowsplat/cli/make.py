@@ -2,49 +2,33 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from snowsplat.cli.flags import Marker, Threads, flag, marker_side, switch, with_flags
+from snowsplat.cli.command import Exit, JsonCommand
+from snowsplat.cli.config_file import config
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver, WatchObserver
-from snowsplat.cli.page_flags import AllowHost, page_at
-from snowsplat.cli.reports import JsonFlag, Reports
+from snowsplat.cli.page_flags import PageAddress
+from snowsplat.pipeline.options import common
+from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.stage_lines import photos_of_last_part
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
-from snowsplat.util.errors import UserError
+from snowsplat.util.flags import command_line, with_flags, words
 from snowsplat.util.messages import message
+from snowsplat.util.settings import argument, group, setting, switch
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.make import MakeResult
     from snowsplat.pipeline.run.live_page import LivePage
 
-# The flags that the command for resuming repeats, in this order.
-_RESUMED_FLAGS = (
-    "output",
-    "quality",
-    "minutes",
-    "hold_out",
-    "title",
-    "exposure",
-    "marker",
-    "threads",
-    "device",
-    "memory",
-    "port",
-    "host",
-)
 
-
-@dataclass
-class Make(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Make(JsonCommand):
     """Make a scene from photos or a video: sfm, train and render in one command.
 
     Examples:
@@ -61,126 +45,76 @@ class Make(Reports):
       repeated only if the photos or the settings change.
     """
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, flag("INPUT [INPUT ...]")] = ()
-    """One or more photos (JPEG, PNG, WebP, TIFF, HEIC), folders of photos, or videos. The camera
-    poses of a dataset are used, if its folder is the only input and they are plausible."""
-    output: Annotated[Path | None, flag("OUT", "-o", default="./INPUT_scene")] = None
-    """Output folder. It is created if it does not exist."""
-    quality: Annotated[
-        Literal["draft", "normal", "best"] | None,
-        flag("{draft,normal,best}", default="normal; with --minutes, chosen for this time"),
-    ] = None
-    """draft: a quick preview; best: takes several times as long as normal. With --minutes, the
-    quality determines only the effort to estimate the camera poses; the training uses the remaining
-    time."""
-    config: Annotated[Path | None, flag("FILE")] = None
-    """A JSON or TOML file with values of these flags. Flags have priority."""
-    minutes: Annotated[float | None, flag("F", default="none")] = None
-    """Finish within this time. If there are too many photos for this time, some of them are used,
-    evenly spread by name. If an earlier run was interrupted, the time of its finished stages is not
-    counted, and its training resumes with the time that remained."""
-    hold_out: Annotated[str | None, flag("{none,N}", default="8")] = None
-    """Hold out every N-th photo until the scene is evaluated. Then the scene is trained on all
-    photos for a moment; the printed PSNR is that of the scene before."""
-    title: Annotated[str | None, flag("TEXT", default="the name of the input")] = None
-    """The name of the scene in its report and on its pages."""
-    exposure: Annotated[
-        Literal["auto", "on", "off"] | None, flag("{auto,on,off}", default="auto")
-    ] = None
-    """Whether to learn a gain for each photo and colour channel, for photos with different
-    exposures or white balances. auto: if the photos differ by at least 0.05 EV."""
-    marker: Marker = None
-    threads: Threads = None
-    device: Annotated[str | None, flag("{cuda,cuda:N,cpu}", default="a GPU if there is one")] = None
-    """Device to train on."""
-    memory: Annotated[str | None, flag("BYTES", default="no limit")] = None
-    """Memory limit of the training, for example 4GB. See snowsplat train --help."""
-    overwrite: Annotated[bool, switch()] = False
-    """Replace the scene in OUT even if it was made from other photos."""
-    view: Annotated[bool, switch()] = False
-    """Show the training in the browser, and afterwards the finished scene until Ctrl-C."""
-    port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
-    """Port of the page. Its URL, which is printed, contains a secret token."""
-    host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network."""
-    allow_host: AllowHost = ()
-    json: JsonFlag = False
+    inputs: tuple[Path, ...] = argument(
+        (),
+        "INPUT [INPUT ...]",
+        "One or more photos (JPEG, PNG, WebP, TIFF, HEIC), folders of photos, or videos. The "
+        "camera poses of a dataset are used, if its folder is the only input and they are "
+        "plausible.",
+    )
+    output: Path | None = setting(
+        None,
+        "Output folder. It is created if it does not exist.",
+        "./INPUT_scene",
+        metavar="OUT",
+        aliases=("-o",),
+    )
+    config: Path | None = config()
+    options: MakeOptions = group(MakeOptions)
+    overwrite: bool = common.overwrite(
+        "Replace the scene in OUT even if it was made from other photos."
+    )
+    view: bool = switch(
+        "Show the training in the browser, and afterwards the finished scene until Ctrl-C."
+    )
+    address: PageAddress = group(PageAddress)
 
-    def run(self) -> int:
-        """Returns the exit code: 0, or 130 after Ctrl-C."""
-        from snowsplat.pipeline.compute import Compute
-        from snowsplat.pipeline.make import MakeOptions, make
+    def run(self) -> Any:
+        """The exit code is 130 after Ctrl-C."""
+        from snowsplat.pipeline.make import make
 
-        options = MakeOptions(
-            quality=self.quality,
-            minutes=self.minutes,
-            memory=self.memory,
-            title=self.title,
-            exposure=self.exposure or "auto",
-            marker=marker_side(self.marker),
-            compute=Compute(self.device, self.threads),
-            **({} if self.hold_out is None else {"hold_out": _hold_out(self.hold_out)}),
-        )
-        page = page_at(self.port, self.host, self.allow_host, self.view)
+        page = self.address.page(self.view)
         with page or nullcontext():
             try:
                 with TerminalObserver() as observer:
                     result = make(
                         self.inputs,
                         self.output,
-                        options,
+                        self.options,
                         overwrite=self.overwrite,
                         observer=observer,
                         page=page,
                     )
             except KeyboardInterrupt as stopped:
                 print(with_flags(str(stopped) or "stopped"))
-                return self._stopped()
-            self.report = {**vars(result), "folder": result.folder.path}
+                again = {k: v for k, v in self.given.items() if k not in ("overwrite", "json")}
+                print(
+                    message(
+                        "resume with: {command_line}",
+                        command_line=command_line("make", words(Make, again)),
+                    )
+                )
+                return Exit(130)
             print_summary(result)
             print("\n" + see_and_share(result.folder.path.parent), flush=True)
             if page is not None:
                 self._show(result, page)
-        return 0
-
-    def _stopped(self) -> int:
-        words = ["snowsplat", "make", *map(str, self.inputs)]
-        for name in _RESUMED_FLAGS:
-            value = getattr(self, name)
-            words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
-        words += ["--view"] if self.view else []
-        print(message("resume with: {words}", words=shlex.join(words)))
-        return 130
+        return {**vars(result), "folder": result.folder.path}
 
     def _show(self, made: MakeResult, page: LivePage) -> None:
         """Show the scene until Ctrl-C, on the page of the training if there was one."""
         from snowsplat.formats import read_gaussians
-        from snowsplat.pipeline.compute import Compute
 
         if page.has_trained:
             with suppress(KeyboardInterrupt):  # Ctrl-C may arrive before the scene is shown
                 gaussians = read_gaussians(made.scene)
                 print(message("the scene is shown at {url} until Ctrl-C", url=page.url), flush=True)
-                page.show_result(gaussians.to(Compute(self.device, self.threads).apply()))
+                page.show_result(gaussians.to(self.options.compute.apply()))
             return
         from snowsplat.pipeline.watch import watch
 
         with WatchObserver() as observer:
-            watch(
-                made.folder.path,
-                page,
-                compute=Compute(self.device, self.threads),
-                observer=observer,
-            )
-
-
-def _hold_out(text: str) -> int | None:
-    """Raises UserError: the text is neither a number from 2 on nor "none"."""
-    if text == "none":
-        return None
-    if not text.isdecimal() or int(text) < 2:
-        raise UserError("--hold-out: {text!r} is not valid; use 2 or more, or none", text=text)
-    return int(text)
+            watch(made.folder.path, page, compute=self.options.compute, observer=observer)
 
 
 def print_summary(made: MakeResult) -> None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Any
 
-from snowsplat.cli.flags import flag, switch
 from snowsplat.cli.next_steps import next_step
-from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.surface_flags import SurfaceFlags
+from snowsplat.cli.surface import SurfaceCommand
+from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.util.settings import group
 
 
-@dataclass
-class Mesh(SurfaceFlags):
+@dataclass(frozen=True, kw_only=True)
+class Mesh(SurfaceCommand):
     """Write the surfaces as triangles with the colours of the photos.
 
     Examples:
@@ -30,21 +30,14 @@ class Mesh(SurfaceFlags):
       --triangles needs a package: pip install 'snowsplat[mesh]'
     """
 
-    triangles: Annotated[int | None, flag("N", default="all")] = None
-    """Simplify the mesh to about this number: 5000 for collisions in a game."""
-    fill_holes: Annotated[bool, switch()] = False
-    """Close holes with flat triangles, as 3D printing needs it."""
+    options: MeshOptions = group(MeshOptions)
 
-    def run(self) -> int:
-        scene, target = self.paths()
-        from snowsplat.pipeline.mesh import MeshOptions, write_mesh
+    def run(self) -> dict[str, Any]:
+        from snowsplat.pipeline.mesh import write_mesh
 
-        options = MeshOptions(self.voxel, self.far, self.parts, self.triangles, self.fill_holes)
-        with TerminalObserver() as observer:
-            surface = write_mesh(
-                lambda: self.load(scene), target, options, self.overwrite, observer
-            )
-        count = len(surface.mesh.faces)
-        self.tell(target, surface, f"{count:,} of {surface.found:,} triangles")
-        print(next_step("for points instead", "points", scene, "-o", target.with_suffix(".ply")))
-        return 0
+        surface = self.written(write_mesh)
+        count = f"{len(surface.mesh.faces):,} of {surface.found:,} triangles"
+        points = self.output.with_suffix(".ply")
+        return self.reported(
+            surface, count, next_step("for points instead", "points", self.scene, "-o", points)
+        )

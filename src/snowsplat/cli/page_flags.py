@@ -1,74 +1,91 @@
-"""A page in the browser: the flags `--view`, `--port`, `--host`, `--allow-host`; addresses."""
+"""The flags of pages in the browser: where they are shown."""
 
 from __future__ import annotations
 
-import getpass
-import os
-import socket
-import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, TypeAlias
-from urllib.parse import urlsplit
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
-import tyro
-
-from snowsplat.cli.flags import flag
+from snowsplat.cli.pages import show, wait
 from snowsplat.util.errors import UserError
+from snowsplat.util.flags import words
+from snowsplat.util.settings import Settings, same, setting, switch
 from snowsplat.viewer.hosts import LOCAL_HOST
 
 if TYPE_CHECKING:
+    from starlette.types import ASGIApp
+
     from snowsplat.pipeline.run.live_page import LivePage
-
-AllowHost: TypeAlias = Annotated[
-    tuple[str, ...],
-    tyro.conf.UseAppendAction,
-    flag("NAME", help="Name of a proxy through which browsers open the page. Can be repeated."),
-]
+    from snowsplat.viewer.http.server import WebServer
 
 
-def page_at(
-    port: int | None, host: str | None, allow_host: tuple[str, ...], view: bool = True
-) -> LivePage | None:
-    """The page at the address of these flags, not yet open; None without ``view``.
-    Raises: UserError: a port or host without a page, or one that cannot be used.
-    """
-    if view:
-        from snowsplat.pipeline.run.live_page import LivePage
+@dataclass(frozen=True)
+class PageAddress(Settings):
+    """The address of a page."""
 
-        return LivePage(port, host, allow_host)
-    for name, given in (("port", port), ("host", host), ("allow-host", allow_host or None)):
-        if given is not None:
+    port: int | None = setting(
+        None,
+        "Port of the page. Its URL, which is printed, contains a secret token.",
+        "8080, or the next free one",
+        metavar="N",
+    )
+    host: str | None = setting(
+        None,
+        "Address to listen on. 0.0.0.0 accepts connections from the network.",
+        "127.0.0.1, this computer only",
+        metavar="H",
+    )
+    allow_host: tuple[str, ...] = setting(
+        (),
+        "Name of a proxy through which browsers open the page. Can be repeated.",
+        repeated=True,
+        metavar="NAME",
+    )
+
+    def page(self, view: bool = True) -> LivePage | None:
+        """The page at this address, not yet open; None without ``view``.
+
+        Raises: UserError: a port or host without a page, or one that cannot be used.
+        """
+        if view:
+            from snowsplat.pipeline.run.live_page import LivePage
+
+            return LivePage(self.port, self.host, self.allow_host)
+        if given := words(PageAddress, asdict(self)):
             raise UserError(
-                "--{name} sets the address of a page; add --view to open one", name=name
+                "{given} sets the address of a page; add --view to open one", given=given[0]
             )
-    return None
+        return None
 
 
-def for_other_computers(url: str, others: Sequence[str]) -> list[str]:
-    """Lines that say how other computers open a page: at its other addresses or, if it is only for
-    this computer and this shell is a remote one, through a forwarded port."""
-    here = urlsplit(url)
-    if here.hostname == LOCAL_HOST and not others and over_ssh():
-        return [f"from your computer: {_forwarding(here.port)}"]
-    return [f"from other computers: {other}" for other in others]
+@dataclass(frozen=True)
+class PageServer(Settings):
+    """Where a finished scene or the studio is shown."""
 
+    host: str = setting(
+        LOCAL_HOST,
+        "Address to listen on. 0.0.0.0 accepts connections from the network.",
+        "127.0.0.1, this computer only",
+        metavar="ADDRESS",
+    )
+    port: int = setting(0, "Port to listen on.", "a free one", metavar="N")
+    allow_host: tuple[str, ...] = same(PageAddress, "allow_host", ())
+    no_browser: bool = switch("Print the URL, but do not open a browser.")
 
-def over_ssh() -> bool:
-    """Whether this shell is a remote one."""
-    return any(name in os.environ for name in ("SSH_CONNECTION", "SSH_TTY"))
+    def open(
+        self, app: ASGIApp, headers: Mapping[str, str], port: int | None = None, token: str = ""
+    ) -> WebServer:
+        """The server, not yet started, at this port or another one.
 
+        Raises: UserError: the address cannot be used.
+        """
+        from snowsplat.viewer.http.server import WebServer
 
-def has_screen() -> bool:
-    """Whether a browser opened here has a screen; otherwise a text browser would take the shell."""
-    if sys.platform in ("win32", "darwin"):
-        return not over_ssh()
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+        where = self.host, self.port if port is None else port, self.allow_host
+        return WebServer(app, *where, headers, token or None)
 
-
-def _forwarding(port: int | None) -> str:
-    """The command that forwards a port of this machine to the computer of the user."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # in containers, a user may have a number only
-        user = "USER"
-    return f"ssh -L {port}:{LOCAL_HOST}:{port} {user}@{socket.gethostname()}"
+    def serve(self, server: WebServer) -> None:
+        """Show a page, see `show`, and wait for Ctrl-C."""
+        url, others = server.url, server.others
+        show("open this in a browser, Ctrl-C ends it", url, others, not self.no_browser)
+        wait()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from snowsplat.cli.next_steps import next_step
-from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.surface_flags import SurfaceFlags
+from snowsplat.cli.surface import SurfaceCommand
+from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.util.settings import group
 
 
-@dataclass
-class Points(SurfaceFlags):
+@dataclass(frozen=True, kw_only=True)
+class Points(SurfaceCommand):
     """Write a dense cloud of points on the surfaces, with normals.
 
     Examples:
@@ -24,15 +26,14 @@ class Points(SurfaceFlags):
       pip install 'snowsplat[mesh]'
     """
 
-    def run(self) -> int:
-        scene, target = self.paths()
-        from snowsplat.pipeline.mesh import MeshOptions, write_points
+    options: MeshOptions = group(MeshOptions, only=("voxel", "far", "parts"))
 
-        options = MeshOptions(self.voxel, self.far, self.parts)
-        with TerminalObserver() as observer:
-            surface = write_points(
-                lambda: self.load(scene), target, options, self.overwrite, observer
-            )
-        self.tell(target, surface, f"{len(surface.mesh.vertices):,} points")
-        print(next_step("for triangles instead", "mesh", scene, "-o", target.with_suffix(".glb")))
-        return 0
+    def run(self) -> dict[str, Any]:
+        from snowsplat.pipeline.mesh import write_points
+
+        surface = self.written(write_points)
+        count = f"{len(surface.mesh.vertices):,} points"
+        mesh = self.output.with_suffix(".glb")
+        return self.reported(
+            surface, count, next_step("for triangles instead", "mesh", self.scene, "-o", mesh)
+        )

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import tyro
-
-from snowsplat.cli.flags import Threads, flag, switch
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.reports import JsonFlag, Reports
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.options import common
+from snowsplat.pipeline.options.publish import PublishOptions
 from snowsplat.util.byte_size import format_bytes
-from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
+from snowsplat.util.settings import group, needed
 
 
-@dataclass
-class Publish(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Publish(JsonCommand):
     """Write a static web site that shows a scene.
 
     Examples:
@@ -35,41 +35,36 @@ class Publish(Reports):
       and AR.
     """
 
-    scene: Annotated[Path | None, tyro.conf.Positional, flag("FILE|OUT")] = None
-    """A scene file of any format, or the output folder of train or make."""
-    output: Annotated[Path | None, flag("FOLDER", "-o")] = None
-    """A new or an empty folder for the web site."""
-    title: Annotated[str | None, flag("TEXT", default="the name of the scene")] = None
-    """The name of the scene on the page."""
-    licence: Annotated[str, flag("TEXT", default="not stated")] = ""
-    """The licence of the scene."""
-    url: Annotated[str, flag("URL", default="not known")] = ""
-    """The address of the folder on the web, for the picture in previews of links."""
-    overwrite: Annotated[bool, switch()] = False
-    """Replace a web site in FOLDER."""
-    iteration: Annotated[int | None, flag("N", default="the last step")] = None
-    """If OUT contains several scenes, the step after which the scene was saved."""
-    threads: Threads = None
-    json: JsonFlag = False
+    scene: Path = needed(
+        "publish needs a scene; use a file or the output folder of a training",
+        "FILE|OUT",
+        "A scene file of any format, or the output folder of train or make.",
+        argument=True,
+    )
+    output: Path = needed(
+        "publish needs a folder; add -o FOLDER",
+        "FOLDER",
+        "A new or an empty folder for the web site.",
+        "-o",
+    )
+    options: PublishOptions = group(PublishOptions)
+    overwrite: bool = common.overwrite("Replace a web site in FOLDER.")
+    iteration: int | None = common.iteration()
+    compute: Compute = group(Compute, only=("threads",))
 
-    def run(self) -> int:
-        if self.scene is None:
-            raise UserError("publish needs a scene; use a file or the output folder of a training")
-        if self.output is None:
-            raise UserError("publish needs a folder; add -o FOLDER")
-        from snowsplat.pipeline.publish import PublishOptions, publish
+    def run(self) -> Any:
+        from snowsplat.pipeline.publish import publish
 
         with TerminalObserver() as observer:
             result = publish(
                 self.scene,
                 self.output,
-                PublishOptions(self.title, self.licence, self.url),
+                self.options,
                 iteration=self.iteration,
                 overwrite=self.overwrite,
-                threads=self.threads,
+                threads=self.compute.threads,
                 observer=observer,
             )
-        self.report = result
         print(
             message(
                 "{folder}: {gaussians:,} Gaussians, {bytes}",
@@ -85,4 +80,4 @@ class Publish(Reports):
                 look=look,
             )
         )
-        return 0
+        return result

@@ -5,15 +5,14 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from snowsplat.cli.flags import flag, switch
-from snowsplat.cli.page_flags import AllowHost
-from snowsplat.cli.view import serve, show
+from snowsplat.cli.command import Command
+from snowsplat.cli.page_flags import PageServer
+from snowsplat.cli.pages import show
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
+from snowsplat.util.settings import argument, group
 from snowsplat.viewer.hosts import ANY_HOST, LOCAL_HOST, KnownHosts, is_loopback
 
 if TYPE_CHECKING:
@@ -24,8 +23,8 @@ if TYPE_CHECKING:
     from snowsplat.viewer.http.server import WebServer
 
 
-@dataclass
-class Studio:
+@dataclass(frozen=True, kw_only=True)
+class Studio(Command):
     """Make a scene from photos or a video, in the browser.
 
     Examples:
@@ -41,20 +40,16 @@ class Studio:
       the folder already, its page is opened.
     """
 
-    folder: Annotated[
-        Path | None, tyro.conf.Positional, flag("FOLDER", default="~/snowsplat_scenes")
-    ] = None
-    """The folder of the scenes. It is created if it does not exist."""
-    host: Annotated[str, flag("ADDRESS", default="127.0.0.1, this computer only")] = "127.0.0.1"
-    """Address to listen on. 0.0.0.0 accepts connections from the network."""
-    port: Annotated[int, flag("N", default="a free one")] = 0
-    """Port to listen on."""
-    allow_host: AllowHost = ()
-    no_browser: Annotated[bool, switch()] = False
-    """Print the URL, but do not open a browser."""
+    folder: Path | None = argument(
+        None,
+        "FOLDER",
+        "The folder of the scenes. It is created if it does not exist.",
+        flag="~/snowsplat_scenes",
+    )
+    server: PageServer = group(PageServer)
 
-    def run(self) -> int:
-        """Returns the exit code: 0, also after Ctrl-C, the usual end."""
+    def run(self) -> None:
+        """Runs until Ctrl-C, the usual end."""
         from snowsplat.studio.library import Library, default_folder
         from snowsplat.studio.one_studio import Running, only_studio
 
@@ -64,7 +59,6 @@ class Studio:
                 self._serve(library, killed)
         except Running as running:
             self._open(library, running.address)
-        return 0
 
     def _serve(self, library: Library, killed: Address | None) -> None:
         from snowsplat.studio.app import own_address, studio_app
@@ -74,35 +68,36 @@ class Studio:
 
         def addresses() -> list[str]:
             (server,) = servers
-            here = own_address() if self.host in ANY_HOST else self.host
+            here = own_address() if self.server.host in ANY_HOST else self.server.host
             open_here = here is not None and not is_loopback(here)
             return ([server.url_at(str(here))] if open_here else []) + server.others
 
-        with self._server(studio_app(library, addresses), killed) as server:
+        with self._opened(studio_app(library, addresses), killed) as server:
             servers.append(server)
             with suppress(OSError):  # a full disk: then a second studio is refused
-                address = Address(server.url, self.host, server.port, server.token, server.others)
+                address = Address(
+                    server.url, self.server.host, server.port, server.token, server.others
+                )
                 write_address(library.folder, address)
             print(message("scenes are kept in {folder}", folder=library.folder))
-            serve(server, browser=not self.no_browser)
+            self.server.serve(server)
 
-    def _server(self, app: ASGIApp, killed: Address | None) -> WebServer:
+    def _opened(self, app: ASGIApp, killed: Address | None) -> WebServer:
         """At the address of a studio that was killed, if possible: its pages go on."""
         from snowsplat.studio.app import POLICY
-        from snowsplat.viewer.http.server import WebServer
 
-        policy = {"Content-Security-Policy": POLICY}
-        if killed is not None and killed.host == self.host and self.port in (0, killed.port):
+        policy, where = {"Content-Security-Policy": POLICY}, self.server
+        if killed is not None and killed.host == where.host and where.port in (0, killed.port):
             with suppress(UserError):  # another program has the port now
-                return WebServer(app, self.host, killed.port, self.allow_host, policy, killed.token)
-        return WebServer(app, self.host, self.port, self.allow_host, policy)
+                return where.open(app, policy, killed.port, killed.token)
+        return where.open(app, policy)
 
     def _open(self, library: Library, address: Address) -> None:
         """Raises: UserError: it has other settings than were asked for."""
-        other_host = self.host not in (LOCAL_HOST, address.host)
-        names = KnownHosts(self.host, self.allow_host).allowed
+        other_host = self.server.host not in (LOCAL_HOST, address.host)
+        names = KnownHosts(self.server.host, self.server.allow_host).allowed
         known = all(f"https://{name}/{address.token}/" in address.others for name in names)
-        if other_host or not known or self.port not in (0, address.port):
+        if other_host or not known or self.server.port not in (0, address.port):
             raise UserError(
                 "{folder}: is open in another studio, with host {host} and port {port}; end that "
                 "one with Ctrl-C first, or omit the flags",
@@ -111,4 +106,9 @@ class Studio:
                 port=address.port,
             )
         print(message("scenes are kept in {folder}", folder=library.folder))
-        show("a studio has them open already", address.url, address.others, not self.no_browser)
+        show(
+            "a studio has them open already",
+            address.url,
+            address.others,
+            not self.server.no_browser,
+        )

@@ -2,23 +2,103 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from snowsplat.cli.command import Command
 
 
 @dataclass(frozen=True)
 class Subcommand:
-    """Where a subcommand is, and what the overview of all subcommands tells about it."""
+    """What the overview of all subcommands tells about one, and where it is."""
 
     usage: str  # its arguments in an example
     result: str  # what this example does
-    module: str  # defines its dataclass; ``Train`` for the subcommand ``train``
+    load: Callable[[], type[Command]]  # imports its module
+
+
+def _load(name: str) -> type[Command]:
+    match name:
+        case "studio":
+            from snowsplat.cli.studio import Studio
+
+            return Studio
+        case "demo":
+            from snowsplat.cli.demo import Demo
+
+            return Demo
+        case "make":
+            from snowsplat.cli.make import Make
+
+            return Make
+        case "sfm":
+            from snowsplat.cli.sfm import Sfm
+
+            return Sfm
+        case "train":
+            from snowsplat.cli.train import Train
+
+            return Train
+        case "evaluate":
+            from snowsplat.cli.evaluate import Evaluate
+
+            return Evaluate
+        case "render":
+            from snowsplat.cli.render import Render
+
+            return Render
+        case "view":
+            from snowsplat.cli.view import View
+
+            return View
+        case "watch":
+            from snowsplat.cli.watch import Watch
+
+            return Watch
+        case "convert":
+            from snowsplat.cli.convert import Convert
+
+            return Convert
+        case "clean":
+            from snowsplat.cli.clean import Clean
+
+            return Clean
+        case "mesh":
+            from snowsplat.cli.mesh import Mesh
+
+            return Mesh
+        case "points":
+            from snowsplat.cli.points import Points
+
+            return Points
+        case "publish":
+            from snowsplat.cli.publish import Publish
+
+            return Publish
+        case "benchmark":
+            from snowsplat.cli.benchmark import Benchmark
+
+            return Benchmark
+        case "blocks":
+            from snowsplat.cli.blocks import Blocks
+
+            return Blocks
+        case "info":
+            from snowsplat.cli.info import Info
+
+            return Info
+        case "doctor":
+            from snowsplat.cli.doctor import Doctor
+
+            return Doctor
+    raise KeyError(name)
 
 
 SUBCOMMANDS = {
-    name: Subcommand(usage, result, f"snowsplat.cli.{name}")
+    name: Subcommand(usage, result, partial(_load, name))
     for name, usage, result in (
         ("studio", "[FOLDER]", "all of this in the browser"),
         ("demo", "", "try it, without own photos"),
@@ -42,14 +122,9 @@ SUBCOMMANDS = {
 }
 
 
-def register(name: str, subcommand: Subcommand) -> None:
-    """Add a subcommand, or replace one."""
-    SUBCOMMANDS[name] = subcommand
-
-
-def load_subcommand(name: str) -> Any:
-    """Import the dataclass of a subcommand."""
-    return getattr(import_module(SUBCOMMANDS[name].module), name.capitalize())
+def load_subcommand(name: str) -> type[Command]:
+    """Import a subcommand."""
+    return SUBCOMMANDS[name].load()
 
 
 # What to use for words that people try.
@@ -92,8 +167,3 @@ def overview() -> str:
 _OVERVIEW = """3D Gaussian Splatting on any computer: makes a 3D scene from photos or a video.
 {subcommands}
 A dataset: photos with their camera poses. Help for each: snowsplat NAME --help"""
-
-
-# The experiments register themselves. Everything else works without that folder.
-if find_spec("snowsplat.extras"):
-    import_module("snowsplat.extras")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from snowsplat.cli.flags import flag
+from snowsplat.cli.command import Command
 from snowsplat.cli.observer import WatchObserver
-from snowsplat.cli.page_flags import AllowHost, page_at
-from snowsplat.cli.scene_flags import SceneFlags
+from snowsplat.cli.page_flags import PageAddress
+from snowsplat.cli.scene_choice import SceneChoice
+from snowsplat.util.settings import group
 
 
-@dataclass
-class Watch(SceneFlags):
+@dataclass(frozen=True, kw_only=True)
+class Watch(Command):
     """Show an ongoing or finished training run in the browser, with its photos.
 
     Examples:
@@ -27,27 +27,23 @@ class Watch(SceneFlags):
       snowsplat train). Ctrl-C closes the page.
     """
 
-    port: Annotated[int | None, flag("N", default="8080, or the next free one")] = None
-    """Port of the page. Its URL, which is printed, contains a secret token."""
-    host: Annotated[str | None, flag("H", default="127.0.0.1, this computer only")] = None
-    """Address to listen on. 0.0.0.0 accepts connections from the network."""
-    allow_host: AllowHost = ()
+    scene: SceneChoice = group(SceneChoice)
+    address: PageAddress = group(PageAddress)
 
-    def run(self) -> int:
-        """Runs until Ctrl-C; returns the exit code, 0."""
-        path = self.output_path()
+    def run(self) -> None:
+        """Runs until Ctrl-C."""
+        path = self.scene.path()
         from snowsplat.pipeline.watch import watch
 
-        page = page_at(self.port, self.host, self.allow_host)
+        page = self.address.page()
         assert page is not None
         with WatchObserver() as observer, page:
             watch(
                 path,
                 page,
-                iteration=self.iteration,
-                dataset=self.dataset,
-                resolution=self.resolution,
-                compute=self.compute(),
+                iteration=self.scene.iteration,
+                dataset=self.scene.dataset,
+                resolution=self.scene.resolution,
+                compute=self.scene.compute,
                 observer=observer,
             )
-        return 0

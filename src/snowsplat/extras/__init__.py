@@ -1,14 +1,41 @@
 """Experiments on top of the system: a photo with depth, a photo as 2D Gaussians, a snow globe.
 
-Each of them is a folder, with its subcommand in ``command.py``. Nothing below imports them: the
-import of this package registers their subcommands.
+Each of them is a folder, with its subcommand in ``command.py``. Nothing below imports them:
+`snowsplat.__main__` adds their subcommands to those of the command line.
 """
 
-from snowsplat.cli.subcommands import Subcommand, register
+from __future__ import annotations
 
-for _name, _usage, _result in (
-    ("lift", "PHOTO --depth MAP -o OUT", "one photo and its depth -> a scene"),
-    ("image", "PHOTO -o OUT", "a photo as 1000 Gaussians"),
-    ("globe", "SCENE", "a snow globe, as a web page"),
-):
-    register(_name, Subcommand(_usage, _result, f"snowsplat.extras.{_name}.command"))
+from typing import TYPE_CHECKING
+
+from snowsplat.cli.subcommands import SUBCOMMANDS, Subcommand
+
+if TYPE_CHECKING:
+    from snowsplat.cli.command import Command
+
+
+def register() -> None:
+    """Add the subcommands of the experiments."""
+    SUBCOMMANDS["lift"] = Subcommand(
+        "PHOTO --depth MAP -o OUT", "one photo and its depth -> a scene", _lift
+    )
+    SUBCOMMANDS["image"] = Subcommand("PHOTO -o OUT", "a photo as 1000 Gaussians", _image)
+    SUBCOMMANDS["globe"] = Subcommand("SCENE", "a snow globe, as a web page", _globe)
+
+
+def _lift() -> type[Command]:
+    from snowsplat.extras.lift.command import Lift
+
+    return Lift
+
+
+def _image() -> type[Command]:
+    from snowsplat.extras.image.command import Image
+
+    return Image
+
+
+def _globe() -> type[Command]:
+    from snowsplat.extras.globe.command import Globe
+
+    return Globe

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from snowsplat.pipeline.run import processes
-from snowsplat.util.settings import Settings, setting
+from snowsplat.util.settings import Settings, setting, switch
 
 if TYPE_CHECKING:
     import torch
@@ -29,10 +29,9 @@ class Compute(Settings):
 
     Attributes:
         device: "cpu", "cuda" or "cuda:1"; None: a GPU if a usable one is present.
-        threads: number of CPU threads; None: all cores, divided between the processes that train
-            together on this computer. Results do not depend on this number.
-        deterministic: on a GPU, compute sums in a fixed order. Results are then bit-identical in
-            every run, but the computation needs more time and memory. On a CPU, results are always
+        threads: None: all cores, divided between the processes that train together on this
+            computer.
+        deterministic: the sums on a GPU have a fixed order. On a CPU, results are always
             bit-identical.
 
     Raises:
@@ -41,12 +40,23 @@ class Compute(Settings):
 
     device: str | None = setting(
         None,
-        "Device for the computation.",
+        "Device to compute on.",
+        "a GPU if there is one",
+        metavar="{cuda,cuda:N,cpu}",
         allowed="cpu, cuda or cuda:1",
         check=lambda device: None if _DEVICE.fullmatch(device) else "is unknown",
     )
-    threads: int | None = setting(None, "Number of CPU threads.", least=1)
-    deterministic: bool = False
+    threads: int | None = setting(
+        None,
+        "Number of CPU threads. The result does not depend on this number.",
+        "all cores",
+        least=1,
+        metavar="N",
+    )
+    deterministic: bool = switch(
+        "On a GPU, make the results of repeated runs bit-identical. This needs more time and "
+        "memory."
+    )
 
     def apply(self) -> torch.device:
         """Apply these settings to the process; returns the device.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from snowsplat.formats import Format
 from snowsplat.formats.lod import LEVELS
 from snowsplat.formats.origin_file import origin_file
 from snowsplat.formats.spz import WRITTEN_VERSIONS
-from snowsplat.pipeline.decimate import Decimation, file_size, gaussians_to_keep, write_within
+from snowsplat.pipeline.decimate import Decimation, write_within
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.convert import Edits, file_size, gaussians_to_keep
 from snowsplat.pipeline.output.levels import write_levels
 from snowsplat.pipeline.output.scene_files import (
     format_for_writing,
@@ -37,85 +38,6 @@ from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, made_on
 
 logger = logging.getLogger(__name__)
-
-Vector = tuple[float, float, float]
-Box = tuple[float, float, float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Edits:
-    """Changes to a scene. The frame is that of a PLY: x right, y down, z forward.
-
-    Attributes:
-        crop: keep the Gaussians whose centres are in this box, given as x, y, z of the lower corner
-            and x, y, z of the upper corner.
-        rotate: angles in degrees of the rotations about x, then about y, then about z.
-        scale: scale by this factor about the origin.
-        translate: translate by this offset.
-        sh_degree: reduce the spherical harmonics to this degree, 0 to 3.
-        decimate: the number of Gaussians, a percentage such as "50%", or the size of the file such
-            as "10MB", see `Decimation`.
-
-    Raises:
-        UserError: a value out of its range.
-    """
-
-    crop: Box | None = None
-    rotate: Vector = (0.0, 0.0, 0.0)
-    scale: float = 1.0
-    translate: Vector = (0.0, 0.0, 0.0)
-    sh_degree: int | None = None
-    decimate: int | str | None = None
-
-    def __post_init__(self) -> None:
-        if self.sh_degree is not None and not 0 <= self.sh_degree <= 3:
-            raise SettingError(
-                "sh_degree", "{sh_degree} is out of range; use 0 to 3", sh_degree=self.sh_degree
-            )
-        if not all(map(math.isfinite, (*self.rotate, *self.translate, *(self.crop or ())))):
-            raise UserError("`rotate`, `translate` and `crop` need finite numbers")
-        if not 0 < self.scale < math.inf:
-            raise SettingError(
-                "scale", "{scale} is not a factor; use a number above 0", scale=self.scale
-            )
-        if self.crop and any(
-            low > high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
-        ):
-            raise SettingError("crop", "the corners are swapped; give the lower corner first")
-        if self.decimate is not None and file_size(self.decimate) is None:
-            gaussians_to_keep(self.decimate, 0)
-
-    def reduced(self, scene: Gaussians) -> Gaussians:
-        """The part of the scene in the box, with the SH degree; ``scene`` is unchanged.
-
-        Raises:
-            UserError: no Gaussian is in the box.
-        """
-        if self.crop:
-            before = len(scene)
-            scene = edit.crop(scene, torch.tensor(self.crop).reshape(2, 3))
-            if before and not len(scene):
-                raise SettingError("crop", "no Gaussian is in this box; see snowsplat info")
-        if self.sh_degree is not None:
-            scene = edit.with_sh_degree(scene, self.sh_degree)
-        return scene
-
-    def placed(self, scene: Gaussians) -> Gaussians:
-        """The rotated, scaled and translated scene, in float64; ``scene`` is unchanged."""
-        transform = self.transform()
-        return edit.transform_world(scene, transform) if transform else scene
-
-    def transform(self) -> Similarity | None:
-        """Rotation, scale and translation of these edits as one transform; None: no change."""
-        if not any(self.rotate) and self.scale == 1 and not any(self.translate):
-            return None
-        rotation = torch.eye(3, dtype=torch.float64)
-        for axis, degrees in enumerate(self.rotate):
-            half = math.radians(degrees) / 2
-            quat = torch.zeros(4, dtype=torch.float64)
-            quat[0], quat[1 + axis] = math.cos(half), math.sin(half)
-            rotation = rotation_from_quat(quat) @ rotation
-        return Similarity(self.scale, rotation, torch.tensor(self.translate, dtype=torch.float64))
 
 
 def convert(
@@ -204,7 +126,7 @@ def convert(
             "first one",
             target,
         )
-    scene = edits.reduced(edit.merge(parts))
+    scene = _reduced(edits, edit.merge(parts))
     if metres:
         observer.note(compared(metres, scene.metres_per_unit))
         scene = replace(scene, metres_per_unit=metres)
@@ -213,7 +135,7 @@ def convert(
         write = partial(write_gaussians, version=spz_version)
     if georeferenced and format.name == "PLY":  # glTF files always have the place in the world
         write = partial(write_gaussians, georeferenced=True)
-    if format.name == "HTML" and len(files) == 1 and edits.transform() is None:
+    if format.name == "HTML" and len(files) == 1 and transform_of(edits) is None:
         write = partial(_write_page, project=projects[0])
     if format.name == LEVELS:
         write = partial(write_levels, observer=observer)
@@ -224,7 +146,7 @@ def convert(
     def write_placed(path: Path, gaussians: Gaussians) -> None:
         # The scene is moved last: cameras and photos show it in its place.
         with observer.waiting("writing"):
-            written[:] = [edits.placed(gaussians)]
+            written[:] = [_moved(edits, gaussians)]
             write(path, *written)
 
     if size is not None:
@@ -287,3 +209,38 @@ def _write_page(target: Path, scene: Gaussians, project: Project) -> None:
     shown, about = viewable(project, scene), Description(target.stem)
     about = replace(about, made=made_on(project.scene_file()))
     write_html(target, shown.ready(), about)
+
+
+def _reduced(edits: Edits, scene: Gaussians) -> Gaussians:
+    """The part of the scene in the box, with the SH degree; ``scene`` is unchanged.
+
+    Raises:
+        UserError: no Gaussian is in the box.
+    """
+    if edits.crop:
+        before = len(scene)
+        scene = edit.crop(scene, torch.tensor(edits.crop).reshape(2, 3))
+        if before and not len(scene):
+            raise SettingError("crop", "no Gaussian is in this box; see snowsplat info")
+    if edits.sh_degree is not None:
+        scene = edit.with_sh_degree(scene, edits.sh_degree)
+    return scene
+
+
+def _moved(edits: Edits, scene: Gaussians) -> Gaussians:
+    """The rotated, scaled and translated scene, in float64; ``scene`` is unchanged."""
+    transform = transform_of(edits)
+    return edit.transform_world(scene, transform) if transform else scene
+
+
+def transform_of(edits: Edits) -> Similarity | None:
+    """Rotation, scale and translation of edits as one transform; None: no change."""
+    if not any(edits.rotate) and edits.scale == 1 and not any(edits.translate):
+        return None
+    rotation = torch.eye(3, dtype=torch.float64)
+    for axis, degrees in enumerate(edits.rotate):
+        half = math.radians(degrees) / 2
+        quat = torch.zeros(4, dtype=torch.float64)
+        quat[0], quat[1 + axis] = math.cos(half), math.sin(half)
+        rotation = rotation_from_quat(quat) @ rotation
+    return Similarity(edits.scale, rotation, torch.tensor(edits.translate, dtype=torch.float64))

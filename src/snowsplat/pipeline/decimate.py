@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,33 +21,8 @@ from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import SettingError
 from snowsplat.util.files import atomic_path
 
-_UNITS = {"kb": 1000, "mb": 1000**2, "gb": 1000**3}
-# Steps of the distillation. See docs/what-was-tried.md.
+# Steps of the distillation. See docs/measurements/2026-11-25-fewer-gaussians.md.
 _STEPS = 60
-
-
-def gaussians_to_keep(decimate: int | str, count: int) -> int:
-    """How many of ``count`` Gaussians a number (5000, "5000") or a percentage ("50%") keeps.
-
-    Raises: SettingError: ``decimate`` is neither.
-    """
-    text = str(decimate)
-    if re.fullmatch(r"\d+", text):
-        return int(text)
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)%", text)
-    if not match or float(match[1]) > 100:
-        raise SettingError(
-            "decimate",
-            "{text!r} is not valid; use a number, 0% to 100%, or a size such as 10MB",
-            text=text,
-        )
-    return round(count * float(match[1]) / 100)
-
-
-def file_size(decimate: int | str | None) -> int | None:
-    """The bytes that a size such as "10MB", "0.5 GB" or "800KB" stands for; None: not a size."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kmg]b)", str(decimate).lower())
-    return round(float(match[1]) * _UNITS[match[2]]) if match else None
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from pathlib import Path
 from torch import Tensor
 
 from snowsplat.data.colmap import posed_camera, read_model
-from snowsplat.pipeline.make import MakeOptions, MakeResult, make
+from snowsplat.pipeline.make import MakeResult, make
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.synthetic import Truth, write_synthetic_photos
 from snowsplat.synthetic.compare_poses import PoseErrors, compare_poses
 from snowsplat.util.errors import UserError

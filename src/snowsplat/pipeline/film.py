@@ -12,8 +12,9 @@ from torch import Tensor
 from snowsplat import trajectory
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.pipeline.output.scene_source import change_of, load_viewable
-from snowsplat.pipeline.videos import VideoOptions, render_video
+from snowsplat.pipeline.videos import render_video
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
 from snowsplat.scene.camera import Camera

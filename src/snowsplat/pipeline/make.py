@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +19,18 @@ from snowsplat import ops
 from snowsplat.data import Dataset
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.all_photos import SHARE, train_on_all
-from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_files import write_gaussians
 from snowsplat.pipeline.output.scene_source import load_trained
-from snowsplat.pipeline.quality import PRESETS, Preset, Quality
+from snowsplat.pipeline.quality import PRESETS, Preset
 from snowsplat.pipeline.render import render_images
-from snowsplat.pipeline.run import option
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import stamps_of
-from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train import resume, train
 from snowsplat.project.dataset_folder import REPORT
 from snowsplat.project.project import MAKE_RECORD as RECORD
 from snowsplat.project.training_folder import (
@@ -39,22 +39,19 @@ from snowsplat.project.training_folder import (
     DatasetSettings,
     TrainingFolder,
 )
-from snowsplat.sfm.colmap import SfmOptions
 from snowsplat.sfm.cost import measure_speed
-from snowsplat.sfm.ingest.inputs import GatherOptions
 from snowsplat.sfm.ingest.search.sources import find_sources
-from snowsplat.sfm.make_dataset import DatasetOptions, make_dataset
+from snowsplat.sfm.make_dataset import make_dataset
+from snowsplat.sfm.options import DatasetOptions, GatherOptions, SfmOptions
 from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
-from snowsplat.training.settings.config import AutoOnOff, TrainConfig
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, one_run
-from snowsplat.util.settings import Settings, same, setting
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("scene", "pictures", "all")  # `make_dataset` records its own stages
@@ -71,42 +68,6 @@ _MIN_SECONDS = 15.0
 _MIN_SHARE = 0.15
 # Approximate time to render one held-out view, in seconds.
 _RENDER_SECONDS = 0.3
-
-
-@dataclass(frozen=True)
-class MakeOptions(Settings):
-    """Options of `make`.
-
-    Attributes:
-        quality: default: "normal" or, with ``minutes``, chosen for that time. With ``minutes``, the
-            quality determines only the effort to estimate the camera poses; the training uses the
-            rest of the time.
-        minutes: finish within this time; see `make_plan` for the number of photos that are used.
-            Stages that an earlier run has finished are not counted. A resumed training run has the
-            time that was left at its interruption.
-        memory: memory limit of the training; see `TrainOptions`.
-        hold_out: hold out every N-th photo until the scene is evaluated; None: none.
-        title: the name of the scene in reports and on pages; None: the name of its photos.
-        exposure: whether to learn a gain for each photo and channel; see ``TrainConfig.exposure``.
-        marker: the side of the printed markers in the photos, in metres; None: there are none.
-        compute: device and threads.
-
-    Raises:
-        SettingError: a value is invalid.
-    """
-
-    quality: Quality | None = None
-    minutes: float | None = option.minutes()
-    memory: int | str | None = option.memory()
-    hold_out: int | None = setting(
-        8, "Hold out every N-th photo.", least=2, allowed="2 or more, or none"
-    )
-    title: str | None = None
-    exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
-    marker: float | None = setting(
-        None, "Side of the printed markers in metres.", above=0.0, allowed="a number above 0"
-    )
-    compute: Compute = field(default_factory=Compute)
 
 
 @dataclass(frozen=True)

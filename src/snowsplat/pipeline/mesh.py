@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from itertools import compress
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from snowsplat.data import ImageLoader, View
 from snowsplat.formats import mesh_files
 from snowsplat.pipeline.confirmed_depth import PHOTO_BYTES, confirm_by_photos
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.surface import MeshOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.mesh import Mesh, compacted, filled_holes, largest_parts, vertex_normals
@@ -39,54 +39,12 @@ _VOXEL_PIXELS = 2.0
 _SMALLEST_VOXEL = 0.2
 #: Surfaces that are farther away than this multiple of the usual depth are cut.
 _REACH = 3.0
-#: Parts of a mesh with a smaller share of the triangles of the largest part are removed.
-_SMALLEST_PART = 0.01
 #: A photo shows a vertex if its depth differs by less than this number of voxels.
 _SAME_PLACE = 2.0
 _TRANSPARENT = 16  # of 255: a pixel of a photo with less alpha shows nothing
 _OPAQUE = (".jpg", ".jpeg")  # other photos can have transparent pixels
 _SAMPLE_VIEWS = 32  # that determine the usual depth
 _SAMPLE_STEP = 3  # of the pixels that determine it
-
-
-@dataclass(frozen=True)
-class MeshOptions:
-    """How surfaces become triangles.
-
-    Attributes:
-        voxel: side of a voxel in world units; default: 2 widths of a pixel, or more if the
-            voxels would not fit into memory.
-        far: surfaces whose depth is larger in a photo are not used, world units; default: three
-            times the median depth.
-        parts: connected parts with a smaller share of the triangles of the largest part are
-            removed.
-        triangles: at most about so many remain; default: all.
-        fill_holes: close holes with flat triangles.
-    """
-
-    voxel: float | None = None
-    far: float | None = None
-    parts: float = _SMALLEST_PART
-    triangles: int | None = None
-    fill_holes: bool = False
-
-    def __post_init__(self) -> None:
-        for name, least in (("voxel", 0.0), ("far", 0.0)):
-            value = getattr(self, name)
-            if value is not None and not least < value < math.inf:
-                raise UserError(
-                    "`{name}` must be a positive number, not {value:g}", name=name, value=value
-                )
-        if not 0.0 <= self.parts <= 1.0:
-            raise UserError("`parts` must be between 0 and 1, not {parts:g}", parts=self.parts)
-        if self.triangles is not None and self.triangles < 4:
-            raise UserError(
-                "`triangles` must be at least 4, not {triangles}", triangles=self.triangles
-            )
-        if self.triangles is not None and find_spec("fast_simplification") is None:
-            raise UserError(
-                "`triangles` needs the package fast-simplification: pip install 'snowsplat[mesh]'"
-            )
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,45 +9,19 @@ from pathlib import Path
 from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.publish import PublishOptions
 from snowsplat.pipeline.output.levels import write_levels
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.project.project import Project
 from snowsplat.scene.edit import with_sh_degree
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.viewer.web.panel import Description, made_on
 from snowsplat.viewer.web.publication import SCENE, is_site, write_one_file, write_site
 
 #: Larger scenes are written in levels of detail. Phones show at most that many Gaussians at a time.
 _LARGE = 2_000_000
-
-
-@dataclass(frozen=True)
-class PublishOptions:
-    """Options of a published scene.
-
-    Attributes:
-        title: the name on the page; None: the name of the scene.
-        licence: the licence of the scene, such as "CC BY 4.0".
-        url: the address of the folder on the web. Services that show a preview of a link need it.
-        for_editing: the page is not to be looked at: it has all Gaussians, even of a large scene,
-            without what their colours owe to the direction of view.
-
-    Raises:
-        UserError: the address is not one.
-    """
-
-    title: str | None = None
-    licence: str = ""
-    url: str = ""
-    for_editing: bool = False
-
-    def __post_init__(self) -> None:
-        if self.url and not re.fullmatch(r"https?://[^\s\"<>?#]+", self.url):
-            raise SettingError(
-                "url", "{url} is no address; use e.g. https://host/garden/", url=self.url
-            )
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ import torch
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.pipeline.evaluate import Split
+from snowsplat.pipeline.options.video import panorama_width
 from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_source import TrainedScene
-from snowsplat.pipeline.videos import level_cameras, panorama_width
+from snowsplat.pipeline.videos import level_cameras
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.panorama import PanoramaRenderer
 from snowsplat.scene.render import render

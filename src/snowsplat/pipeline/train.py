@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from snowsplat.data import Dataset
 from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.run import option
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.live_page import LivePage
@@ -39,7 +39,6 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
-from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json, config_to_json
 from snowsplat.util.byte_size import format_bytes
@@ -47,7 +46,6 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 from snowsplat.util.run_lock import one_run
-from snowsplat.util.settings import Settings, setting
 
 logger = logging.getLogger(__name__)
 
@@ -55,95 +53,6 @@ logger = logging.getLogger(__name__)
 _BYTES_IN_FILE = 248
 # Settings that may be changed when a training run is resumed.
 _FREE_ON_RESUME = {"iterations", "test_iterations", "checkpoint_every"}
-
-
-@dataclass(frozen=True)
-class TrainOptions(Settings):
-    """Options of the training. None selects the value of the recipe or, in `resume`, that of the
-    checkpoint.
-
-        TrainOptions(hold_out=8, settings={"iterations": 7000, "max_gaussians": 200_000})
-
-    Attributes:
-        recipe: name of the recipe, which defines the defaults of all settings.
-        config: a complete configuration, in the place of a recipe.
-        settings: names and values of changed settings, see
-            `snowsplat.training.settings.names.changed`.
-        images: name of the folder of photos in the dataset; default: "images".
-        resolution: 1, 2, 4 or 8: divide width and height of the photos by this number; any other
-            number: the new width in pixels; default: unchanged.
-        hold_out: hold out every ``hold_out``-th photo for testing, if the dataset has no split of
-            its own; default: none.
-        first_held_out: index of the first of these photos in the order of names; default: 0, as in
-            the papers. There, the first photo of a walk is at its end, where the fewest photos
-            show the scene.
-        test_list: a text file with the names of the photos to hold out; replaces ``hold_out``.
-        minutes: finish within this time. The number of steps, the size of the photos and the
-            maximum number of Gaussians are chosen for this time, unless other options set them. In
-            `resume`, this is the time for the remaining steps.
-        memory: memory limit of the training, in bytes or as a text such as "4GB". On a GPU, this is
-            memory of the GPU; on the CPU, it is memory in addition to that of Python and its
-            libraries. Default: no limit.
-        trust_cameras: train even if the cameras are impossible, see `check_cameras`.
-        save_iterations: steps after which to save the scene, in addition to the last step.
-        checkpoint_seconds: time between checkpoints, if ``settings`` does not contain
-            checkpoint_every; default: no checkpoints.
-        compute: device, threads, determinism.
-
-    Raises:
-        UserError: a value is invalid, or ``minutes`` is given together with iterations.
-    """
-
-    recipe: str | None = option.recipe()
-    config: TrainConfig | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    images: str | None = None
-    resolution: int | None = option.resolution()
-    hold_out: int | None = option.hold_out()
-    first_held_out: int | None = option.first_held_out()
-    test_list: Path | None = None
-    minutes: float | None = option.minutes()
-    memory: int | str | None = option.memory()
-    trust_cameras: bool = False
-    save_iterations: tuple[int, ...] = setting((), "Steps after which to save.", least=-1)
-    checkpoint_seconds: float | None = setting(None, "Time between checkpoints.", least=0.0)
-    compute: Compute = field(default_factory=Compute)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.minutes is not None and self.iterations is not None:
-            raise UserError("`minutes` and `iterations` cannot be combined; set one of them")
-        if self.recipe is not None and self.config is not None:
-            raise UserError("`recipe` and `config` both contain all settings; leave one out")
-
-    def configuration(self) -> TrainConfig:
-        """The configuration with the changed settings.
-
-        Raises:
-            SettingError: a setting is unknown or invalid.
-        """
-        return changed(self.config or recipe(self.recipe or "default"), **self.settings)
-
-    @property
-    def iterations(self) -> int | None:
-        """The requested number of steps."""
-        return self.settings.get("iterations")
-
-    def dataset_settings(
-        self, dataset: Path | str | None, before: DatasetSettings | None = None
-    ) -> DatasetSettings:
-        """How to read the dataset: ``before`` with the changes of these options."""
-        every = 8 if self.hold_out is None and self.test_list is not None else self.hold_out
-        changes: dict[str, Any] = {
-            "path": None if dataset is None else str(Path(dataset).absolute()),
-            "images": self.images,
-            "resolution": self.resolution,
-            "hold_out": every,
-            "first_held_out": self.first_held_out,
-            "test_list": None if self.test_list is None else str(Path(self.test_list).absolute()),
-        }
-        settings = before or DatasetSettings(path="")
-        return replace(settings, **{k: v for k, v in changes.items() if v is not None})
 
 
 def train(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -18,6 +16,7 @@ from snowsplat import trajectory
 from snowsplat.formats import read_gaussians
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.video import CAMERA_PATHS, VideoOptions, VideoSize, panorama_width
 from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_source import cameras_of
 from snowsplat.project.project import Project
@@ -33,71 +32,7 @@ from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import remove_temporaries
 from snowsplat.util.stages import Outcome
 
-Projection = Literal["pinhole", "equirectangular"]
-
-#: The camera paths that are computed from the cameras of a training run.
-CAMERA_PATHS = ("training", "ellipse", "spiral")
-
-_LONGEST_SIDE = 1920  # of a video without a requested size
-_SMALLEST, _LARGEST = 16, 8192  # pixels along a side
-_MAX_FRAMES = 100_000
-_PANORAMA_WIDTH = 3840  # of a 360° picture without a requested size
 _RANGE_FRAMES = 8  # number of frames that determine the range of the depth colours
-
-
-@dataclass(frozen=True)
-class VideoSize:
-    """The requested size of a video, in pixels; None if a side was not requested."""
-
-    width: int | None = None
-    height: int | None = None
-
-    @classmethod
-    def parse(cls, text: str | None) -> VideoSize:
-        """Parse "1280x720", "1280" or None. Raises: UserError: ``text`` is no possible size."""
-        if text is None:
-            return cls()
-        match = re.fullmatch(r"(\d{1,6})(?:[xX×](\d{1,6}))?", text)
-        if match is None:
-            raise SettingError(
-                "size", "{text!r} is not a size; use e.g. 1280x720, or a width, 1280", text=text
-            )
-        width, height = int(match[1]), int(match[2]) if match[2] else None
-        if not all(_SMALLEST <= side <= _LARGEST for side in (width, height) if side is not None):
-            raise SettingError(
-                "size",
-                "{text} is out of range; use {smallest} to {largest} pixels",
-                text=text,
-                smallest=_SMALLEST,
-                largest=_LARGEST,
-            )
-        return cls(width, height)
-
-    def for_camera(self, camera: Camera) -> tuple[int, int]:
-        """Width and height, both even; a side that was not requested is taken from ``camera``."""
-        width, height = camera.width, camera.height
-        if self.width is None:
-            scale = min(1.0, _LONGEST_SIDE / max(width, height))
-        else:
-            scale = self.width / width
-        wanted = (self.width or width * scale, self.height or height * scale)
-        # Cameras may come from files. A very narrow one would be extremely high at a large width.
-        width, height = (min(_LARGEST, max(_SMALLEST, 2 * int(side / 2 + 0.25))) for side in wanted)
-        return width, height
-
-
-def panorama_width(size: str | None) -> int:
-    """The width of a panorama of the requested size, in pixels. Raises UserError."""
-    wanted = VideoSize.parse(size)
-    width = wanted.width or _PANORAMA_WIDTH
-    if width % 4 or wanted.height not in (None, width // 2):
-        raise SettingError(
-            "size",
-            "{size} is no size of a 360° picture, which is twice as wide as high with a width "
-            "that is a multiple of 4; use e.g. 3840",
-            size=size,
-        )
-    return width
 
 
 def level_cameras(cameras: Sequence[Camera]) -> list[Camera]:
@@ -107,74 +42,6 @@ def level_cameras(cameras: Sequence[Camera]) -> list[Camera]:
         dataclasses.replace(camera, cam_from_world=level_pose(camera.cam_from_world, up))
         for camera in cameras
     ]
-
-
-@dataclass(frozen=True)
-class VideoOptions:
-    """Options of a video: camera path, length, size, depth.
-
-    Attributes:
-        path: the camera path. "training": a smooth curve along the cameras of the photos;
-            "ellipse": around the point that these cameras look at; "spiral": for scenes whose
-            cameras look in one direction; or a file of key cameras in the format of cameras.json.
-        seconds: length of the video.
-        fps: frames per second.
-        size: width and height such as "1280x720", or the width, "1280"; None: the size of the
-            photos.
-        depth: render a second video that shows the depth in colours.
-        side_by_side: render only one video, with colour on the left and depth on the right.
-        antialias: whether to render with the 2D mip filter, see `Gaussians`; None: as trained.
-        projection: "equirectangular": a 360° video, level, with the heading of the cameras.
-        ease: slow at the start and at the end; for a file of key cameras.
-
-    Raises:
-        UserError: an unusable length, rate or size.
-    """
-
-    path: str = "ellipse"
-    seconds: float = 10.0
-    fps: float = 30.0
-    size: str | None = None
-    depth: bool = False
-    side_by_side: bool = False
-    antialias: bool | None = None
-    projection: Projection = "pinhole"
-    ease: bool = False
-
-    def __post_init__(self) -> None:
-        for name, value in (("seconds", self.seconds), ("fps", self.fps)):
-            if not 0 < value < float("inf"):
-                raise SettingError(
-                    name, "{value:g} is not positive; use a number above 0", value=value
-                )
-        if self.seconds * self.fps > _MAX_FRAMES:
-            raise SettingError(
-                "seconds",
-                "{seconds:g} with `fps` {fps:g} is more than {max_frames:,} frames; make the "
-                "video shorter",
-                seconds=self.seconds,
-                fps=self.fps,
-                max_frames=_MAX_FRAMES,
-            )
-        if self.ease and self.path in CAMERA_PATHS:
-            raise SettingError("ease", "is for a path through the cameras of a file; leave it out")
-        if self.projection == "equirectangular":
-            if self.depth or self.side_by_side:
-                raise SettingError("projection", "equirectangular has no depth; render it alone")
-            panorama_width(self.size)
-        VideoSize.parse(self.size)
-
-    @property
-    def frames(self) -> int:
-        """The number of frames."""
-        return max(1, round(self.seconds * self.fps))
-
-    @property
-    def name(self) -> str:
-        """The name of the file, without its suffix."""
-        name = self.path if Path(self.path).suffix == "" else Path(self.path).stem
-        around = self.projection == "equirectangular"
-        return name + "_side_by_side" * self.side_by_side + "_360" * around
 
 
 def render_video(

@@ -33,7 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.features.sift import detect_in_grey
-from snowsplat.sfm.colmap.options import EFFORTS, EffortName, photos_with_adjustment
+from snowsplat.sfm.colmap.options import EFFORTS, photos_with_adjustment
+from snowsplat.sfm.options import EffortName
 from snowsplat.sfm.survey import Photos
 
 # Seconds of one core of the reference machine: a virtual x86-64 server with two cores and AVX-512.

@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,11 +20,12 @@ import numpy as np
 
 from snowsplat.data.frame.placement import PLACEMENT
 from snowsplat.project.dataset_folder import IMAGE_FOLDERS, RECORD, REPORT, DatasetFolder
-from snowsplat.sfm.colmap import SfmOptions, describe_model, estimate_poses
+from snowsplat.sfm.colmap import describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
-from snowsplat.sfm.ingest.inputs import Gathered, GatherOptions, gather
+from snowsplat.sfm.ingest.inputs import Gathered, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.search.sources import Sources, find_sources
+from snowsplat.sfm.options import DatasetOptions, GatherOptions
 from snowsplat.sfm.orient import orientation
 from snowsplat.sfm.orient.marker import MarkerScale, scale_of_markers
 from snowsplat.sfm.progress import Report
@@ -45,25 +46,6 @@ from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("photos", "poses", "images", "report")
 _OUTPUT_NAMES = ("distorted", *IMAGE_FOLDERS, RECORD, REPORT)
-
-
-@dataclass(frozen=True)
-class DatasetOptions:
-    """Options for making a dataset from photos.
-
-    Attributes:
-        gather: selection of the frames of a video, and the image size.
-        sfm: options of the pose estimation.
-        resize: also make images_2, images_4 and images_8.
-        skip_matching: use the existing model in distorted/sparse/0 instead of estimating poses.
-        marker: the side of the printed markers in the photos, in metres; None: there are none.
-    """
-
-    gather: GatherOptions = field(default_factory=GatherOptions)
-    sfm: SfmOptions = field(default_factory=SfmOptions)
-    resize: bool = False
-    skip_matching: bool = False
-    marker: float | None = None
 
 
 class Watcher(Protocol):

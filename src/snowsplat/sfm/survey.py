@@ -6,10 +6,10 @@ import statistics
 from contextlib import suppress
 from dataclasses import dataclass
 
-from snowsplat.sfm.ingest.inputs import GatherOptions
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
 from snowsplat.sfm.ingest.search.sources import Sources
 from snowsplat.sfm.ingest.video.clip import max_frame_count, read_clip
+from snowsplat.sfm.options import GatherOptions
 
 #: The sizes of about this number of photos are read.
 _HEADERS = 10

@@ -29,7 +29,7 @@ from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.cost import Step, expected_pairs, share_of_poses, steps_of, steps_of_pairs
 
 if TYPE_CHECKING:
-    from snowsplat.sfm.colmap.options import EffortName
+    from snowsplat.sfm.options import EffortName
     from snowsplat.sfm.progress import Report
     from snowsplat.sfm.survey import Photos
 

@@ -17,7 +17,8 @@ from typing import Any
 from snowsplat.pipeline.convert import convert
 from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames, write_keys
-from snowsplat.pipeline.publish import PublishOptions, publish
+from snowsplat.pipeline.options.publish import PublishOptions
+from snowsplat.pipeline.publish import publish
 from snowsplat.project.edit_record import PageEdit, edited_file
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project

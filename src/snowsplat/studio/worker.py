@@ -32,9 +32,11 @@ import numpy as np
 from snowsplat.pipeline.cameras_from_above import cameras_from_above, draw_level
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.film import film, film_preview
-from snowsplat.pipeline.make import MakeOptions, MakeResult, make
+from snowsplat.pipeline.make import MakeResult, make
 from snowsplat.pipeline.observer import Observer, Page
-from snowsplat.pipeline.publish import PublishOptions, publish
+from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.publish import PublishOptions
+from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described

@@ -4,15 +4,16 @@
     class Sharpening(Settings):
         strength: float = setting(0.5, "Weight of the sharpness.", least=0.0, metavar="F")
 
-`Settings` checks the values when the object is created. The flags of the command line
-(`snowsplat.cli.config_flags`), their help texts and the table in the documentation are made from
-the same fields. This module imports nothing slow: neither torch nor numpy.
+`Settings` checks the values when the object is created. The arguments and flags of the command line
+(`snowsplat.util.flags`), their help texts, the values in files (`--config`) and the table in the
+documentation are made from the same fields. This module imports nothing slow: neither torch nor
+numpy.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from functools import cache
@@ -31,6 +32,7 @@ from typing import (
 )
 
 from snowsplat.util.errors import SettingError
+from snowsplat.util.messages import Message
 from snowsplat.util.safe_json import printable
 
 #: A moment of the training: a step (int), or a fraction of all steps (float).
@@ -62,7 +64,20 @@ class Setting:
     # The placeholder of the value of the flag; "": a flag without a value; None: there is no flag.
     metavar: str | None = None
     aliases: tuple[str, ...] = ()  # other spellings of the flag
-    default: str | None = None  # the default in the help text; None: it is set by the recipe
+    default: str | None = None  # the default in the help text; None: the value, or that of a recipe
+    name: str | None = None  # that of the flag, if it is not that of the field
+    means: Any = True  # what a flag without a value stands for
+    # Makes the value of the text of the flag; raises ValueError with what is wrong.
+    parse: Callable[[str], Any] | None = None
+    argument: bool = False  # it has no flag: it is known by its place in the command line
+    repeated: bool = False  # the flag is given once for each item of the tuple
+    needed: str | Message | None = (
+        None  # the error if an argument or flag without a default is not given
+    )
+    # The classes whose settings are flags, too; those of `by_name` are the values of a mapping.
+    kinds: tuple[type, ...] = ()
+    only: Collection[str] | None = None  # of these settings; None: all; a mapping: to their helps
+    action: str = ""  # what these flags are for, in front of their help texts: "plan"
 
 
 _UNDECLARED = Setting()
@@ -84,6 +99,42 @@ def part(kind: Callable[[], _Value], help: str, **declared: Any) -> _Value:
     """A field for settings that have a class of their own; the default is ``kind()``."""
     metadata = {"setting": Setting(help, **declared)}
     return field(default_factory=kind, metadata=metadata)
+
+
+def switch(help: str, *aliases: str, **declared: Any) -> bool:
+    """A flag without a value: False, unless it is given."""
+    return setting(False, help, metavar="", aliases=aliases, **declared)
+
+
+def argument(value: _Value, metavar: str, help: str, **declared: Any) -> _Value:
+    """An argument of a command line, with the default ``value``."""
+    return setting(value, help, metavar=metavar, argument=True, **declared)
+
+
+def needed(error: str | Message, metavar: str, help: str, *aliases: str, **declared: Any) -> Any:
+    """An argument or flag without a default; ``error`` says that it is missing."""
+    about = Setting(help, metavar=metavar, aliases=aliases, needed=error, **declared)
+    return field(metadata={"setting": about})
+
+
+def group(
+    kind: Callable[[], _Value], only: Collection[str] | None = None, action: str = ""
+) -> _Value:
+    """A field for the settings of a class, or ``only`` some of them, which are flags, too.
+
+    ``action``: see `Setting`.
+    """
+    declared = Setting(kinds=(kind,), only=only, action=action)  # type: ignore[arg-type]
+    return field(default_factory=kind, metadata={"setting": declared})
+
+
+def by_name(*kinds: type, only: Collection[str] | None = None) -> Any:
+    """A field for changed settings of some classes, name -> value; their flags change it.
+
+    ``only``: some of them; or a mapping from these to their help texts here.
+    """
+    declared = Setting(kinds=kinds, only=only)
+    return field(default_factory=dict, metadata={"setting": declared})
 
 
 def same(kind: type, name: str, value: _Value, **changes: Any) -> _Value:
@@ -261,14 +312,3 @@ def _number(value: Any, kind: type, hint: Any, declared: Setting) -> int | float
     if (most is not None and number > most) or (below is not None and number >= below):
         raise ValueError("is too large")
     return number
-
-
-def flags_of(*kinds: type) -> Iterator[tuple[str, Any, Setting]]:
-    """Name, type and declaration of all settings with a flag; the first of each name."""
-    seen: set[str] = set()
-    for kind in kinds:
-        for name, hint, declared in declarations(kind):
-            flag = getattr(kind, "prefix", "") + name
-            if declared.metavar is not None and flag not in seen:
-                seen.add(flag)
-                yield flag, hint, declared

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from snowsplat.evaluation.metrics import psnr
-from snowsplat.extras.image.fit import FitOptions
+from snowsplat.extras.image.options import FitOptions
 from snowsplat.extras.image.svg import write_svg
 from snowsplat.util.errors import UserError
 

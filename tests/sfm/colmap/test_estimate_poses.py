@@ -13,8 +13,9 @@ import torch
 from PIL import Image
 
 from snowsplat.scene.geometry import similarity_from_points
-from snowsplat.sfm.colmap import SfmOptions, SfmResult, describe_model, estimate_poses
+from snowsplat.sfm.colmap import SfmResult, describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import CAMERA_MODELS
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 

@@ -8,8 +8,9 @@ import torch
 from PIL import Image
 
 from snowsplat.scene.geometry import similarity_from_points
-from snowsplat.sfm.colmap import SfmOptions, estimate_poses
+from snowsplat.sfm.colmap import estimate_poses
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 
 CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "captures"

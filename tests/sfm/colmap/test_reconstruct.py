@@ -9,8 +9,8 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap import reconstruct
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.lens import Lens
-from snowsplat.sfm.colmap.options import SfmOptions
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation, best_attempt
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 
 

@@ -9,9 +9,10 @@ import pillow_heif
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.inputs import GatherOptions, gather
+from snowsplat.sfm.ingest.inputs import gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.search.sources import find_sources
+from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 

@@ -10,57 +10,14 @@ from snowsplat.extras.globe.glass import engraving
 from snowsplat.extras.globe.globe_page import write_page
 from snowsplat.extras.globe.globe_video import GlobeVideo
 from snowsplat.extras.globe.layout import arrange
+from snowsplat.extras.globe.options import LONGEST_NAME, GlobeOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_source import load_viewable
-from snowsplat.pipeline.videos import VideoSize
 from snowsplat.project.project import Project
 from snowsplat.trajectory.video_file import video_writer
-from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Outcome
-
-_LARGEST = 1_000_000  # Gaussians: the page has 26 bytes for each
-_LONGEST_NAME = 60
-_SIDE = 960  # pixels of a video
-_FPS = (1.0, 120.0)
-
-
-@dataclass(frozen=True)
-class GlobeOptions:
-    """Options of a globe.
-
-    Attributes:
-        gaussians: maximum number of Gaussians in the globe. The most important ones are used.
-        name: the text on the plate of the base; None: the name of the scene.
-        size: width and height of the video such as "960x960", or the side of a square.
-        fps: frames per second of the video.
-
-    Raises:
-        UserError: a value is out of range.
-    """
-
-    gaussians: int = 100_000
-    name: str | None = None
-    size: str | None = None
-    fps: float = 30.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.gaussians <= _LARGEST:
-            problem = f"{self.gaussians} is out of range; use 1 to {_LARGEST:,}"
-            raise SettingError("gaussians", problem)
-        if self.name is not None and len(self.name) > _LONGEST_NAME:
-            problem = f"{len(self.name)} letters are too many; use at most {_LONGEST_NAME}"
-            raise SettingError("name", problem)
-        if not _FPS[0] <= self.fps <= _FPS[1]:
-            raise SettingError("fps", "{fps:g} is out of range; use 1 to 120", fps=self.fps)
-        VideoSize.parse(self.size)
-
-    @property
-    def video_size(self) -> tuple[int, int]:
-        """Width and height of the video in pixels, both even."""
-        size = VideoSize.parse(self.size)
-        width = size.width or _SIDE
-        return 2 * (width // 2), 2 * ((size.height or width) // 2)
 
 
 @dataclass(frozen=True)
@@ -115,7 +72,7 @@ def make_globe(
         source = load_viewable(project)
     with observer.waiting("arranging"):
         arrangement = arrange(source.gaussians, source.cameras, options.gaussians)
-    name = options.name or project.name[:_LONGEST_NAME]
+    name = options.name or project.name[:LONGEST_NAME]
     write_page(target, arrangement, name)
     if video is not None:
         width, height = options.video_size

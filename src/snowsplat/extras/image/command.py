@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any
 
-import tyro
-
-from snowsplat.cli.flags import Quiet, Threads, flag, switch
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.reports import JsonFlag, Reports
+from snowsplat.extras.image.options import FitOptions
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.options import common
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
+from snowsplat.util.settings import group, needed, setting
 
 _COMPACT = ".gimg"
+_NEEDED = message("image needs a photo and an output folder: snowsplat image PHOTO -o OUT")
 
 
-@dataclass
-class Image(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Image(JsonCommand):
     """Approximate a photo by 2D Gaussians, or render such an approximation.
 
     Examples:
@@ -34,63 +36,46 @@ class Image(Reports):
       A compact file in place of PHOTO is rendered to the PNG file OUT.
     """
 
-    photo: Annotated[Path | None, tyro.conf.Positional, flag("PHOTO|FILE.gimg")] = None
-    """The photo, or a compact file of Gaussians."""
-    output: Annotated[Path | None, flag("OUT", "-o")] = None
-    """The output folder. It is created if it does not exist. For a compact file: the PNG file."""
-    gaussians: Annotated[int, flag("N", "-n", default="1000")] = 1000
-    """Number of Gaussians."""
-    blending: Annotated[
-        Literal["front-to-back", "additive"],
-        flag("{front-to-back,additive}", default="front-to-back"),
-    ] = "front-to-back"
-    """front-to-back: opaque to transparent ellipses, the first one in front; additive: the sum of
-    the Gaussians, without SVG."""
-    steps: Annotated[int, flag("N", default="3000")] = 3000
-    """Number of steps of the optimiser. More steps give a better image."""
-    size: Annotated[int | None, flag("PIXELS", default="512; of a file: as fitted")] = None
-    """Pixels along the longer side. A larger photo is scaled down."""
-    seed: Annotated[int, flag("N", default="0")] = 0
-    """Seed of the random positions of the Gaussians."""
-    threads: Threads = None
-    overwrite: Annotated[bool, switch()] = False
-    """Replace an earlier fit in OUT."""
-    quiet: Quiet = False
-    json: JsonFlag = False
+    photo: Path = needed(
+        _NEEDED,
+        "PHOTO|FILE.gimg",
+        "The photo, or a compact file of Gaussians.",
+        argument=True,
+    )
+    output: Path = needed(
+        _NEEDED,
+        "OUT",
+        "The output folder. It is created if it does not exist. For a compact file: the PNG file.",
+        "-o",
+    )
+    options: FitOptions = group(FitOptions)
+    size: int | None = setting(
+        None,
+        "Pixels along the longer side. A larger photo is scaled down.",
+        "512; of a file: as fitted",
+        metavar="PIXELS",
+    )
+    compute: Compute = group(Compute, only=("threads",))
+    overwrite: bool = common.overwrite("Replace an earlier fit in OUT.")
+    quiet: bool = common.quiet()
 
-    def run(self) -> int:
-        if self.photo is None or self.output is None:
-            raise UserError(
-                "image needs a photo and an output folder: snowsplat image PHOTO -o OUT"
-            )
+    def run(self) -> dict[str, Any] | None:
         if self.photo.suffix.lower() == _COMPACT:
-            return self._decode(self.photo, self.output)
-        from snowsplat.extras.image.fit import FitOptions
+            self._decode(self.photo, self.output)
+            return None
         from snowsplat.extras.image.fit_image import fit_image
 
-        options = FitOptions(
-            gaussians=self.gaussians, blending=self.blending, steps=self.steps, seed=self.seed
-        )
         with TerminalObserver(self.quiet) as observer:
             result = fit_image(
                 self.photo,
                 self.output,
-                options,
+                self.options,
                 size=512 if self.size is None else self.size,
-                threads=self.threads,
+                threads=self.compute.threads,
                 overwrite=self.overwrite,
                 observer=observer,
             )
         end = result.moments[-1]
-        self.report = {
-            "output": result.output,
-            "gaussians": end.gaussians,
-            "psnr": end.psnr,
-            "ssim": end.ssim,
-            "steps": end.step,
-            **{name: getattr(result, name) for name in ("file_psnr", "file_bytes")},
-            "bits_per_pixel": result.bits_per_pixel,
-        }
         print(
             message(
                 "{output}: {gaussians:,} Gaussians, PSNR {psnr:.2f} dB, SSIM {ssim:.4f}, "
@@ -116,9 +101,17 @@ class Image(Reports):
         print(
             message("to see it: open {output} in a browser", output=result.output / "report.html")
         )
-        return 0
+        return {
+            "output": result.output,
+            "gaussians": end.gaussians,
+            "psnr": end.psnr,
+            "ssim": end.ssim,
+            "steps": end.step,
+            **{name: getattr(result, name) for name in ("file_psnr", "file_bytes")},
+            "bits_per_pixel": result.bits_per_pixel,
+        }
 
-    def _decode(self, compact: Path, target: Path) -> int:
+    def _decode(self, compact: Path, target: Path) -> None:
         if target.suffix.lower() != ".png":
             raise UserError(
                 "{target}: the image of a compact file is written as PNG; use -o FILE.png",
@@ -132,4 +125,3 @@ class Image(Reports):
                 "{target}: {width} × {height} pixels", target=target, width=width, height=height
             )
         )
-        return 0

@@ -24,14 +24,8 @@ from typing import get_args
 import numpy as np
 import torch
 
-from snowsplat.extras.image.model import (
-    ANGLE,
-    MOST_GAUSSIANS,
-    OPACITY_LOGIT,
-    Blending,
-    ImageGaussians,
-    column_count,
-)
+from snowsplat.extras.image.model import ANGLE, OPACITY_LOGIT, ImageGaussians, column_count
+from snowsplat.extras.image.options import MOST_GAUSSIANS, Blending
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 

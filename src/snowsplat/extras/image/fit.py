@@ -8,7 +8,6 @@ where they are needed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,13 +16,11 @@ from snowsplat.extras.image.model import (
     COLORS,
     LOG_SIGMAS,
     MEANS,
-    MOST_GAUSSIANS,
     OPACITY_LOGIT,
-    Blending,
     ImageGaussians,
     column_count,
 )
-from snowsplat.util.errors import SettingError
+from snowsplat.extras.image.options import FitOptions
 
 # The values below were chosen by measuring the PSNR of 1000 Gaussians after the same number of
 # steps; docs/guides/image.md has the figures.
@@ -45,34 +42,6 @@ _FIRST_SIGMAS = (0.7, 30.0)  # pixels; limits of the first Gaussians
 _ERROR_POWER = 1.5
 _NEW_SIGMA = 0.4  # times the mean distance of the Gaussians
 _NEW_OPACITY = 0.12  # of front-to-back Gaussians
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """Settings of a fit.
-
-    Attributes:
-        gaussians: number of Gaussians at the end.
-        blending: see `Blending`.
-        steps: number of steps of the optimiser.
-        seed: of the random positions. On the CPU, the same seed gives the same Gaussians, bit by
-            bit, for any number of threads.
-
-    Raises:
-        UserError: a value is out of range.
-    """
-
-    gaussians: int = 1000
-    blending: Blending = "front-to-back"
-    steps: int = 3000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.gaussians <= MOST_GAUSSIANS:
-            problem = f"{self.gaussians} is out of range; use 1 to {MOST_GAUSSIANS}"
-            raise SettingError("gaussians", problem)
-        if self.steps < 1:
-            raise SettingError("steps", "{steps} is too small; use at least 1", steps=self.steps)
 
 
 class Fitter:

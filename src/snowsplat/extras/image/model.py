@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from snowsplat import ops
+from snowsplat.extras.image.options import Blending
 from snowsplat.ops.splats import Splats2D
-
-#: "additive": the image is background + Σ w c, in which the order has no effect and colours may be
-#: negative (Zhang et al. 2024, GaussianImage, arXiv:2403.08551). "front-to-back": the Gaussians are
-#: composited, the first one in front, as splats are in 3D Gaussian Splatting.
-Blending = Literal["additive", "front-to-back"]
-
-#: The largest number of Gaussians of an image.
-MOST_GAUSSIANS = 4_000_000
 
 # Columns of `ImageGaussians.rows`.
 MEANS = slice(0, 2)

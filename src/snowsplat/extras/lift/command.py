@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
-
-from snowsplat.cli.flags import Quiet, Threads, flag, switch
+from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import see_and_share
 from snowsplat.cli.observer import TerminalObserver
-from snowsplat.cli.reports import JsonFlag, Reports
+from snowsplat.extras.lift.options import DepthSource, LiftOptions
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.options import common
 from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
+from snowsplat.util.settings import group, needed, setting, switch
+
+_NEEDED = message(
+    "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"
+)
 
 
-@dataclass
-class Lift(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Lift(JsonCommand):
     """Make a scene from one photo and its depth map.
 
     Examples:
@@ -32,85 +37,64 @@ class Lift(Reports):
       computer; snowsplat never downloads one.
     """
 
-    photo: Annotated[Path | None, tyro.conf.Positional, flag("PHOTO")] = None
-    """The photo."""
-    output: Annotated[Path | None, flag("OUT", "-o")] = None
-    """The output folder. It is created if it does not exist."""
-    depth: Annotated[Path | None, flag("MAP")] = None
-    """Depth map of the photo: PNG (8 or 16 bits), TIFF, NPY or EXR, of any size."""
-    model: Annotated[Path | None, flag("PATH")] = None
-    """Instead of a map: a network that estimates depth. An ONNX file, or a folder of the library
-    transformers; for example, Depth Anything V2."""
-    depth_is: Annotated[
-        Literal["z", "distance", "disparity"] | None,
-        flag("{z,distance,disparity}", default="z; disparity for a model"),
-    ] = None
-    """What the values are. z: the distance along the optical axis; distance: along the ray;
-    disparity: inverse depth, known up to a factor."""
-    near: Annotated[float | None, flag("F", default="from the map")] = None
-    """Depth of the nearest pixel. Together with --far, sets the range of the depths of a map
-    without units."""
-    far: Annotated[float | None, flag("F", default="from the map")] = None
-    """Depth of the farthest pixel."""
-    focal: Annotated[float | None, flag("PIXELS", default="from EXIF data")] = None
-    """Focal length in pixels of the photo as stored. Without EXIF data, that of the main camera of
-    phones is assumed."""
-    size: Annotated[int | None, flag("PIXELS", default="640")] = None
-    """Pixels along the longer side. A larger photo is scaled down."""
-    max_gaussians: Annotated[int | None, flag("N", default="one per pixel")] = None
-    """Merge the pixels of uniform parts, until there are at most this many Gaussians."""
-    edge: Annotated[float, flag("F", default="0.05")] = 0.05
-    """Neighbouring pixels are on different surfaces if their depths differ by more than this
-    share."""
-    swing: Annotated[bool, switch()] = False
-    """Also render swing.mp4, a video from viewpoints around that of the photo."""
-    refine: Annotated[Path | None, flag("DATASET")] = None
-    """A dataset of photos with camera poses that contains PHOTO. The depth is aligned to its
-    points, and the scene is trained on all of its photos."""
-    iterations: Annotated[int | None, flag("N", default="1000")] = None
-    """Number of training steps with --refine."""
-    eval: Annotated[bool, switch()] = False
-    """With --refine: hold out every 8th photo, and evaluate the scene on these photos."""
-    threads: Threads = None
-    overwrite: Annotated[bool, switch()] = False
-    """Replace an earlier scene in OUT."""
-    quiet: Quiet = False
-    json: JsonFlag = False
+    photo: Path = needed(_NEEDED, "PHOTO", "The photo.", argument=True)
+    output: Path = needed(
+        _NEEDED, "OUT", "The output folder. It is created if it does not exist.", "-o"
+    )
+    source: DepthSource = group(DepthSource)
+    focal: float | None = setting(
+        None,
+        "Focal length in pixels of the photo as stored. Without EXIF data, that of the main camera "
+        "of phones is assumed.",
+        "from EXIF data",
+        metavar="PIXELS",
+    )
+    size: int | None = setting(
+        None,
+        "Pixels along the longer side. A larger photo is scaled down.",
+        "640",
+        metavar="PIXELS",
+    )
+    options: LiftOptions = group(LiftOptions)
+    swing: bool = switch("Also render swing.mp4, a video from viewpoints around that of the photo.")
+    refine: Path | None = setting(
+        None,
+        "A dataset of photos with camera poses that contains PHOTO. The depth is aligned to its "
+        "points, and the scene is trained on all of its photos.",
+        metavar="DATASET",
+    )
+    iterations: int = setting(1000, "Number of training steps with --refine.", metavar="N")
+    eval: bool = switch(
+        "With --refine: hold out every 8th photo, and evaluate the scene on these photos."
+    )
+    compute: Compute = group(Compute, only=("threads",))
+    overwrite: bool = common.overwrite("Replace an earlier scene in OUT.")
+    quiet: bool = common.quiet()
 
-    def run(self) -> int:
-        if self.photo is None or self.output is None:
-            raise UserError(
-                "lift needs a photo and an output folder: snowsplat lift PHOTO --depth MAP -o OUT"
-            )
-        if self.refine is None and (self.eval or self.iterations is not None):
+    def run(self) -> Any:
+        if self.refine is None and (self.eval or "iterations" in self.given):
             raise UserError("`eval` and `iterations` are about the training; set `refine` as well")
         if self.refine is not None and (self.size is not None or self.focal is not None):
             raise UserError(
                 "`size` and `focal` are those of the dataset with `refine`; leave them out"
             )
-        from snowsplat.extras.lift.lift import LiftOptions
-        from snowsplat.extras.lift.lift_photo import DepthSource, lift_photo
+        from snowsplat.extras.lift.lift_photo import lift_photo
 
-        source = DepthSource(self.depth, self.model, self.depth_is, self.near, self.far)
-        what = self.photo, self.output, source
-        options = LiftOptions(self.edge, self.max_gaussians)
+        what = self.photo, self.output, self.source
         given: dict[str, Any] = {
             "swing": self.swing,
-            "threads": self.threads,
+            "threads": self.compute.threads,
             "overwrite": self.overwrite,
         }
         if self.refine is None:
             size = 640 if self.size is None else self.size
-            result = lift_photo(*what, options, size=size, focal=self.focal, **given)
+            result = lift_photo(*what, self.options, size=size, focal=self.focal, **given)
         else:
             from snowsplat.extras.lift.refine_photo import refine_photo
 
-            if self.iterations is not None:
-                given["iterations"] = self.iterations
-            given["hold_out"] = 8 if self.eval else None
+            given |= {"iterations": self.iterations, "hold_out": 8 if self.eval else None}
             with TerminalObserver(self.quiet) as observer:
-                result = refine_photo(*what, self.refine, options, observer=observer, **given)
-        self.report = result
+                result = refine_photo(*what, self.refine, self.options, observer=observer, **given)
         if result.alignment is not None:
             fit = result.alignment
             print(
@@ -134,7 +118,7 @@ class Lift(Reports):
         print(
             message(
                 "depth ({values_are}): {depths:.3g} to {depths2:.3g}",
-                values_are=source.values_are,
+                values_are=self.source.values_are,
                 depths=result.depths[0],
                 depths2=result.depths[1],
             )
@@ -161,4 +145,4 @@ class Lift(Reports):
         if result.swing is not None:
             print(message("{swing}: the video", swing=result.swing))
         print(see_and_share(self.output))
-        return 0
+        return result

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-#: The largest difference of the depths of linked neighbours, relative to the larger depth.
-EDGE_THRESHOLD = 0.05
+from snowsplat.extras.lift.options import EDGE_THRESHOLD
+
 # Radius in pixels of the window in which `snap_to_surfaces` looks for the two surfaces. Networks
 # blur a discontinuity over about this number of pixels on each side.
 _SNAP_RADIUS = 2

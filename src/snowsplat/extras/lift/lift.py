@@ -2,52 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from snowsplat.extras.lift.blocks import merge_pixels, pixel_blocks
 from snowsplat.extras.lift.colors import match_photo
 from snowsplat.extras.lift.discs import discs, sigma_of_block
-from snowsplat.extras.lift.edges import EDGE_THRESHOLD, find_links, snap_to_surfaces
+from snowsplat.extras.lift.edges import find_links, snap_to_surfaces
+from snowsplat.extras.lift.options import LiftOptions
 from snowsplat.extras.lift.surface import surface_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order
-from snowsplat.util.errors import SettingError
 from snowsplat.util.process import single_threaded
-
-
-@dataclass(frozen=True)
-class LiftOptions:
-    """How a photo becomes Gaussians.
-
-    Attributes:
-        edge: the largest difference of the depths of two neighbouring pixels on the same surface,
-            relative to the larger depth.
-        max_gaussians: merge pixels of uniform parts into larger Gaussians, until there are at most
-            this many; None: a Gaussian for each pixel.
-
-    Raises:
-        SettingError: a value is not positive.
-    """
-
-    edge: float = EDGE_THRESHOLD
-    max_gaussians: int | None = None
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.edge < math.inf:
-            raise SettingError(
-                "edge", "{edge:g} is not a positive share; use e.g. 0.05", edge=self.edge
-            )
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise SettingError(
-                "max_gaussians",
-                "{max_gaussians} is too small; use at least 1",
-                max_gaussians=self.max_gaussians,
-            )
 
 
 def lift(

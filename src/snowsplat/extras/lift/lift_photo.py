@@ -13,11 +13,12 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.maps.depth_alignment import Alignment
-from snowsplat.data.maps.depth_file import DepthKind, read_depth_file, to_z
+from snowsplat.data.maps.depth_file import read_depth_file, to_z
 from snowsplat.evaluation.metrics import Evaluation, compare
 from snowsplat.extras.lift.depth_model import estimate_depth
 from snowsplat.extras.lift.edges import resize_depth
-from snowsplat.extras.lift.lift import LiftOptions, lift
+from snowsplat.extras.lift.lift import lift
+from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit, write_png
 from snowsplat.pipeline.run.training_files import read_dataset, write_beginning, write_scene
@@ -42,62 +43,31 @@ _ASPECT_TOLERANCE = 0.03  # between the aspect ratios of photo and depth map, re
 _SWING_SECONDS, _SWING_FPS = 4, 24
 
 
-@dataclass(frozen=True)
-class DepthSource:
-    """Where the depth comes from: a file, or a network that is on disk.
-
-    Attributes:
-        map: a depth map, see `read_depth_file`.
-        model: a network, see `estimate_depth`. Exactly one of ``map`` and ``model`` is set.
-        kind: what the values are; default: "z" for a map, "disparity" for a model.
-        near, far: the depths of the nearest and the farthest pixel, see `to_z`.
+def read_depth(source: DepthSource, photo: Tensor, camera: Camera, edge: float) -> Tensor:
+    """The depth of each pixel of the photo: camera z (H, W) float32; NaN where it is unknown.
 
     Raises:
-        UserError: neither or both of ``map`` and ``model`` are set.
+        UserError: an unusable file, model or range; another aspect ratio than the photo.
     """
-
-    map: Path | None = None
-    model: Path | None = None
-    kind: DepthKind | None = None
-    near: float | None = None
-    far: float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.map is None) == (self.model is None):
+    if source.map is not None:
+        values = read_depth_file(source.map)
+        height, width = values.shape
+        aspect = width / height * camera.height / camera.width
+        if abs(aspect - 1) > _ASPECT_TOLERANCE:
             raise UserError(
-                "lift needs either a depth map or a model; set one of `depth` and `model`"
+                "{map}: has {width}x{height} pixels, but the upright photo has "
+                "{width2}x{height2}; use a depth map of the whole photo",
+                map=source.map,
+                width=width,
+                height=height,
+                width2=camera.width,
+                height2=camera.height,
             )
-
-    @property
-    def values_are(self) -> DepthKind:
-        """``kind`` or its default."""
-        return self.kind or ("z" if self.model is None else "disparity")
-
-    def read(self, photo: Tensor, camera: Camera, edge: float) -> Tensor:
-        """The depth of each pixel of the photo: camera z (H, W) float32; NaN where it is unknown.
-
-        Raises:
-            UserError: an unusable file, model or range; another aspect ratio than the photo.
-        """
-        if self.map is not None:
-            values = read_depth_file(self.map)
-            height, width = values.shape
-            aspect = width / height * camera.height / camera.width
-            if abs(aspect - 1) > _ASPECT_TOLERANCE:
-                raise UserError(
-                    "{map}: has {width}x{height} pixels, but the upright photo has "
-                    "{width2}x{height2}; use a depth map of the whole photo",
-                    map=self.map,
-                    width=width,
-                    height=height,
-                    width2=camera.width,
-                    height2=camera.height,
-                )
-        else:
-            assert self.model is not None
-            values = estimate_depth(self.model, photo)
-        z = to_z(values, self.values_are, camera, self.near, self.far)
-        return resize_depth(z, camera.width, camera.height, edge)
+    else:
+        assert source.model is not None
+        values = estimate_depth(source.model, photo)
+    z = to_z(values, source.values_are, camera, source.near, source.far)
+    return resize_depth(z, camera.width, camera.height, edge)
 
 
 @dataclass(frozen=True)
@@ -165,7 +135,7 @@ def lift_photo(
     out.check_free(resume=False, overwrite=overwrite)
     pixels, camera, source = read_photo(Path(photo), size, focal)
     Compute("cpu", threads).apply()
-    z = depth.read(pixels, camera, options.edge)
+    z = read_depth(depth, pixels, camera, options.edge)
     gaussians = lift(pixels, z, camera, options)
     _begin(out, Path(photo).stem, pixels, camera)
     return finish(out, 0, gaussians, pixels, z, camera, source, swing, started)

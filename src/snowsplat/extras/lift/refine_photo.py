@@ -8,8 +8,9 @@ from pathlib import Path
 
 from snowsplat.data import Dataset, ImageLoader, Points, View
 from snowsplat.data.maps.depth_alignment import align
-from snowsplat.extras.lift.lift import LiftOptions, lift
-from snowsplat.extras.lift.lift_photo import DepthSource, LiftResult, finish
+from snowsplat.extras.lift.lift import lift
+from snowsplat.extras.lift.lift_photo import LiftResult, finish, read_depth
+from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.run.training_files import read_dataset, write_beginning
@@ -74,7 +75,7 @@ def refine_photo(
     Compute("cpu", threads).apply()
     with ImageLoader([view], background=(1.0, 1.0, 1.0)) as loader:
         pixels = loader.get(view).rgb.float().div(255).contiguous()
-    z = depth.read(pixels, view.camera, options.edge)
+    z = read_depth(depth, pixels, view.camera, options.edge)
     alignment = align(z, posed.points.xyz, view.camera, with_shift=depth.values_are == "disparity")
     z = alignment.apply(z)
     limit = round(_LIFTED_SHARE * config.density.max_gaussians)

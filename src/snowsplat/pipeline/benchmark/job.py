@@ -24,8 +24,9 @@ from snowsplat.evaluation.lpips import Lpips
 from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.evaluate import evaluate
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
-from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -16,53 +14,10 @@ from snowsplat.evaluation.lpips import Lpips, is_packaged
 from snowsplat.pipeline.benchmark.benchmark_page import BenchmarkReport, write_report
 from snowsplat.pipeline.benchmark.job import Job, SceneResult, run
 from snowsplat.pipeline.benchmark.suites import SUITES, suite_of
-from snowsplat.pipeline.run import option
-from snowsplat.training.settings.recipes import check_recipe, recipe
+from snowsplat.pipeline.options.benchmark import BenchmarkOptions
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.messages import as_message
 from snowsplat.util.run_lock import InUse
-from snowsplat.util.settings import Settings, setting
-
-
-@dataclass(frozen=True)
-class BenchmarkOptions(Settings):
-    """Options of a benchmark.
-
-    Attributes:
-        suite: a name of `suites.SUITES`; None: that to which all scenes belong, or "custom".
-        scenes: only these scenes; empty: all.
-        recipe: the recipe of the training.
-        settings: changed settings, see `TrainOptions`.
-        resolution: replaces that of the suite; see `TrainOptions`.
-        lpips: a file of weights, or "vgg" or "alex", see `snowsplat.evaluation.lpips`; None: LPIPS
-            is not measured.
-        jobs: number of scenes that are trained at the same time. They share the CPU threads; with
-            GPUs, job i uses GPU i.
-        device: "cpu" or "cuda"; None: GPUs if there are any.
-
-    Raises:
-        UserError: an unknown suite, or fewer than 1 job.
-    """
-
-    suite: str | None = None
-    scenes: tuple[str, ...] = ()
-    recipe: str = setting("default", "Name of the recipe.", check=check_recipe)
-    settings: dict[str, Any] = field(default_factory=dict)
-    resolution: int | None = option.resolution()
-    lpips: Path | None = None
-    jobs: int = setting(1, "Number of scenes at the same time.", least=1)
-    device: str | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.suite is not None and self.suite not in SUITES:
-            raise SettingError(
-                "suite",
-                "{suite} is unknown; use {suites}",
-                suite=self.suite,
-                suites=", ".join(SUITES),
-            )
-        recipe(self.recipe, **self.settings)  # raises an error if a setting is invalid
 
 
 def benchmark(

@@ -8,9 +8,8 @@ FOLDER/config.json …      FOLDER is also the output folder of the merged scene
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +20,20 @@ from snowsplat._version import __version__
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.pipeline.blocks.cells import Axes, Cell
 from snowsplat.pipeline.blocks.content import block_content
-from snowsplat.pipeline.run import option
+from snowsplat.pipeline.options.benchmark import PlanOptions
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.run.training_files import read_dataset_files, write_beginning
-from snowsplat.pipeline.train import TrainOptions
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.parts.found_sky import sky_distance
-from snowsplat.training.settings.recipes import check_recipe, recipe
+from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, read_json
-from snowsplat.util.settings import Settings, setting
 
 PLAN = "plan.json"
-#: More blocks than this are a mistake.
-MOST_BLOCKS = 10_000
 
 
 @dataclass(frozen=True)
@@ -109,34 +105,6 @@ class Plan:
         """Positions (N, 3) relative to `origin` -> (N, 2) float64 in the ground plane."""
         axes = torch.tensor(self.axes, dtype=torch.float64)
         return positions.to(torch.float64) @ axes.T
-
-
-@dataclass(frozen=True)
-class PlanOptions(Settings):
-    """Options of `plan_blocks`. None selects the value of the recipe or of `load_dataset`.
-
-    Attributes:
-        blocks: their number.
-        margin: a block is trained with the photos and points of its cell, expanded on each side by
-            this share of its size.
-        recipe: the recipe of all blocks.
-        settings: changed settings, see `TrainOptions`. ``max_gaussians`` is the number of the whole
-            scene, which the blocks share.
-        images, resolution, hold_out, test_list: see `TrainOptions`. Photos that are held out are in
-            no block.
-
-    Raises:
-        UserError: a value out of its range.
-    """
-
-    blocks: int = setting(4, "Number of blocks.", least=1, most=MOST_BLOCKS)
-    margin: float = setting(0.2, "Share of the size of a cell.", least=0.0, most=10.0)
-    recipe: str = setting("default", "Name of the recipe.", check=check_recipe)
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    images: str | None = None
-    resolution: int | None = option.resolution()
-    hold_out: int | None = option.hold_out()
-    test_list: Path | None = None
 
 
 def plan_blocks(

@@ -8,8 +8,9 @@ from pathlib import Path
 from snowsplat.pipeline.blocks.plan import Block, Plan
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.train_result import TrainResult
-from snowsplat.pipeline.train import TrainOptions, resume, train
+from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.run_lock import InUse, one_run

@@ -13,7 +13,7 @@ from snowsplat.util.errors import UserError
 from snowsplat.util.interrupts import handle_again
 
 try:
-    from snowsplat.sfm.colmap.options import SfmOptions, SfmResult
+    from snowsplat.sfm.colmap.options import SfmResult
     from snowsplat.sfm.colmap.process.child import estimate_poses
     from snowsplat.sfm.colmap.result import describe_model
 except ModuleNotFoundError as error:
@@ -25,4 +25,4 @@ except ModuleNotFoundError as error:
     ) from None
 handle_again()
 
-__all__ = ["SfmOptions", "SfmResult", "describe_model", "estimate_poses"]
+__all__ = ["SfmResult", "describe_model", "estimate_poses"]

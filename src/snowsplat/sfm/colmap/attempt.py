@@ -23,11 +23,12 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress, extract_features
 from snowsplat.sfm.colmap.lenses.lens import Lens, Refine, misfit, settled, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
-from snowsplat.sfm.colmap.options import Effort, Mapper, detection_size
+from snowsplat.sfm.colmap.options import Effort, detection_size
 from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
 from snowsplat.sfm.colmap.pairs.pair_matching import match_pairs, verify_pairs
 from snowsplat.sfm.colmap.pairs.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.options import Mapper
 
 #: "plain": the incremental mapper with COLMAP's own order of registration.
 AnyMapper = Mapper | Literal["plain"]

@@ -1,15 +1,13 @@
-"""Settings and result of structure from motion, and the parameters of each effort level."""
+"""The result of structure from motion, and the parameters of each effort level."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
+from snowsplat.sfm.options import EffortName
 from snowsplat.util.machine import processor_count
-
-Mapper = Literal["incremental", "global"]
-EffortName = Literal["draft", "normal", "best"]
 
 # The camera models of COLMAP that can be undistorted to pinhole cameras.
 CAMERA_MODELS = (
@@ -31,22 +29,6 @@ CAMERA_MODELS = (
 )
 #: The camera model of 360° panoramas, twice as wide as high.
 PANORAMA_MODEL = "EQUIRECTANGULAR"
-
-
-@dataclass(frozen=True)
-class SfmOptions:
-    """Options of the pose estimation."""
-
-    # One of `CAMERA_MODELS`, or "auto": OPENCV if enough photos share a camera to determine its
-    # eight parameters, else SIMPLE_RADIAL; of a fisheye lens, OPENCV_FISHEYE or
-    # SIMPLE_RADIAL_FISHEYE. Panoramas (`Photo.panorama`) have their own model.
-    camera_model: str = "auto"
-    mapper: Mapper = "incremental"
-    effort: EffortName = "normal"
-    threads: int | None = None  # None: one per processor
-    # If this time is set, no further attempt begins that would probably end later. There is always
-    # a first attempt, and further ones until poses are found.
-    seconds: float | None = None
 
 
 @dataclass(frozen=True)

@@ -61,9 +61,10 @@ from snowsplat.sfm.colmap.lenses.lens import (
     focals_by_camera,
 )
 from snowsplat.sfm.colmap.mapping.mapping import write_models
-from snowsplat.sfm.colmap.options import Effort, Mapper, SfmOptions, SfmResult
+from snowsplat.sfm.colmap.options import Effort, SfmResult
 from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.options import Mapper, SfmOptions
 
 _ENOUGH = 0.9  # fraction of the usable photos that have to be registered
 # The expected time from the start of the job to the end of the next attempt, divided by the time

@@ -30,15 +30,13 @@ from snowsplat.sfm.ingest.photos.set_aside import set_fixed_parts_aside
 from snowsplat.sfm.ingest.search.sources import Source, Sources, find_sources
 from snowsplat.sfm.ingest.video.clip import Clip, max_frame_count, read_clip
 from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW, extract_frames
+from snowsplat.sfm.options import MIN_PHOTOS, GatherOptions
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import shown
 from snowsplat.util.natural_order import natural_key
 
 logger = logging.getLogger(__name__)
-
-_MIN_PHOTOS = 3  # minimum number of photos
-_MIN_SIZE = 128  # pixels
 
 
 @dataclass(frozen=True)
@@ -49,20 +47,6 @@ class Gathered:
     skipped: list[tuple[str, str]]  # file, or file and time of a frame; reason
     # Lines for the user about what was cropped and masked. Earlier versions did neither.
     notes: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class GatherOptions:
-    """Photos, frames and sizes to use. At most one of ``fps`` and ``frames`` may be set."""
-
-    fps: float | None = None  # frames per second to use of each video
-    frames: int | None = None  # maximum number of frames to use of each video
-    size: int | None = None  # resize to this longest side in pixels, if larger; None: keep
-    # Maximum number of photos; they are evenly spread in the order of their names. None: all.
-    photos: int | None = None
-    panoramas: bool = False  # all photos and videos show all directions; False: if they say so
-    # Photos in place keep their pixels as stored, because a model of these exists.
-    as_stored: bool = False
 
 
 def gather(
@@ -86,7 +70,8 @@ def gather(
             enough disk space, or photos used in place that would have to be changed.
         OSError: the dataset cannot be written.
     """
-    _check(options)
+    if options.fps is not None and options.frames is not None:
+        raise SettingError("fps", "cannot be combined with frames; set only one of them")
     sources = inputs if isinstance(inputs, Sources) else find_sources(inputs)
     folder = DatasetFolder(dataset).photos
     for note in sources.notes:
@@ -128,32 +113,9 @@ def gather(
         )
     if doubt := doubt_about_masks(looks):
         logger.warning("warning: %s", doubt)
-    if len(photos) < _MIN_PHOTOS:
+    if len(photos) < MIN_PHOTOS:
         raise _too_few(len(photos), skipped)
     return Gathered(photos, skipped, notes)
-
-
-def _check(options: GatherOptions) -> None:
-    if options.fps is not None and options.frames is not None:
-        raise SettingError("fps", "cannot be combined with frames; set only one of them")
-    if options.fps is not None and not (options.fps > 0 and math.isfinite(options.fps)):
-        raise SettingError("fps", "{fps:g} is not a positive number; use e.g. 2", fps=options.fps)
-    if options.frames is not None and options.frames < _MIN_PHOTOS:
-        raise SettingError(
-            "frames",
-            "{frames} is too few; use {min_photos} or more, e.g. 60",
-            frames=options.frames,
-            min_photos=_MIN_PHOTOS,
-        )
-    if options.photos is not None and options.photos < 1:
-        raise SettingError("photos", "{photos} is too few; use 1 or more", photos=options.photos)
-    if options.size is not None and options.size < _MIN_SIZE:
-        raise SettingError(
-            "size",
-            "{size} is too small; use {min_size} or more",
-            size=options.size,
-            min_size=_MIN_SIZE,
-        )
 
 
 def _with_panoramas(photos: list[Photo]) -> list[Photo]:
@@ -288,7 +250,7 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
             "photos: {count}; use at least {min_photos}, preferably 20 or more, from different "
             "places around the scene{left_out}",
             count=_count(usable),
-            min_photos=_MIN_PHOTOS,
+            min_photos=MIN_PHOTOS,
             left_out=left_out,
         )
     if reason == SAME_VIEW:
@@ -326,7 +288,7 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
         who=who,
         first=first,
         reason=reason,
-        min_photos=_MIN_PHOTOS,
+        min_photos=MIN_PHOTOS,
     )
 
 

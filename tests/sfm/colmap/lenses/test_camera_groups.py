@@ -22,9 +22,10 @@ from snowsplat.sfm.colmap.lenses.camera_groups import (
 )
 from snowsplat.sfm.colmap.lenses.lens import Lens, camera_ids
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
-from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions
+from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.colmap.pairs.choice import PairChoice
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 
 from .. import walks

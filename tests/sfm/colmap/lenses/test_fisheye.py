@@ -14,8 +14,9 @@ from snowsplat.sfm.colmap.features.extraction import WorkerProgress
 from snowsplat.sfm.colmap.lenses.fisheye import lens_evidence
 from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
-from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions
+from snowsplat.sfm.colmap.options import CAMERA_MODELS
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.synthetic.lens import Lens as PhoneLens
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.sfm.colmap import SfmOptions, estimate_poses
+from snowsplat.sfm.colmap import estimate_poses
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 

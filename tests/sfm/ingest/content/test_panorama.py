@@ -14,7 +14,8 @@ from snowsplat.sfm.ingest.content.panorama import (
     shows_all_around,
     spherical_video,
 )
-from snowsplat.sfm.ingest.inputs import GatherOptions, gather
+from snowsplat.sfm.ingest.inputs import gather
+from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.inputs import GatherOptions, gather
+from snowsplat.sfm.ingest.inputs import gather
+from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import silent
 
 from ...pictures import HEIGHT, WIDTH, pan, write_video

@@ -25,7 +25,8 @@ from snowsplat.sfm.colmap.lenses.lens import robust_adjustment
 from snowsplat.sfm.colmap.mapping.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.mapping.subset import spread_subset
 from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph
-from snowsplat.sfm.colmap.options import Mapper, photos_with_adjustment
+from snowsplat.sfm.colmap.options import photos_with_adjustment
+from snowsplat.sfm.options import Mapper
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import new_folder
 

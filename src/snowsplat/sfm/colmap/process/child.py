@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.project.dataset_folder import DatasetFolder
-from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmOptions, SfmResult, thread_count
+from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmResult, thread_count
 from snowsplat.sfm.colmap.process.growing_map import read_poses
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import Figures, Report, ShowPoses
 from snowsplat.util.errors import SettingError, UserError
 

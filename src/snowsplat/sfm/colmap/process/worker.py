@@ -26,10 +26,11 @@ import pycolmap
 
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.features.extraction import SEED, WorkerProgress
-from snowsplat.sfm.colmap.options import EFFORTS, SfmOptions, SfmResult, thread_count
+from snowsplat.sfm.colmap.options import EFFORTS, SfmResult, thread_count
 from snowsplat.sfm.colmap.process.growing_map import PoseMessages
 from snowsplat.sfm.colmap.reconstruct import PoseEstimation
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.options import SfmOptions
 from snowsplat.util.errors import UserError
 
 

@@ -1,0 +1,67 @@
+"""`MakeOptions`: what one can set of `make`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.options import common
+from snowsplat.pipeline.quality import Quality
+from snowsplat.sfm.options import DatasetOptions
+from snowsplat.training.settings.config import AutoOnOff, TrainConfig
+from snowsplat.util.settings import Settings, group, same, setting
+
+
+def _every(text: str) -> int | None:
+    """Raises ValueError: the text is neither a number from 2 on nor "none"."""
+    if text == "none":
+        return None
+    if not text.isdecimal() or int(text) < 2:
+        raise ValueError(f"{text!r} is not valid; use 2 or more, or none")
+    return int(text)
+
+
+@dataclass(frozen=True)
+class MakeOptions(Settings):
+    """Options of `make`.
+
+    Attributes:
+        minutes: see `make_plan` for the number of photos that are used.
+        marker: in metres; None: there are none.
+
+    Raises:
+        SettingError: a value is invalid.
+    """
+
+    quality: Quality | None = setting(
+        None,
+        "draft: a quick preview; best: takes several times as long as normal. With `minutes`, the "
+        "quality determines only the effort to estimate the camera poses; the training uses the "
+        "remaining time.",
+        "normal; with --minutes, chosen for this time",
+        metavar="{draft,normal,best}",
+    )
+    minutes: float | None = common.minutes(
+        "Finish within this time. If there are too many photos for this time, some of them are "
+        "used, evenly spread by name. If an earlier run was interrupted, the time of its finished "
+        "stages is not counted, and its training resumes with the time that remained."
+    )
+    memory: int | str | None = common.memory()
+    hold_out: int | None = setting(
+        8,
+        "Hold out every N-th photo until the scene is evaluated. Then the scene is trained on all "
+        "photos for a moment; the printed PSNR is that of the scene before.",
+        least=2,
+        allowed="2 or more, or none",
+        parse=_every,
+        metavar="{none,N}",
+    )
+    title: str | None = setting(
+        None,
+        "The name of the scene in its report and on its pages.",
+        "the name of the input",
+        metavar="TEXT",
+    )
+    exposure: AutoOnOff = same(TrainConfig, "exposure", "auto")
+    marker: float | None = same(DatasetOptions, "marker", None)
+    compute: Compute = group(Compute, only=("device", "threads"))
