@@ -26,6 +26,7 @@ from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_aligned
 from snowsplat.evaluation.lpips import Lpips
+from snowsplat.evaluation.renderings import renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 
@@ -202,11 +203,8 @@ def evaluate_views(
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
     ahead = _PHOTOS_AHEAD * 3 * largest
     with ImageLoader(views, budget_bytes=ahead, device=device) as loader:
-        loader.prefetch(views)
-        for view in views:
-            photo = loader.get(view)
-            image = render(gaussians, view.camera, color, sh_degree).image
-            results.append(compare(image, photo.over(color), photo.mask, lpips, view.name))
+        for each in renderings(gaussians, views, loader, color, sh_degree=sh_degree, render=render):
+            results.append(compare(each.image, each.photo, each.mask, lpips, each.view.name))
             if on_view is not None:
                 on_view(results[-1])
     return Evaluation(results)

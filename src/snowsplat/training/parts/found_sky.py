@@ -108,7 +108,8 @@ class Sky:
         """(N,) bool: the points (N, 3) in the world frame, on the device of the views, that are not
         in the sky, although most of the photos that would show them show the sky there.
         """
-        before, shown = (torch.zeros(len(xyz), dtype=torch.int16, device=xyz.device) for _ in "12")
+        before = torch.zeros(len(xyz), dtype=torch.int16, device=xyz.device)
+        shown = torch.zeros_like(before)
         for camera, sky in self.views:
             x, y, depth = _pixels(camera, xyz)
             shown += depth > 0.0

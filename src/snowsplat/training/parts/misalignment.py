@@ -19,6 +19,7 @@ from torch import Tensor
 
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
+from snowsplat.evaluation.renderings import renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 from snowsplat.util.process import single_threaded
@@ -59,7 +60,6 @@ def misalignment(
     return shift * _diagonal(views) if shift >= SHIFTED else None
 
 
-@torch.no_grad()
 def shift_of(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -80,14 +80,19 @@ def shift_of(
     color = torch.tensor(background, dtype=torch.float32, device=device)
     diagonal = _diagonal(views)
     factor = min(_FACTORS, key=lambda factor: abs(math.log(factor * _DIAGONAL / diagonal)))
-    shifts = []
     with single_threaded(), ImageLoader(views, budget_bytes=0, device=device) as images:
-        images.prefetch(views, factor)
-        for view in views:
-            photo = images.get(view, factor)
-            camera = view.camera.downscaled(factor).to(device)
-            image = render(gaussians, camera, color, sh_degree).image.clamp(0.0, 1.0)
-            shifts.append(float(shift_between(image, photo.over(color), photo.mask).norm()))
+        shifts = [
+            float(shift_between(each.image, each.photo, each.mask).norm())
+            for each in renderings(
+                gaussians,
+                views,
+                images,
+                color,
+                downscale=factor,
+                sh_degree=sh_degree,
+                render=render,
+            )
+        ]
     return factor * sorted(shifts)[len(shifts) // 2] / diagonal
 
 

@@ -26,15 +26,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from snowsplat import ops
 from snowsplat.data.dataset import View
 from snowsplat.data.lens.resample import nearest
 from snowsplat.data.maps.normal_file import read_normal_file
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.render import RenderOutput, project
+from snowsplat.scene.render import RenderOutput
 from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
 from snowsplat.training.parts.part import Part
+from snowsplat.training.processes.shards import sharded_render
 from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.step.batch import BatchView
@@ -113,15 +113,14 @@ class NormalSupervision(Part):
         begun = run.step >= run.schedule.step_of(_FROM)
         if self.idle or not begun or bool(self.signs.any()):
             return
-        views = run.cameras.views()
+        views, render = run.cameras.views(), sharded_render(run.shards, with_depth=True)
         surfaces, stated, agreement = {}, {}, torch.zeros(3, device=run.device)
         for index, stored in self._maps.items():
             height, width = (max(3, side // _COARSE) for side in stored.shape[1:])
             camera = views[index].camera.scaled(width, height).to(run.device)
-            splats = run.shards.everywhere(project(run.gaussians, camera, run.sh_degree))
-            _, alpha, depth = ops.rasterize(splats, width, height, with_depth=True)
-            assert depth is not None
-            own, weight = surfaces_of(depth, alpha, camera)
+            shown = render(run.gaussians, camera, run.background.evaluation, run.sh_degree)
+            assert shown.depth is not None
+            own, weight = surfaces_of(shown.depth, shown.alpha, camera)
             surfaces[index] = own * (weight > 0.0)
             coarse = interpolate(stored[None].to(own), (height, width), mode="area")[0] / 127.0
             length = coarse.square().sum(0).sqrt()

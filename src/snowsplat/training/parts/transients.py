@@ -34,10 +34,8 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
-from snowsplat import ops
 from snowsplat.data.photos.decode import LoadedImage
-from snowsplat.scene.camera import Camera
-from snowsplat.scene.render import project
+from snowsplat.evaluation.renderings import renderings
 from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.view_residuals import (
     CellMap,
@@ -45,6 +43,7 @@ from snowsplat.training.parts.view_residuals import (
     cell_size,
     residuals_elsewhere,
 )
+from snowsplat.training.processes.shards import sharded_render
 from snowsplat.training.settings.config import AutoOnOff
 from snowsplat.training.step.batch import BatchView
 from snowsplat.util.messages import message
@@ -129,27 +128,20 @@ class Transients(Part):
         run.queue.continue_with(run.queue.order, run.step)
 
     def _compute(self, run: Run) -> None:
-        background, downscale = run.background.evaluation, run.downscale_at(run.step)
-
-        def with_depth(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-            splats = project(run.gaussians, camera.to(run.device), run.sh_degree)
-            image, alpha, depth = ops.rasterize(
-                run.shards.everywhere(splats),
-                camera.width,
-                camera.height,
-                background,
-                with_depth=True,
-            )
-            assert depth is not None
-            return image, alpha, depth
-
         views = run.dataset.train
         used = [i for i in range(len(views)) if i not in run.left_out]
-        run.photos.prefetch([views[i] for i in used], downscale)
-        maps = []
-        for i in used:
-            photo = run.photos.get(views[i], downscale)
-            maps.append(cell_map(views[i].camera, photo, downscale, background, with_depth))
+        # At the size of the training: Gaussians that were trained on larger photos are too small
+        # for reduced ones, and their rendering is too bright or too dark.
+        shown = renderings(
+            run.gaussians,
+            [views[i] for i in used],
+            run.photos,
+            run.background.evaluation,
+            downscale=run.downscale_at(run.step),
+            sh_degree=run.sh_degree,
+            render=sharded_render(run.shards, with_depth=True),
+        )
+        maps = [cell_map(each) for each in shown]
         found = _moving_cells(maps, [~self.masks[i] for i in used], self._mode)
         for i, cells in zip(used, found, strict=True):
             self.masks[i] = ~cells

@@ -21,6 +21,7 @@ from torch import Tensor
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_fit
+from snowsplat.evaluation.renderings import renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 from snowsplat.training.parts.part import Part
@@ -150,14 +151,20 @@ def unexplained_views(
     """
     if len(views) < _FEWEST_VIEWS:
         return ()
-    images.prefetch(views, _DOWNSCALE)
-    fits = np.empty((len(views), 2))
-    for fit, view in zip(fits, views, strict=True):
-        camera = view.camera.downscaled(_DOWNSCALE)
-        camera = camera.to(gaussians.means.device)
-        photo = images.get(view, _DOWNSCALE)
-        image = render(gaussians, camera, background, sh_degree).image.clamp(0.0, 1.0)
-        fit[:] = fitted(image, photo.over(background), photo.mask)
+    fits = np.array(
+        [
+            fitted(each.image, each.photo, each.mask)
+            for each in renderings(
+                gaussians,
+                views,
+                images,
+                background,
+                downscale=_DOWNSCALE,
+                sh_degree=sh_degree,
+                render=render,
+            )
+        ]
+    )
     poses = torch.stack([view.camera.cam_from_world.detach().cpu() for view in views])
     positions = torch.stack([view.camera.position.detach().cpu() for view in views])
     return standing_out(fits[:, 0], fits[:, 1], positions.numpy(), poses[:, 2, :3].numpy())

@@ -7,14 +7,14 @@ does not count. The depth of the rendering tells which cells of other photos sho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
-from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.evaluation.renderings import Rendering
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import DepthMap
 
@@ -45,42 +45,33 @@ class CellMap:
     places: DepthMap  # of the same size
 
 
-#: Gaussians in a view as an image (H, W, 3), alpha (H, W) and depth (H, W), not divided by alpha.
-DepthRenderer = Callable[[Camera], tuple[Tensor, Tensor, Tensor]]
-
-
 def cell_size(camera: Camera) -> tuple[int, int]:
     """Height and width of the map of a view."""
     reduced = camera.downscaled(CELL)
     return reduced.height, reduced.width
 
 
-def cell_map(
-    camera: Camera, photo: LoadedImage, downscale: int, background: Tensor, render: DepthRenderer
-) -> CellMap:
-    """The cells of a view.
-
-    Args:
-        camera: that of the view, at full size, on the CPU.
-        photo: reduced by ``downscale``.
-        downscale: that of the training: Gaussians that were trained on larger photos are too small
-            for this one, and their rendering is too bright or too dark.
-        background: (3,) colour in 0..1.
-        render: renders the scene over the background.
-    """
-    small = camera.downscaled(CELL)
+def cell_map(rendering: Rendering) -> CellMap:
+    """The cells of a view; its rendering has a depth."""
+    small = rendering.view.camera.downscaled(CELL)
     size = (small.height, small.width)
-    image, alpha, depth = render(camera.downscaled(downscale))
-    target = photo.over(background).permute(2, 0, 1)
-    planes = [image.clamp(0.0, 1.0).permute(2, 0, 1), target, alpha[None], depth[None]]
+    output, target = rendering.output, rendering.photo.permute(2, 0, 1)
+    assert output.depth is not None
+    planes = [
+        rendering.image.permute(2, 0, 1),
+        target,
+        output.alpha[None],
+        output.depth[None],
+    ]
     pooled = [adaptive_avg_pool2d(plane, size).cpu() for plane in planes]
     seen, shown, opaque, z = pooled
     usable = torch.ones(size, dtype=torch.bool)
-    if photo.mask is not None:
-        usable = adaptive_avg_pool2d(photo.mask[None].to(torch.float32), size)[0].cpu() == 1.0
+    if rendering.mask is not None:
+        mask = rendering.mask[None].to(torch.float32)
+        usable = adaptive_avg_pool2d(mask, size)[0].cpu() == 1.0
     residual = torch.where(usable, _residual(seen, shown, usable), 0.0)
     known = (opaque[0] >= _OPAQUE) & (z[0] > 0.0)
-    correlation = _correlation(image.mean(2), target.mean(0), size)
+    correlation = _correlation(output.image.mean(2), target.mean(0), size)
     return CellMap(
         residual, correlation, DepthMap(small, torch.where(known, opaque[0] / z[0], 0.0))
     )

@@ -146,14 +146,16 @@ def share(rows: int, rank: int, size: int) -> tuple[int, int]:
 _ALIGNMENT = 64
 
 
-def sharded_render(shards: Shards) -> Renderer:
+def sharded_render(shards: Shards, *, with_depth: bool = False) -> Renderer:
     """A function that renders the Gaussians of all processes; each process must call it."""
 
     def render(
         gaussians: Gaussians, camera: Camera, background: Tensor, sh_degree: int | None
     ) -> RenderOutput:
         splats = shards.everywhere(project(gaussians, camera, sh_degree))
-        image, alpha, _ = ops.rasterize(splats, camera.width, camera.height, background)
-        return RenderOutput(image, alpha, None, splats)
+        image, alpha, depth = ops.rasterize(
+            splats, camera.width, camera.height, background, with_depth=with_depth
+        )
+        return RenderOutput(image, alpha, depth, splats)
 
     return render
