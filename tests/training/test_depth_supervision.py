@@ -87,7 +87,7 @@ def depth_error(trainer: Trainer) -> float:
 
 def trained(data: Dataset, **settings) -> tuple[Trainer, list[str]]:
     lines: list[str] = []
-    trainer = Trainer(data, replace(CONFIG, **settings), note=lines.append)
+    trainer = Trainer(data, replace(CONFIG, **settings), note=lambda line: lines.append(str(line)))
     trainer.run()
     return trainer, lines
 
@@ -130,7 +130,7 @@ def test_a_map_that_contradicts_the_photos_is_dropped_and_named(tmp_path) -> Non
     data = dataset(tmp_path, "z")
     np.save(data.train[4].depth, 10.0 * np.load(data.train[4].depth))
     lines: list[str] = []
-    trainer = Trainer(data, CONFIG, note=lines.append)
+    trainer = Trainer(data, CONFIG, note=lambda line: lines.append(str(line)))
     part = trainer.part(DepthSupervision)
     part.errors[:] = torch.tensor([0.01, 0.005, -1.0, 0.01, 0.9, 0.01])
     trainer.step = round(CHECK_FROM * 60) - 1

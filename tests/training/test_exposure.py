@@ -168,7 +168,7 @@ def exposure_of(setting: str, dataset: Dataset, notes: list[str] | None = None) 
     exposure = Exposure(setting)
     with ImageLoader(dataset.train) as images:
         run = stage(dataset=dataset, images=images, shards=ALONE, resumed=False)
-        run.note = [].append if notes is None else notes.append
+        run.note = lambda line: None if notes is None else notes.append(str(line))
         exposure.prepare(run)
     return exposure
 
@@ -192,7 +192,7 @@ def test_the_decision(clean, degraded):
     assert not exposure_of("auto", replace(degraded, points=None), notes).active
     assert "not known" in notes[-1]
     assert len(notes) == 4
-    off = Trainer(same, replace(CONFIG, exposure="off"), note=notes.append)
+    off = Trainer(same, replace(CONFIG, exposure="off"), note=lambda line: notes.append(str(line)))
     assert off.part(Exposure) is None
     assert len(notes) == 4
 
@@ -200,7 +200,7 @@ def test_the_decision(clean, degraded):
 def test_a_training_without_gains_is_told_that_exposures_differ(clean, degraded, tmp_path):
     notes: list[str] = []
     observer = Observer()
-    observer.note = notes.append
+    observer.note = lambda line: notes.append(str(line))
 
     def told(folder: Path, **settings: object) -> bool:
         notes.clear()

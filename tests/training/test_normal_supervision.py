@@ -153,7 +153,7 @@ def with_normals(data: Dataset, signs: tuple[int, int, int]) -> Dataset:
 
 def trained(data: Dataset, **settings) -> tuple[Trainer, list[str]]:
     lines: list[str] = []
-    trainer = Trainer(data, replace(CONFIG, **settings), note=lines.append)
+    trainer = Trainer(data, replace(CONFIG, **settings), note=lambda line: lines.append(str(line)))
     trainer.run()
     return trainer, lines
 

@@ -116,7 +116,7 @@ def test_a_failed_recording_is_reported_once(dataset: Dataset) -> None:
     notes: list[str] = []
     expected = losses(Trainer(dataset, BUSY), 9)
     trainer = Trainer(dataset, BUSY)
-    trainer.graphs = ViewGraphs(Failing(), notes.append)
+    trainer.graphs = ViewGraphs(Failing(), lambda line: notes.append(str(line)))
     assert losses(trainer, 9) == expected
     assert notes == ["training continues without CUDA graphs, more slowly: no memory"]
 

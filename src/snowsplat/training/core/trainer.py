@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.regularizers import add_regularizers
 from snowsplat.training.core.run import Run
-from snowsplat.training.step.batch import BatchView, batch_gradients
+from snowsplat.training.step.batch import Batch, BatchView, batch_gradients
 from snowsplat.training.step.view_gradient import ViewGradient
 from snowsplat.util.interrupts import interrupts_between_steps
 from snowsplat.util.process import single_threaded
@@ -86,7 +86,7 @@ class Trainer(Run):
         self.within_step = False
         return sum(losses) / len(losses)
 
-    def _optimize(self, step: int, batch: Sequence[BatchView]) -> None:
+    def _optimize(self, step: int, batch: Batch) -> None:
         """Rasterize, compare with the photos, and update the Gaussians."""
         gradients = self._gradients(step, batch)
         for part in reversed(self.parts):
@@ -94,7 +94,7 @@ class Trainer(Run):
         add_regularizers(self)
         self.optimizer.step(self.gaussians, gradients, step)
 
-    def _gradients(self, step: int, batch: Sequence[BatchView]) -> list[ViewGradient]:
+    def _gradients(self, step: int, batch: Batch) -> list[ViewGradient]:
         sh_degree = self.config.sh_degree_at(step)
         # Recordings contain neither `_background` nor `_loss`, which a subclass may replace.
         kind = type(self)

@@ -12,13 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import torch
 from torch import Tensor
 
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.density.adaptive import AdaptiveDensityControl
 from snowsplat.training.density.mcmc import McmcDensityControl
-from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.density import (
     DENSITY_CONTROLS,
     AdaptiveDensity,
@@ -27,7 +25,6 @@ from snowsplat.training.settings.density import (
     McmcDensity,
     register_density,
 )
-from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.step.optim import Adam
 from snowsplat.training.step.view_gradient import ViewGradient
 
@@ -86,37 +83,18 @@ _STATES: dict[type, Callable[..., DensityControl]] = {
 }
 
 
-def density_control(
-    settings: Any,
-    count: int,
-    *,
-    schedule: Schedule,
-    extent: float,
-    random_init: bool,
-    generator: torch.Generator,
-    device: torch.device | None = None,
-    shards: Shards = ALONE,
-) -> DensityControl:
+def density_control(settings: Any, count: int, **state: Any) -> DensityControl:
     """The initial state of a density control.
 
     Args:
         settings: a `DensityConfig`. If it is from outside of the package, it has a method
             ``control`` with the other arguments of this function, which returns the state.
         count: number of Gaussians of this process.
-        extent: extent of the scene, in world units.
-        random_init: whether training starts from random points instead of SfM points.
-        generator: a random generator on the CPU.
-        device: the device of the Gaussians; default: the CPU.
-        shards: the processes of the training; default: this one alone.
+        state: schedule (`Schedule`); extent, of the scene in world units; random_init, whether
+            training starts from random points instead of SfM points; generator, a random generator
+            on the CPU; device, of the Gaussians, default: the CPU; shards, the processes of the
+            training, default: this one alone.
     """
-    state: dict[str, Any] = {
-        "schedule": schedule,
-        "extent": extent,
-        "random_init": random_init,
-        "generator": generator,
-        "device": device,
-        "shards": shards,
-    }
     if hasattr(settings, "control"):
         made: DensityControl = settings.control(count, **state)
         return made

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,8 +10,7 @@ from torch import Tensor
 from snowsplat.training.density import DensityConfig, DensityControl, density_control
 from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.init import starts_at_random
-from snowsplat.training.step.batch import BatchView
-from snowsplat.training.step.view_gradient import ViewGradient
+from snowsplat.training.step.batch import Batch, Gradients
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
@@ -71,13 +69,7 @@ class Densification(Part):
         """See `DensityControl.after_step`."""
         run.gaussians = self.control.after_step(run.step, run.gaussians, run.optimizer)
 
-    def gradients(
-        self,
-        run: Run,
-        step: int,
-        batch: Sequence[BatchView],
-        gradients: Sequence[ViewGradient],
-    ) -> None:
+    def gradients(self, run: Run, step: int, batch: Batch, gradients: Gradients) -> None:
         """See `DensityControl.after_backward`."""
         for gradient in gradients:
             self.control.after_backward(step, run.gaussians, gradient)

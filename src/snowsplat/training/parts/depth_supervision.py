@@ -19,7 +19,6 @@ is not used any more (`CHECK_FROM`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -30,7 +29,7 @@ from snowsplat.scene.render import RenderOutput
 from snowsplat.training.parts.part import Part
 from snowsplat.training.starts.depth import aligned_depth_map, contradicts
 from snowsplat.training.starts.depth_map import LONGER_SIDE
-from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.batch import Batch, BatchView
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
@@ -128,7 +127,7 @@ class DepthSupervision(Part):
         self._present[view] = error  # if a step is repeated, this replaces that of the last attempt
         return self.weight * term
 
-    def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
+    def after_step(self, run: Run, step: int, batch: Batch) -> None:
         """Keep the errors of the batch, in every process."""
         if self.idle:
             return

@@ -19,7 +19,6 @@ Where a photo is overexposed, it only says that the image is at least as bright;
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -30,7 +29,7 @@ from snowsplat.training.parts.exposed_image import ExposedImages
 from snowsplat.training.parts.exposure_start import GAMMA, ExposureStart, exposure_start
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.parts.part import Part
-from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.batch import Batch, BatchView
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
@@ -121,7 +120,7 @@ class Exposure(Part):
         same = view.photo is not None and photo.planes is view.photo.planes
         return self._images.exposed(image, self._present[view], photo, view.index if same else None)
 
-    def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
+    def after_step(self, run: Run, step: int, batch: Batch) -> None:
         """Update the gains of the photos of the batch."""
         if not self.active:
             return

@@ -18,7 +18,6 @@ A part does not know any other part. What several parts need is in the `Run`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
@@ -27,8 +26,7 @@ from snowsplat.data.dataset import Points
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
-from snowsplat.training.step.batch import BatchView
-from snowsplat.training.step.view_gradient import ViewGradient
+from snowsplat.training.step.batch import Batch, BatchView, Gradients
 
 if TYPE_CHECKING:  # these modules import this one
     from snowsplat.training.core.run import Run
@@ -113,13 +111,7 @@ class Part:
         """
         return None
 
-    def gradients(
-        self,
-        run: Run,
-        step: int,
-        batch: Sequence[BatchView],
-        gradients: Sequence[ViewGradient],
-    ) -> None:
+    def gradients(self, run: Run, step: int, batch: Batch, gradients: Gradients) -> None:
         """Called before the optimiser: may read or change the gradient of each view of the batch,
         ``gradient.packed_grad``, in place. It must not wait for a GPU, and must not change the
         state of the part if ``gradient.valid`` is False on the device; see `ViewGradient`.
@@ -133,7 +125,7 @@ class Part:
         """
         return None
 
-    def after_step(self, run: Run, step: int, batch: Sequence[BatchView]) -> None:
+    def after_step(self, run: Run, step: int, batch: Batch) -> None:
         """Called after the optimiser, when the step is known to be valid."""
 
     # In checkpoints

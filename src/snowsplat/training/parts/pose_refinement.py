@@ -22,7 +22,6 @@ moves, and the training is that without refinement, to the bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -35,7 +34,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.training.parts.misalignment import shift_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
-from snowsplat.training.step.batch import BatchView
+from snowsplat.training.step.batch import Batch, Gradients
 from snowsplat.training.step.view_gradient import ViewGradient
 
 if TYPE_CHECKING:
@@ -137,13 +136,7 @@ class PoseRefinement(Part):
         self._state["exact"].fill_(1.0 if shift < EXACT else -1.0)
         self._read_state()
 
-    def gradients(
-        self,
-        run: Run,
-        step: int,
-        batch: Sequence[BatchView],
-        gradients: Sequence[ViewGradient],
-    ) -> None:
+    def gradients(self, run: Run, step: int, batch: Batch, gradients: Gradients) -> None:
         """Move the cameras of a batch, before the Gaussians are updated."""
         if self._exact >= 0.0:
             return

@@ -35,8 +35,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
 from snowsplat.training.parts.part import Part
-from snowsplat.training.step.batch import BatchView, rounds
-from snowsplat.training.step.view_gradient import ViewGradient
+from snowsplat.training.step.batch import Batch, Gradients, rounds
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
@@ -66,13 +65,7 @@ class Surfaces(Part):
             flatter = torch.maximum(smallest + times * math.log(_SHRINK), flat)
             scales.scatter_(1, scales.argmin(1, keepdim=True), flatter[:, None])
 
-    def gradients(
-        self,
-        run: Run,
-        step: int,
-        batch: Sequence[BatchView],
-        gradients: Sequence[ViewGradient],
-    ) -> None:
+    def gradients(self, run: Run, step: int, batch: Batch, gradients: Gradients) -> None:
         """Add those of the consistency, in one step of `_EVERY`; see the module."""
         times = run.schedule.multiples(step, _EVERY)
         if step <= run.schedule.step_of(_FROM) or not times:

@@ -37,6 +37,11 @@ class BatchView:
     background: Tensor  # (3,)
 
 
+#: The views of a step, and the gradient of each.
+Batch = Sequence[BatchView]
+Gradients = Sequence[ViewGradient]
+
+
 def rounds(batch: Sequence[Each], size: int) -> list[Sequence[Each]]:
     """The views, or one value for each, in groups of at most ``size``: in each round, process i
     blends view i.
@@ -46,7 +51,7 @@ def rounds(batch: Sequence[Each], size: int) -> list[Sequence[Each]]:
 
 def batch_gradients(
     gaussians: Gaussians,
-    batch: Sequence[BatchView],
+    batch: Batch,
     runner: StepRunner,
     shards: Shards,
     sh_degree: int,
