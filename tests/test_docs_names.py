@@ -16,9 +16,12 @@ from pathlib import Path
 import pytest
 
 import snowsplat
+from snowsplat import extras
 from snowsplat.cli import main as cli
 
 from .walk_throughs import FOLDER, walk_throughs
+
+extras.register()
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
