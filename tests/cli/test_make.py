@@ -16,9 +16,10 @@ from snowsplat.formats import read_gaussians
 from snowsplat.pipeline import all_photos, make_plan
 from snowsplat.pipeline import make as make_module
 from snowsplat.pipeline.evaluate import evaluate
-from snowsplat.pipeline.make import RECORD, STAGES
+from snowsplat.pipeline.make import STAGES
 from snowsplat.pipeline.output.scene_source import load_trained, load_viewable
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.project.project import MAKE_RECORD as RECORD
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.sfm import cost
@@ -123,20 +124,6 @@ def test_from_photos_to_files_and_repeated_stages(run, refused, photos, tmp_path
     before = state(out)
     assert "--overwrite" in refused("make", fewer, "-o", out, "--quality", "draft")
     assert state(out) == before
-
-
-@pytest.mark.sfm
-def test_a_folder_of_version_0_1_is_continued(run, photos, tmp_path, monkeypatch):
-    """There, the dataset was in the folder "capture", whose name is also a key in make.json."""
-    monkeypatch.setitem(PRESETS, "draft", replace(QUICK, iterations=20))
-    out, command = tmp_path / "out", ("make", photos, "--quality", "draft", "--threads", 1, "-o")
-    with monkeypatch.context() as former:
-        former.setattr(make_module, "DATASET", "capture")
-        assert run(*command, out).code == 0
-    again = run(*command, out)
-    assert again.code == 0, again.err
-    assert again.out.count("done before") == 7
-    assert not (out / "dataset").exists()
 
 
 def test_the_last_part_uses_all_photos_and_the_figures_are_those_before(

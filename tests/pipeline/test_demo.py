@@ -7,6 +7,7 @@ import torch
 from snowsplat.data.colmap import ColmapImage, write_model
 from snowsplat.data.lens.models import lens_of
 from snowsplat.pipeline.demo import compare_with_truth, is_accurate
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.synthetic import Truth
 from snowsplat.synthetic.lens import Lens
@@ -30,6 +31,6 @@ def test_wrong_or_missing_poses_fail(tmp_path, moved, count, near):
     camera = lens_of("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
     nothing = np.zeros((0, 3))
     write_model(tmp_path / "sparse" / "0", {1: camera}, images, nothing, nothing.astype(np.uint8))
-    errors = compare_with_truth(tmp_path, TRUTH.poses)
+    errors = compare_with_truth(DatasetFolder(tmp_path), TRUTH.poses)
     assert is_accurate(errors) is near
     assert len(errors.missing) == 20 - count

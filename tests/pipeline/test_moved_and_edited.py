@@ -92,23 +92,20 @@ def test_make_keeps_its_name_if_only_the_photos_were_renamed(
 ):
     done = {"photos": Outcome({}, 0.0, same)}
     monkeypatch.setattr(make, "make_dataset", lambda *args, **flags: done)
-    job = make._Job([tmp_path], "new", tmp_path, make.MakeOptions(), False, SILENT, None, 0.0)
-    job.sources, job.plan = Sources((tmp_path,), [], [], []), MakePlan("draft", 9)
-    job.given = None
-    job.stages = Stages(tmp_path / "make.json", make.STAGES)
-    job.stages.about = {"name": recorded}
-    job._make_dataset()
+    stages, sources = Stages(tmp_path / "make.json", make.STAGES), Sources((tmp_path,), [], [], [])
+    stages.about = {"name": recorded}
+    inputs = tmp_path, "new", sources, None, stages
+    job = make._Job(*inputs, make.MakeOptions(), False, SILENT, None, 0.0)
+    job._make_dataset(MakePlan("draft", 9))
     assert (job.file, job.stages.about["name"]) == (tmp_path / f"{name}.ply", name)
 
 
 def test_make_leaves_the_comparison_of_photos_to_their_dataset(tmp_path):
     """Their folder may have been renamed. Without a dataset, the scene may be that of another."""
-    job = make._Job([tmp_path], "new", tmp_path, make.MakeOptions(), False, SILENT, None, 0.0)
-    job.sources = Sources((tmp_path,), [], [], [])
-    job.stages = Stages(tmp_path / "make.json", make.STAGES)
-    job.stages.about = {"inputs": ["/old"]}
+    sources, stages = Sources((tmp_path,), [], [], []), Stages(tmp_path / "make.json", make.STAGES)
+    stages.about = {"inputs": ["/old"]}
     with pytest.raises(UserError, match="contains a scene made from /old"):
-        job._check_inputs()
+        make._check_inputs(tmp_path, sources, stages, overwrite=False)
     (tmp_path / "dataset").mkdir()
-    job._check_inputs()
-    assert job.stages.about["inputs"] == [str(tmp_path)]
+    make._check_inputs(tmp_path, sources, stages, overwrite=False)
+    assert stages.about["inputs"] == [str(tmp_path)]

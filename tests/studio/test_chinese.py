@@ -54,7 +54,6 @@ def test_progress_and_verdict():
         described("images", images)[0],
         described("images", images | {"resampled": False})[0],
         *described("scene", {"iteration": 900, "psnr": 28.3, "size": "533x948"}),
-        *described("scene", {"iteration": 900, "psnr": 28.3}),
         *described("pictures", {}),
         *described("all", {"steps": 90, "photos": 50}),
         *described("all", {"steps": 90, "photos": 50, "left_out": 2}),

@@ -72,7 +72,7 @@ class Demo(Command):
                 file=sys.stderr,
             )
             return Exit(1)
-        scene = result.made.folder.path.parent
+        scene = result.made.project.path
         if not self.open:
             print(message("\n{see_and_share}", see_and_share=see_and_share(scene)))
             print("with your own photos: snowsplat make PHOTOS")

@@ -23,7 +23,7 @@ from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group, setting, switch
 
 if TYPE_CHECKING:
-    from snowsplat.pipeline.make import MakeResult
+    from snowsplat.pipeline.make_result import MakeResult
     from snowsplat.pipeline.run.live_page import LivePage
 
 
@@ -96,10 +96,10 @@ class Make(JsonCommand):
                 )
                 return Exit(130)
             print_summary(result)
-            print("\n" + see_and_share(result.folder.path.parent), flush=True)
+            print("\n" + see_and_share(result.project.path), flush=True)
             if page is not None:
                 self._show(result, page)
-        return {**vars(result), "folder": result.folder.path}
+        return result.as_json()
 
     def _show(self, made: MakeResult, page: LivePage) -> None:
         """Show the scene until Ctrl-C, on the page of the training if there was one."""
@@ -114,12 +114,12 @@ class Make(JsonCommand):
         from snowsplat.pipeline.watch import watch
 
         with WatchObserver() as observer:
-            watch(made.folder.path, page, compute=self.options.compute, observer=observer)
+            watch(made.training.path, page, compute=self.options.compute, observer=observer)
 
 
 def print_summary(made: MakeResult) -> None:
     """Print the files of a finished scene, its quality, and the verdict."""
-    poses = made.dataset_report or f"those of {made.dataset} are used"
+    poses = made.dataset_report or f"those of {made.dataset.path} are used"
     print(
         message(
             "\nThe scene, for any viewer:  {scene} ({st_size})\n{what:27} {poses}\nReport on the "
@@ -128,7 +128,7 @@ def print_summary(made: MakeResult) -> None:
             st_size=format_bytes(made.scene.stat().st_size),
             what="Report on camera poses:" if made.dataset_report else "Camera poses:",
             poses=poses,
-            report=made.folder.report,
+            report=made.training.report,
             quality=_quality(made),
             seconds=duration(made.seconds),
         )
@@ -140,21 +140,22 @@ def print_summary(made: MakeResult) -> None:
 
 def _quality(made: MakeResult) -> str:
     """The lines about the held-out photos; "" if there are none."""
-    if made.psnr is None:
+    known = made.figures
+    if known.psnr is None:
         return ""
-    aligned = f"colour-aligned PSNR {made.psnr_aligned:.2f} dB"
-    figures = f"PSNR {made.psnr:.2f} dB, {aligned}, SSIM {made.ssim:.3f}"
-    if made.exposures:  # the scene has the mean exposure of the photos, not that of each of them
-        figures = f"{aligned} (gains of exposure are learnt), SSIM {made.ssim:.3f}"
-    photos = "1 photo" if made.views == 1 else f"{made.views} photos"
+    aligned = f"colour-aligned PSNR {known.psnr_aligned:.2f} dB"
+    figures = f"PSNR {known.psnr:.2f} dB, {aligned}, SSIM {known.ssim:.3f}"
+    if known.exposures:  # the scene has the mean exposure of the photos, not that of each of them
+        figures = f"{aligned} (gains of exposure are learnt), SSIM {known.ssim:.3f}"
+    photos = "1 photo" if known.views == 1 else f"{known.views} photos"
     lines = [
         f"Rendered test views:        {made.renders}",
         f" and held-out photos:       {made.photos}",
-        f"Quality of these views:     {figures} ({photos} of {made.size})",
+        f"Quality of these views:     {figures} ({photos} of {known.size})",
     ]
-    if made.all_photos:
+    if made.last_part.steps:
         lines.append(
             "                            before the last part, which has used "
-            + photos_of_last_part(made.all_photos, made.left_out)
+            + photos_of_last_part(made.last_part.photos, made.last_part.left_out)
         )
     return "\n".join(lines) + "\n"

@@ -39,9 +39,8 @@ _LAST_STRETCHES = 10
 
 @dataclass(frozen=True)
 class LastPart:
-    """The result of `train_on_all`."""
+    """What `train_on_all` has done. All fields can be stored as JSON."""
 
-    gaussians: Gaussians | None = None  # the scene; None if there was no last part
     steps: int = 0
     photos: int = 0  # their number
     left_out: int = 0  # the number of photos that the scene does not explain
@@ -50,13 +49,15 @@ class LastPart:
 
 def train_on_all(
     folder: TrainingFolder, iteration: int, seconds: float, compute: Compute, observer: Observer
-) -> LastPart:
+) -> tuple[LastPart, Gaussians | None]:
     """Continue a finished training with all photos; writes nothing.
 
     Photos that the training has left out remain so, and so do held-out photos that the scene does
     not explain. There is no last part if something moves in the photos, because it is not known in
     the held-out ones, or if there are fewer than `_LOOKS` steps for each photo: with many photos,
     or little time, the last part would change little.
+
+    Returns: what was done, and the scene; None if there was no last part.
 
     Args:
         iteration: of the scene to begin with.
@@ -65,7 +66,7 @@ def train_on_all(
     Raises: UserError: scene, settings, dataset or a photo are missing or damaged.
     """
     if folder.masks.is_dir():
-        return LastPart(why_not="something moves in the photos")
+        return LastPart(why_not="something moves in the photos"), None
     scene = load_trained(folder.path, iteration=iteration, compute=compute)
     left_out = {each.photo for each in folder.left_out()}
     used = [view for view in scene.dataset.train if view.name not in left_out]
@@ -76,7 +77,7 @@ def train_on_all(
         pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
         steps = min(steps, int(seconds / pace)) if pace > 0 else 0
     if steps < _LOOKS * len(views):
-        return LastPart(why_not="it would use each photo less than twice")
+        return LastPart(why_not="it would use each photo less than twice"), None
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
     with ImageLoader(views, device=background.device) as images:
         wrong = unexplained_views(
@@ -102,7 +103,7 @@ def train_on_all(
     with observer.stepping(0, steps):
         trainer.run(observer.step)
     photos = len(scene.dataset.train) + len(scene.dataset.test)
-    return LastPart(trainer.gaussians.detach(), steps, len(views), photos - len(views))
+    return LastPart(steps, len(views), photos - len(views)), trainer.gaussians.detach()
 
 
 def _last_config(

@@ -192,8 +192,8 @@ def _decimation(
         training = scenes[0].training
         if training is None:
             return Decimation(observer=observer)
-        cameras, background = cameras_of(training)[1], training.background()
-        return Decimation(cameras, background, training.origin(), observer=observer)
+        known = cameras_of(training)[1], training.background(), training.origin()
+        return Decimation(*known, observer=observer)
     if edits.decimate is None:
         raise SettingError("refine", "is for decimated scenes; set `decimate` as well")
     if edits.crop:

@@ -10,9 +10,11 @@ from pathlib import Path
 from torch import Tensor
 
 from snowsplat.data.colmap import posed_camera, read_model
-from snowsplat.pipeline.make import MakeResult, make
+from snowsplat.pipeline.make import make
+from snowsplat.pipeline.make_result import MakeResult
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.synthetic import Truth, write_synthetic_photos
 from snowsplat.synthetic.compare_poses import PoseErrors, compare_poses
 from snowsplat.util.errors import UserError
@@ -56,11 +58,10 @@ def demo(output: Path | str, *, observer: Observer = SILENT) -> DemoResult:
     truth = _take_photos(out / PHOTOS, observer)
     truth.write(out / TRUTH)
     made = make(out / PHOTOS, out / MADE, _OPTIONS, observer=observer)
-    dataset = made.dataset
     # On a slow machine, `make` uses only some of the photos, to finish in time.
-    used = {path.name for path in (dataset / "input").iterdir()}
+    used = {path.name for path in made.dataset.photos.iterdir()}
     poses = {name: pose for name, pose in truth.poses.items() if name in used}
-    errors = compare_with_truth(dataset, poses)
+    errors = compare_with_truth(made.dataset, poses)
     return DemoResult(out / PHOTOS, out / TRUTH, made, errors)
 
 
@@ -81,12 +82,12 @@ def _take_photos(folder: Path, observer: Observer) -> Truth:
     return truth
 
 
-def compare_with_truth(dataset: Path, poses: Mapping[str, Tensor]) -> PoseErrors:
+def compare_with_truth(dataset: DatasetFolder, poses: Mapping[str, Tensor]) -> PoseErrors:
     """The errors of the poses of a dataset; ``poses`` are the true ones, as in `Truth`.
 
     Raises: ValueError: fewer than three photos have poses.
     """
-    model = read_model(dataset / "sparse" / "0")
+    model = read_model(dataset.model)
     found = {image.name: posed_camera(model, image).cam_from_world for image in model.images}
     return compare_poses(found, poses)
 

@@ -5,7 +5,6 @@ If the input is a dataset, its camera poses are used, unless they are impossible
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 import time
@@ -17,10 +16,10 @@ from typing import Any
 
 from snowsplat import ops
 from snowsplat.data import Dataset
-from snowsplat.evaluation.verdict import Verdict
-from snowsplat.pipeline.all_photos import SHARE, train_on_all
+from snowsplat.pipeline.all_photos import SHARE, LastPart, train_on_all
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
+from snowsplat.pipeline.make_result import Figures, MakeResult
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.options.train import TrainOptions
@@ -29,10 +28,11 @@ from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.quality import PRESETS, Preset
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.photo_stamps import stamps_of
+from snowsplat.pipeline.run.photo_stamps import hash_of_dataset, hash_of_files
+from snowsplat.pipeline.run.training_files import read_dataset
 from snowsplat.pipeline.train import resume, train
-from snowsplat.project.dataset_folder import REPORT
-from snowsplat.project.project import MAKE_RECORD as RECORD
+from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.project import MAKE_RECORD, Project
 from snowsplat.project.training_folder import (
     DATASET,
     SCENE,
@@ -40,7 +40,7 @@ from snowsplat.project.training_folder import (
     TrainingFolder,
 )
 from snowsplat.sfm.cost import measure_speed
-from snowsplat.sfm.ingest.search.sources import find_sources
+from snowsplat.sfm.ingest.search.sources import Sources, find_sources
 from snowsplat.sfm.make_dataset import make_dataset
 from snowsplat.sfm.options import DatasetOptions, GatherOptions, SfmOptions
 from snowsplat.sfm.survey import survey
@@ -52,7 +52,8 @@ from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import atomic_path, remove_temporaries
 from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, one_run
-from snowsplat.util.stages import Outcome, Stages
+from snowsplat.util.safe_json import from_json
+from snowsplat.util.stages import Stages
 
 STAGES = ("scene", "pictures", "all")  # `make_dataset` records its own stages
 # The fields of a preset that affect the training.
@@ -68,49 +69,6 @@ _MIN_SECONDS = 15.0
 _MIN_SHARE = 0.15
 # Approximate time to render one held-out view, in seconds.
 _RENDER_SECONDS = 0.3
-
-
-@dataclass(frozen=True)
-class MakeResult:
-    """A finished scene.
-
-    Attributes:
-        scene: the PLY file.
-        folder: the output folder of the training.
-        dataset: the folder of the dataset that the scene is trained from.
-        dataset_report: the HTML page about the camera poses; None if the input has poses.
-        renders, photos: folders with the rendered test views and the held-out photos.
-        all_photos: the number of photos of the last part of the training, which follows the
-            evaluation and uses the held-out photos, too; 0 if there was none.
-        left_out: the number of photos that the last part leaves out, because the scene does not
-            explain them.
-        psnr, ssim, psnr_aligned: means over the held-out photos, before the last part; PSNR in
-            dB. If gains of exposure are learnt, the colour-aligned PSNR tells the quality. None if
-            no photos were held out.
-        size: of the images of which these are the means, in pixels, as text.
-        views: number of held-out photos.
-        exposures: whether gains of exposure are learnt.
-        verdict: whether the scene is good, usable or poor, and why; None if it is not known, as for
-            a scene of an earlier version.
-        seconds: duration of this call.
-    """
-
-    scene: Path
-    folder: TrainingFolder
-    dataset: Path
-    dataset_report: Path | None
-    renders: Path
-    photos: Path
-    all_photos: int
-    left_out: int
-    psnr: float | None
-    ssim: float | None
-    psnr_aligned: float | None
-    size: str
-    views: int
-    exposures: bool
-    verdict: Verdict | None
-    seconds: float
 
 
 def scene_name(inputs: Sequence[Path]) -> str:
@@ -165,86 +123,137 @@ def make(
         options.compute.apply()
     with one_run(out):
         _check_free(out)
-        return _Job(paths, name, out, options, overwrite, observer, page, started).run()
+        stages = Stages(out / MAKE_RECORD, STAGES)
+        with _removed_if_alone(out):
+            sources = find_sources(paths)
+            _check_inputs(out, sources, stages, overwrite)
+            if sources.posed is not None:
+                sources = replace(sources, notes=[])  # they offer the poses
+            given = _given_dataset(sources, options, observer)
+            job = _Job(
+                out, name, sources, given, stages, options, overwrite, observer, page, started
+            )
+            return job.run()
 
 
 def _check_free(out: Path) -> None:
     """Raises UserError if the folder contains files that `make` has not written."""
-    remove_temporaries(out, (RECORD,))
+    remove_temporaries(out, (MAKE_RECORD,))
     others = any(entry.name != LOCK for entry in out.iterdir())
-    if others and not (out / RECORD).is_file():
+    if others and not (out / MAKE_RECORD).is_file():
         raise UserError("{out}: contains other files; use a new or an empty folder", out=out)
+
+
+@contextmanager
+def _removed_if_alone(out: Path) -> Iterator[None]:
+    """If the job wrote only its record, remove it."""
+    try:
+        yield
+    finally:
+        if out.is_dir() and {entry.name for entry in out.iterdir()} <= {MAKE_RECORD, LOCK}:
+            (out / MAKE_RECORD).unlink(missing_ok=True)
+
+
+def _check_inputs(out: Path, sources: Sources, stages: Stages, overwrite: bool) -> None:
+    """Record the inputs. Raises UserError if the folder has a scene of other photos that must not
+    be replaced."""
+    inputs = [str(path.absolute()) for path in sources.inputs]
+    before = stages.about.get("inputs", inputs)
+    # `make_dataset` compares the photos themselves, whose folder may have been renamed.
+    compared = sources.posed is None and (out / DATASET).is_dir()
+    if before != inputs and not (compared or overwrite):
+        what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
+        raise UserError(
+            "{out}: contains a scene made from {what}; use another folder, or set `overwrite`",
+            out=out,
+            what=what,
+        )
+    stages.about["inputs"] = inputs
+
+
+def _given_dataset(sources: Sources, options: MakeOptions, observer: Observer) -> Dataset | None:
+    """The dataset that is the input, if its poses are used."""
+    if sources.posed is None:
+        return None
+    settings = DatasetSettings(str(sources.posed), **_split(options))
+    given = given_poses(sources, settings, observer)
+    if given is not None and options.marker is not None:
+        raise SettingError(
+            "marker",
+            "is for poses that are estimated, and {posed} has its own; make it of the photos "
+            "alone, or scale the scene afterwards: snowsplat convert --scale-to",
+            posed=sources.posed,
+        )
+    return given
+
+
+def _split(options: MakeOptions) -> dict[str, Any]:
+    """Every N-th photo is held out, from the middle of the first N on: the first photo of a walk is
+    at its end, and shows places that no other photo shows, so it says little."""
+    return {"hold_out": options.hold_out, "first_held_out": (options.hold_out or 0) // 2}
 
 
 @dataclass
 class _Job:
     """One call of `make`: runs the stages in their order, except for those that are finished."""
 
-    inputs: list[Path]
-    name: str
     out: Path
+    name: str  # of the scene file, without suffix
+    sources: Sources
+    given: Dataset | None  # the dataset that is the input; None: it is made from the photos
+    stages: Stages
     options: MakeOptions
     overwrite: bool
     observer: Observer
     page: LivePage | None
     started: float  # by `time.monotonic`
 
+    @property
+    def dataset(self) -> DatasetFolder:
+        posed = self.sources.posed if self.given is not None else None
+        return DatasetFolder(posed or self.out / DATASET)
+
+    @property
+    def folder(self) -> TrainingFolder:
+        return TrainingFolder(self.out / SCENE)
+
+    @property
+    def file(self) -> Path:
+        """The scene file. An old file is replaced when the new scene is finished."""
+        return self.out / f"{self.name}.ply"
+
     def run(self) -> MakeResult:
-        self.sources = find_sources(self.inputs)
-        self.stages = Stages(self.out / RECORD, STAGES)
-        with self._removed_if_alone():
-            self._check_inputs()
-            self.given = self._given()
-            self.plan = self._plan()
-            self.stages.about["title"] = (
-                self.options.title or self.stages.about.get("title") or self.name
-            )
-            self.stages.save()  # from now on, the folder is recognised as an output of `make`
-            if self.given is None:
-                self._make_dataset()
-            # No `sfm` changes the photos during the training.
-            with one_run(self.dataset) if self.given is None else nullcontext():
-                return self._make_scene()
+        plan = self._plan()
+        title = self.options.title or self.stages.about.get("title") or self.name
+        self.stages.about["title"] = title
+        self.stages.save()  # from now on, the folder is recognised as an output of `make`
+        if self.given is None:
+            self._make_dataset(plan)
+        # No `sfm` changes the photos during the training.
+        with one_run(self.dataset.path) if self.given is None else nullcontext():
+            figures, last_part = self._make_scene(plan)
+        project = Project.open(self.out)
+        return MakeResult(project, self.dataset, figures, last_part, self._elapsed())
 
-    def _check_inputs(self) -> None:
-        """Raises UserError if the folder has a scene of other photos that must not be replaced."""
-        inputs = [str(path.absolute()) for path in self.inputs]
-        before = self.stages.about.get("inputs", inputs)
-        # `make_dataset` compares the photos themselves, whose folder may have been renamed.
-        compared = self.sources.posed is None and (self.out / DATASET).is_dir()
-        if before != inputs and not (compared or self.overwrite):
-            what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
-            raise UserError(
-                "{out}: contains a scene made from {what}; use another folder, or set `overwrite`",
-                out=self.out,
-                what=what,
-            )
-        self.stages.about["inputs"] = inputs
+    def _elapsed(self) -> float:
+        return time.monotonic() - self.started
 
-    def _given(self) -> Dataset | None:
-        """The dataset that is the input, if its poses are used."""
-        posed = self.sources.posed
-        if posed is None:
-            return None
-        self.sources = replace(self.sources, notes=[])  # they offer the poses
-        given = given_poses(self.sources, self._dataset_settings(posed), self.observer)
-        if given is not None and self.options.marker is not None:
-            raise SettingError(
-                "marker",
-                "is for poses that are estimated, and {posed} has its own; make it of the photos "
-                "alone, or scale the scene afterwards: snowsplat convert --scale-to",
-                posed=posed,
-            )
-        return given
+    def _stage(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        outputs: list[Path],
+        work: Callable[[], dict[str, Any]],
+    ) -> dict[str, Any]:
+        """The result of a stage, which is executed unless it is finished."""
 
-    @contextmanager
-    def _removed_if_alone(self) -> Iterator[None]:
-        """If the job wrote only its record, remove it."""
-        try:
-            yield
-        finally:
-            if self.out.is_dir() and {entry.name for entry in self.out.iterdir()} <= {RECORD, LOCK}:
-                (self.out / RECORD).unlink(missing_ok=True)
+        def on_change(reason: str) -> None:
+            self.observer.note(message("{name}: repeated ({reason})", name=name, reason=reason))
+
+        self.observer.begin(name)
+        outcome = self.stages.run(name, settings, outputs, work, on_change)
+        self.observer.end(name, outcome)
+        return outcome.result
 
     def _plan(self) -> MakePlan:
         """The plan for the requested quality or time.
@@ -267,8 +276,7 @@ class _Job:
             self.observer.note(described(plan, photos, 60.0 * minutes))
         return MakePlan(**self.stages.about["plan"]["chosen"])
 
-    def _make_dataset(self) -> None:
-        plan = self.plan
+    def _make_dataset(self, plan: MakePlan) -> None:
         options = DatasetOptions(
             gather=GatherOptions(size=plan.size, photos=plan.photos, frames=plan.frames),
             sfm=SfmOptions(
@@ -278,99 +286,49 @@ class _Job:
             ),
             marker=self.options.marker,
         )
-        observer, later = self.observer, self._later()
+        later = self._later(plan)
         outcomes = make_dataset(
-            self.sources, self.dataset, options, observer, overwrite=self.overwrite, later=later
+            self.sources, self.dataset.path, options, self.observer, self.overwrite, later
         )
         before = self.stages.about.get("name")
         if outcomes["photos"].again and isinstance(before, str) and Path(before).name == before:
             self.name = before  # the photos are the same, if their folder was renamed, too
         self.stages.about["name"] = self.name
 
-    def _later(self) -> Later:
+    def _later(self, plan: MakePlan) -> Later:
         """The work after the dataset is made, for the estimate of the time left."""
         if self.options.minutes is not None:
             return Later(deadline=self.started + 60.0 * self.options.minutes)
         if ops.resolve_device(self.options.compute.device).type != "cpu":
             return Later()  # on a GPU, the training takes a small part of the time
-        return Later(work=PRESETS[self.plan.quality].training)
+        return Later(work=PRESETS[plan.quality].training)
 
-    def _make_scene(self) -> MakeResult:
+    def _make_scene(self, plan: MakePlan) -> tuple[Figures, LastPart]:
         settings: dict[str, Any] = (
-            {DATASET: _fingerprint(self.dataset)}
+            {DATASET: hash_of_files(self.dataset)}
             if self.given is None
-            else {"given": _fingerprint_of(self.given, self.dataset)}
+            else {"given": hash_of_dataset(self.given, self.dataset.path)}
         )
         if self.options.minutes is None:
-            preset = PRESETS[self.plan.quality]
+            preset = PRESETS[plan.quality]
             settings |= {key: getattr(preset, key) for key in _TRAINING_FIELDS}
-            # Version 0.2 recorded it, and its scenes need not be made again.
-            settings["stop_overfitting"] = self.plan.quality == "best"
         else:
             settings["minutes"] = self.options.minutes
-        settings |= {**self._split, "exposure": self.options.exposure}
-        folder = TrainingFolder(self.out / SCENE)
-        outputs = [self.file, folder.path / "point_cloud", folder.metrics]
-        scene = self._stage("scene", settings, outputs, lambda: self._train(settings)).result
+        settings |= {**_split(self.options), "exposure": self.options.exposure}
+        folder = self.folder
+        outputs = [self.file, folder.point_clouds, folder.metrics]
+        result = self._stage("scene", settings, outputs, lambda: self._train(settings, plan))
+        figures = from_json(Figures, result)
         shutil.rmtree(folder.checkpoints, ignore_errors=True)  # no longer needed
-        target = folder.rendered("test", scene["iteration"])
-        whole: dict[str, Any] = {"steps": 0, "photos": 0}
-        if scene["views"]:
-            self._stage("pictures", {}, [target], self._render)
-            whole = self._stage("all", {}, [self.file], lambda: self._train_on_all(scene)).result
-        return MakeResult(
-            scene=self.file,
-            folder=folder,
-            dataset=self.dataset,
-            dataset_report=None if self.given is not None else self.dataset / REPORT,
-            renders=target / "renders",
-            photos=target / "gt",
-            all_photos=whole["photos"],
-            left_out=whole.get("left_out", 0),  # earlier versions did not say it
-            psnr=scene.get("psnr"),
-            ssim=scene.get("ssim"),
-            psnr_aligned=scene.get("psnr_aligned"),
-            size=scene.get("size", "an unknown size"),
-            views=scene["views"],
-            exposures=scene["exposures"],
-            verdict=Verdict.from_json(scene["verdict"]),
-            seconds=self._elapsed(),
-        )
+        if not figures.views:
+            return figures, LastPart()
+        self._stage("pictures", {}, [folder.rendered("test", figures.iteration)], self._render)
+        last = self._stage("all", {}, [self.file], lambda: self._train_on_all(figures.iteration))
+        return figures, from_json(LastPart, last)
 
-    @property
-    def dataset(self) -> Path:
-        """The folder of the dataset."""
-        if self.given is not None:
-            assert self.sources.posed is not None
-            return self.sources.posed
-        return self.out / DATASET
-
-    @property
-    def file(self) -> Path:
-        """The scene file. An old file is replaced when the new scene is finished."""
-        return self.out / f"{self.name}.ply"
-
-    def _elapsed(self) -> float:
-        return time.monotonic() - self.started
-
-    def _stage(
-        self,
-        name: str,
-        settings: dict[str, Any],
-        outputs: list[Path],
-        work: Callable[[], dict[str, Any]],
-    ) -> Outcome:
-        def on_change(reason: str) -> None:
-            self.observer.note(message("{name}: repeated ({reason})", name=name, reason=reason))
-
-        self.observer.begin(name)
-        outcome = self.stages.run(name, settings, outputs, work, on_change)
-        self.observer.end(name, outcome)
-        return outcome
-
-    def _train(self, settings: dict[str, Any]) -> dict[str, Any]:
+    def _train(self, settings: dict[str, Any], plan: MakePlan) -> dict[str, Any]:
         """Start or resume the training; copy its scene into the output folder of `make`."""
-        folder = TrainingFolder(self.out / SCENE)
+        folder, dataset = self.folder, self.dataset.path
         options = TrainOptions(
             memory=self.options.memory,
             checkpoint_seconds=_CHECKPOINT_SECONDS,
@@ -384,68 +342,43 @@ class _Job:
                 folder.clear()
             self.stages.about["training"] = settings
             self.stages.save()
-            new = self._new_training(options)
-            trained = train(self.dataset, folder.path, new, observer=self.observer, page=self.page)
+            new = self._new_training(options, plan)
+            trained = train(dataset, folder.path, new, observer=self.observer, page=self.page)
         with atomic_path(self.file) as temporary:
             shutil.copyfile(trained.scene, temporary)
         self.stages.about |= {"file": self.file.name, "last_part": False}
-        result: dict[str, Any] = {"iteration": trained.step, "views": 0}
+        verdict = trained.verdict and trained.verdict.as_json()
+        figures = Figures(trained.step, 0, bool(folder.exposures()), verdict)
         if trained.evaluation is not None:
-            metrics = folder.read_metrics()
-            result |= {key: metrics[key] for key in ("psnr", "ssim", "psnr_aligned", "size")}
-            result["views"] = len(metrics["views"])
-        return result | {
-            "exposures": bool(folder.exposures()),
-            "verdict": trained.verdict and trained.verdict.as_json(),
-        }
+            found = folder.read_metrics()
+            means = {key: found[key] for key in ("psnr", "ssim", "psnr_aligned", "size")}
+            figures = replace(figures, views=len(found["views"]), **means)
+        return asdict(figures)
 
-    def _new_training(self, options: TrainOptions) -> TrainOptions:
+    def _new_training(self, options: TrainOptions, plan: MakePlan) -> TrainOptions:
         settings: dict[str, Any] = {
             "leave_out_after": _LEAVE_OUT_AFTER,
             "exposure": self.options.exposure,
         }
-        options = replace(options, **self._split)
+        options = replace(options, **_split(self.options))
         if self.options.minutes is not None:
             minutes = self._minutes_left(60.0 * self.options.minutes)
             return replace(options, minutes=minutes, settings=settings)
-        preset = PRESETS[self.plan.quality]
+        preset = PRESETS[plan.quality]
         settings |= {name: getattr(preset, name) for name in _TRAINING_FIELDS if name != "side"}
-        dataset = self.given or self._dataset_settings(self.dataset).load()
+        dataset = self.given or read_dataset(
+            DatasetSettings(str(self.dataset.path), **_split(self.options))
+        )
         config = recipe(options.recipe or "default", **settings).lengthened(len(dataset.train))
         settings["iterations"] = config.iterations
         return replace(options, resolution=_width(dataset, preset), settings=settings)
-
-    def _dataset_settings(self, dataset: Path) -> DatasetSettings:
-        return DatasetSettings(str(dataset), **self._split)
-
-    @property
-    def _split(self) -> dict[str, Any]:
-        """Every N-th photo is held out, from the middle of the first N on: the first photo of a
-        walk is at its end, and shows places that no other photo shows, so it says little."""
-        every = self.options.hold_out
-        return {"hold_out": every, "first_held_out": (every or 0) // 2}
-
-    def _train_on_all(self, scene: dict[str, Any]) -> dict[str, Any]:
-        """The last part; it replaces the scene file, but not the scene in the folder of the
-        training, to which the metrics belong."""
-        seconds = math.inf
-        if self.options.minutes is not None:
-            seconds = 60.0 * self.options.minutes - self._elapsed()
-        folder = TrainingFolder(self.out / SCENE)
-        compute = self.options.compute
-        last = train_on_all(folder, scene["iteration"], seconds, compute, self.observer)
-        if last.gaussians is not None:
-            self.stages.about["last_part"] = True
-            self.stages.save()  # before the scene is written: it must not be judged by its photos
-            write_gaussians(self.file, last.gaussians)
-        return {name: getattr(last, name) for name in ("steps", "photos", "left_out", "why_not")}
 
     def _minutes_left(self, given: float) -> float:
         """The time for the training in minutes: the rest of ``given`` seconds, or the minimum."""
         if self.given is not None:
             photos = len(self.given.train) + len(self.given.test)
         else:
-            photos = sum(path.is_file() for path in (self.dataset / "images").rglob("*"))
+            photos = sum(path.is_file() for path in self.dataset.images.rglob("*"))
         left = given - self._elapsed()
         if self.options.hold_out is not None:
             left -= _RENDER_SECONDS * -(-photos // self.options.hold_out)
@@ -464,9 +397,23 @@ class _Job:
         return max(left, shortest) / 60.0
 
     def _render(self) -> dict[str, Any]:
-        scene = load_trained(self.out / SCENE, compute=self.options.compute)
+        scene = load_trained(self.folder.path, compute=self.options.compute)
         render_images(scene, splits=("test",))
         return {}
+
+    def _train_on_all(self, iteration: int) -> dict[str, Any]:
+        """The last part; it replaces the scene file, but not the scene in the folder of the
+        training, to which the metrics belong."""
+        seconds = math.inf
+        if self.options.minutes is not None:
+            seconds = 60.0 * self.options.minutes - self._elapsed()
+        compute = self.options.compute
+        last, gaussians = train_on_all(self.folder, iteration, seconds, compute, self.observer)
+        if gaussians is not None:
+            self.stages.about["last_part"] = True
+            self.stages.save()  # before the scene is written: it must not be judged by its photos
+            write_gaussians(self.file, gaussians)
+        return asdict(last)
 
 
 def _width(dataset: Dataset, preset: Preset) -> int | None:
@@ -475,30 +422,3 @@ def _width(dataset: Dataset, preset: Preset) -> int | None:
     camera = max(cameras, key=lambda camera: max(camera.width, camera.height))
     longer = max(camera.width, camera.height)
     return None if longer <= preset.side else round(camera.width * preset.side / longer)
-
-
-def _fingerprint_of(dataset: Dataset, folder: Path) -> str:
-    """A hash of the cameras and points of a dataset, and of its photos and masks."""
-    digest = hashlib.sha256()
-    for view in [*dataset.train, *dataset.test]:
-        camera = view.camera
-        intrinsics = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
-        pose = camera.cam_from_world.tolist()
-        digest.update(repr((view.name, intrinsics, pose, view.image.view)).encode())
-    if dataset.points is not None:
-        digest.update(dataset.points.xyz.numpy().tobytes())
-    stamps = stamps_of(dataset, folder)
-    digest.update(repr(sorted((k, v.size, v.digest) for k, v in stamps.items())).encode())
-    return digest.hexdigest()
-
-
-def _fingerprint(dataset: Path) -> str:
-    """A hash of the cameras, and of the names and sizes of photos and masks."""
-    digest = hashlib.sha256()
-    for path in sorted((dataset / "sparse" / "0").glob("*.bin")):
-        digest.update(path.read_bytes())
-    for folder in ("images", "masks"):
-        for path in sorted((dataset / folder).rglob("*")):
-            if path.is_file():
-                digest.update(f"{path.relative_to(dataset)} {path.stat().st_size}\n".encode())
-    return digest.hexdigest()

@@ -56,8 +56,8 @@ def _images(undistorted: dict[str, Any]) -> list[str]:
 
 
 def _scene(trained: dict[str, Any]) -> list[str]:
-    size = f" at {trained['size']}" if "size" in trained else ""  # earlier versions did not say it
-    quality = f", PSNR {trained['psnr']:.2f} dB{size}" if "psnr" in trained else ""
+    known = trained["psnr"] is not None
+    quality = f", PSNR {trained['psnr']:.2f} dB at {trained['size']}" if known else ""
     return [f"{trained['iteration']} steps{quality}"]
 
 

@@ -99,6 +99,11 @@ class TrainingFolder:
         return self.path / _POINTS
 
     @property
+    def point_clouds(self) -> Path:
+        """The folder of the scenes."""
+        return self.path / _SCENES
+
+    @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
 
@@ -205,7 +210,7 @@ class TrainingFolder:
         shutil.rmtree(self.tensorboard, ignore_errors=True)
         self._remove_unwritten_scenes()
         with suppress(OSError):  # missing, or not empty
-            (self.path / _SCENES).rmdir()
+            self.point_clouds.rmdir()
         if self.path.is_dir() and not any(self.path.iterdir()):
             self.path.rmdir()
 
@@ -317,7 +322,7 @@ class TrainingFolder:
 
     def scenes(self) -> list[int]:
         """The iterations that have a scene, ascending."""
-        folder = self.path / _SCENES
+        folder = self.point_clouds
         if not folder.is_dir():
             return []
         found = [_SCENE.fullmatch(entry.name) for entry in folder.iterdir()]
@@ -325,7 +330,7 @@ class TrainingFolder:
         return [step for step in steps if self.scene_path(step).is_file()]
 
     def scene_path(self, iteration: int) -> Path:
-        return self.path / _SCENES / f"iteration_{iteration}" / "point_cloud.ply"
+        return self.point_clouds / f"iteration_{iteration}" / "point_cloud.ply"
 
     def find_scene(self, iteration: int | None = None) -> tuple[int, Path]:
         """An iteration and the file of its scene; None or -1: the last one.
@@ -348,7 +353,7 @@ class TrainingFolder:
 
     def _remove_unwritten_scenes(self) -> None:
         """Remove folders without a scene: the process was killed, or the disk was full."""
-        for folder in (self.path / _SCENES).glob("iteration_*"):
+        for folder in self.point_clouds.glob("iteration_*"):
             if not (folder / "point_cloud.ply").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 

@@ -32,7 +32,8 @@ import numpy as np
 from snowsplat.pipeline.cameras_from_above import cameras_from_above, draw_level
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.film import film, film_preview
-from snowsplat.pipeline.make import MakeResult, make
+from snowsplat.pipeline.make import make
+from snowsplat.pipeline.make_result import MakeResult
 from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.options.publish import PublishOptions
@@ -221,13 +222,14 @@ def _film(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
 
 
 def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
-    reports = {"training": made.folder.report, "photos": made.dataset_report}
+    known = made.figures
+    reports = {"training": made.training.report, "photos": made.dataset_report}
     return {
         "file": made.scene.name,
         "bytes": made.scene.stat().st_size,
         # With gains of exposure, the scene has the mean exposure of the photos.
-        "psnr": made.psnr_aligned if made.exposures else made.psnr,
-        "aligned": made.exposures,
+        "psnr": known.psnr_aligned if known.exposures else known.psnr,
+        "aligned": known.exposures,
         "seconds": made.seconds,
         "verdict": [] if made.verdict is None else made.verdict.lines(message("the scene")),
         "reports": existing_reports(scene, reports),

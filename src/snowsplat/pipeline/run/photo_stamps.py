@@ -1,4 +1,5 @@
-"""Stamps of the photos and masks of a training, by which `resume` notices that they were edited."""
+"""What tells that a dataset has changed: stamps of photos and masks, which `resume` compares, and
+hashes of the whole, which `make` compares."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snowsplat.data import Dataset
+from snowsplat.project.dataset_folder import DatasetFolder
 
 _PART = 1 << 16  # bytes at the begin, the middle and the end of a file that its digest covers
 
@@ -61,3 +63,31 @@ def _stamp(path: Path, before: Stamp | None) -> Stamp:
             file.seek(start)
             digest.update(file.read(_PART))
     return Stamp(size, time, digest.hexdigest())
+
+
+def hash_of_dataset(dataset: Dataset, folder: Path) -> str:
+    """A hash of the cameras and points of a dataset, and of its photos and masks."""
+    digest = hashlib.sha256()
+    for view in [*dataset.train, *dataset.test]:
+        camera = view.camera
+        intrinsics = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        pose = camera.cam_from_world.tolist()
+        digest.update(repr((view.name, intrinsics, pose, view.image.view)).encode())
+    if dataset.points is not None:
+        digest.update(dataset.points.xyz.numpy().tobytes())
+    stamps = stamps_of(dataset, folder)
+    digest.update(repr(sorted((k, v.size, v.digest) for k, v in stamps.items())).encode())
+    return digest.hexdigest()
+
+
+def hash_of_files(dataset: DatasetFolder) -> str:
+    """A hash of the cameras, and of the names and sizes of photos and masks."""
+    digest = hashlib.sha256()
+    for path in sorted(dataset.model.glob("*.bin")):
+        digest.update(path.read_bytes())
+    for folder in (dataset.images, dataset.masks):
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                name = path.relative_to(dataset.path)
+                digest.update(f"{name} {path.stat().st_size}\n".encode())
+    return digest.hexdigest()

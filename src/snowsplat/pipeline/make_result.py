@@ -1,0 +1,105 @@
+"""`MakeResult`: a finished scene of `make`, and what is known about its quality."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from snowsplat.evaluation.verdict import Verdict
+from snowsplat.pipeline.all_photos import LastPart
+from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.project import Project
+from snowsplat.project.training_folder import TrainingFolder
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the training tells about a scene, before the last part: the result of a stage, as JSON.
+
+    Attributes:
+        iteration: the last step of the training.
+        views: number of held-out photos.
+        exposures: whether gains of exposure are learnt; then the colour-aligned PSNR tells the
+            quality.
+        verdict: the JSON value of the `Verdict`.
+        psnr, ssim, psnr_aligned: means over the held-out photos; PSNR in dB. None if no photos were
+            held out.
+        size: of the images of which these are the means, in pixels, as text.
+    """
+
+    iteration: int
+    views: int
+    exposures: bool
+    verdict: Any = None
+    psnr: float | None = None
+    ssim: float | None = None
+    psnr_aligned: float | None = None
+    size: str = "an unknown size"
+
+
+@dataclass(frozen=True)
+class MakeResult:
+    """A finished scene.
+
+    Attributes:
+        project: the output folder.
+        dataset: the folder of the dataset that the scene is trained from.
+        figures: the quality of the scene on the held-out photos, before the last part.
+        last_part: the training on all photos, after the evaluation.
+        seconds: duration of the call.
+    """
+
+    project: Project
+    dataset: DatasetFolder
+    figures: Figures
+    last_part: LastPart
+    seconds: float
+
+    @property
+    def scene(self) -> Path:
+        """The PLY file."""
+        return self.project.scene_file()
+
+    @property
+    def training(self) -> TrainingFolder:
+        return self.project.training_folder()
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Whether the scene is good, usable or poor, and why; None if no photos were held out."""
+        return Verdict.from_json(self.figures.verdict)
+
+    @property
+    def dataset_report(self) -> Path | None:
+        """The HTML page about the camera poses; None if the input has poses."""
+        return self.dataset.report if self.dataset == self.project.dataset else None
+
+    @property
+    def renders(self) -> Path:
+        """The folder with the rendered test views."""
+        return self.training.rendered("test", self.figures.iteration) / "renders"
+
+    @property
+    def photos(self) -> Path:
+        """The folder with the held-out photos."""
+        return self.training.rendered("test", self.figures.iteration) / "gt"
+
+    def as_json(self) -> dict[str, Any]:
+        """The values for scripts; paths are `Path`s."""
+        figures = asdict(self.figures)
+        for name in ("iteration", "verdict"):
+            del figures[name]
+        return {
+            "scene": self.scene,
+            "folder": self.training.path,
+            "dataset": self.dataset.path,
+            "dataset_report": self.dataset_report,
+            "renders": self.renders,
+            "photos": self.photos,
+            "all_photos": self.last_part.photos,
+            "left_out": self.last_part.left_out,
+            **figures,
+            "verdict": self.verdict,
+            "seconds": self.seconds,
+        }
