@@ -8,7 +8,7 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.scene.initial_view import bound, overview, view_of_camera
+from snowsplat.scene.initial_view import bounding_sphere, overview, view_of_camera
 
 
 def test_view_of_a_camera():
@@ -96,7 +96,7 @@ def test_overview_contains_the_object(far: torch.Tensor):
     means = torch.cat([body, far]) + shift
     seen = balls(means, opacity_logit=math.log(0.21 / 0.79))
     scene = Gaussians.cat([seen, hidden])
-    middle, radius = bound(scene)
+    middle, radius = bounding_sphere(scene)
     assert middle.tolist() == pytest.approx([10, 20, 30], abs=0.1)
     assert radius == pytest.approx(1, abs=0.1)
     view = overview(scene)

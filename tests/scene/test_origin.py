@@ -8,7 +8,7 @@ from snowsplat.scene import edit
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
-from snowsplat.scene.origin import HERE, added, origin_of, stored_origin
+from snowsplat.scene.origin import HERE, add_origins, origin_of, stored_origin
 
 POINTS = np.random.default_rng(0).normal(size=(1000, 3))
 UTM = (500_000.0, 5_400_000.0, 300.0)
@@ -75,4 +75,4 @@ def test_stored_values_are_checked():
     assert stored_origin([1, 2.5, -3]) == (1.0, 2.5, -3.0)
     for value in (None, [1, 2], [1, 2, float("nan")], [1, 2, True], [1, 2, 1e300], "123"):
         assert stored_origin(value) is None
-    assert added(UTM, (1.0, 0.0, -300.0)) == (500_001.0, 5_400_000.0, 0.0)
+    assert add_origins(UTM, (1.0, 0.0, -300.0)) == (500_001.0, 5_400_000.0, 0.0)

@@ -11,7 +11,7 @@ from snowsplat.util.natural_order import natural_key
 from snowsplat.util.safe_json import is_file, quoted
 
 
-def held_out(
+def held_out_names(
     posed: list[PosedImage],
     hold_out: int | None,
     first: int,
@@ -21,7 +21,9 @@ def held_out(
     names = sorted((image.name for image in posed), key=natural_key)
     together = _frames(posed)
     if test_list is not None:
-        return {name for one in _listed(names, test_list, together) for name in together[one]}
+        return {
+            name for one in _names_in_list(names, test_list, together) for name in together[one]
+        }
     if hold_out is None:
         return set()
     if hold_out < 1:
@@ -44,7 +46,7 @@ def _frames(posed: list[PosedImage]) -> dict[str, tuple[str, ...]]:
     return {name: tuple(sorted(names)) for names in frames.values() for name in names}
 
 
-def _listed(
+def _names_in_list(
     names: list[str], test_list: Path | str | Sequence[str], together: Mapping[str, tuple[str, ...]]
 ) -> set[str]:
     """The image names in a test list; folder and suffix may be omitted if the rest is unique.

@@ -12,9 +12,9 @@ import torch
 
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
 from snowsplat.data.files.masks import with_masks
-from snowsplat.data.frame.move_to_origin import moved_to_origin
+from snowsplat.data.frame.move_to_origin import move_to_origin
 from snowsplat.data.frame.near import near_of
-from snowsplat.data.hold_out import held_out
+from snowsplat.data.hold_out import held_out_names
 from snowsplat.data.image_sizes import ImageSize, image_sizes, with_smaller_copies
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.lens import Lens
@@ -157,7 +157,7 @@ def read_files(
     """
     root = Path(path)
     found = read_poses(root, images)
-    posed, points, origin = moved_to_origin(found.images, found.points)
+    posed, points, origin = move_to_origin(found.images, found.points)
     folder = root.parent if root.is_file() else root
     posed = with_masks(folder, _with_maps(folder, posed))
     if resolution in _DIVISORS[1:]:
@@ -174,7 +174,7 @@ def read_files(
     return DatasetFiles(
         root=root,
         images=sized,
-        test_names=held_out(posed, hold_out, first_held_out, test_list),
+        test_names=held_out_names(posed, hold_out, first_held_out, test_list),
         circles=_circles(sized),
         points=points,
         description=found.description,

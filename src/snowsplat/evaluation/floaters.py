@@ -23,7 +23,7 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.scene.sight import blended, reduced
+from snowsplat.scene.sight import blended_sums, reduced_camera
 
 Report = Callable[[int, int, str], None]
 
@@ -73,7 +73,7 @@ def coverage(gaussians: Gaussians, cameras: Sequence[Camera], report: Report = _
     ``report`` is called with the number of rendered views, of all, and the word "views"; each view
     is rendered several times.
     """
-    small = [reduced(camera) for camera in cameras]
+    small = [reduced_camera(camera) for camera in cameras]
     solid = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for i in range(_ROUNDS):
         found = _measure(gaussians, solid, _counted(small, i, report))
@@ -118,7 +118,7 @@ def _weights(
         covered = (output.alpha > _COVERED) & (output.depth > 0.0)
         inverse = torch.where(covered, output.alpha / output.depth.clamp_min(1e-12), 0.0)
     each = torch.stack([torch.ones_like(inverse), covered.to(inverse.dtype), inverse], dim=2)
-    return blended(gaussians, camera, each)
+    return blended_sums(gaussians, camera, each)
 
 
 def clean(

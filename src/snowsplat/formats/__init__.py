@@ -23,7 +23,7 @@ from snowsplat.formats.registry import (
     format_for_writing,
     register_format,
 )
-from snowsplat.scene.origin import added
+from snowsplat.scene.origin import add_origins
 from snowsplat.util.errors import UserError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def read_arrays(path: Path | str) -> GaussianArrays:
     if format.stores_origin:
         return scene
     origin, metres = read_place(path)
-    return replace(scene, origin=added(scene.origin, origin), metres_per_unit=metres)
+    return replace(scene, origin=add_origins(scene.origin, origin), metres_per_unit=metres)
 
 
 def _name_coarse_positions(path: Path, scene: GaussianArrays) -> None:

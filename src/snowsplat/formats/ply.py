@@ -27,7 +27,7 @@ import numpy as np
 from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, unusable
 from snowsplat.formats.packing import FLAT
 from snowsplat.scene.length import stored_metres
-from snowsplat.scene.origin import HERE, Origin, added, stored_origin
+from snowsplat.scene.origin import HERE, Origin, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -143,7 +143,7 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     if problem := unusable(scene):
         logger.warning("%s: %s; they are not shown", path, problem)
     origin, metres = placement_in(table.comments)
-    return replace(scene, origin=added(scene.origin, origin), metres_per_unit=metres)
+    return replace(scene, origin=add_origins(scene.origin, origin), metres_per_unit=metres)
 
 
 def _rest_count(table: PlyTable) -> int:

@@ -40,7 +40,7 @@ from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
 from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, without_unusable
 from snowsplat.formats.sog_container import Bundle, Damaged
 from snowsplat.scene.length import stored_metres
-from snowsplat.scene.origin import HERE, added, stored_origin
+from snowsplat.scene.origin import HERE, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
@@ -91,7 +91,7 @@ def read_stored(path: Path | str) -> GaussianArrays:
     stored = stored_origin(asset.get("origin"))
     return replace(
         scene,
-        origin=added(scene.origin, stored or HERE),
+        origin=add_origins(scene.origin, stored or HERE),
         metres_per_unit=stored_metres(asset.get("metres_per_unit")),
     )
 

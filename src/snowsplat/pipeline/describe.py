@@ -66,9 +66,10 @@ def describe(path: Path | str) -> dict[str, Any]:
                 return _photos(path, unknown)
         else:
             return _scene(path, format)
-    training = project.training_folder()
-    if training.is_training() or training.scenes():
-        return _output(project)
+    if path.is_dir():  # a file may be a dataset
+        training = project.training_folder()
+        if training.is_training() or training.scenes():
+            return _output(project)
     return _dataset(path)
 
 

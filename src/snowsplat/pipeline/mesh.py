@@ -19,7 +19,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.surface import MeshOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.mesh import Mesh, compacted, filled_holes, largest_parts, vertex_normals
+from snowsplat.scene.mesh import Mesh, compact_mesh, filled_holes, largest_parts, vertex_normals
 from snowsplat.scene.orientation import scene_up
 from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
@@ -256,7 +256,7 @@ def _cleaned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without small parts, with holes filled and simplified as the options say."""
     faces = faces[largest_parts(faces, len(vertices), options.parts)]
-    vertices, faces, _ = compacted(vertices, faces)
+    vertices, faces, _ = compact_mesh(vertices, faces)
     if not len(faces):
         raise UserError("no surface was found; train longer, or use another `voxel`")
     if options.fill_holes:

@@ -74,7 +74,7 @@ def view_of_camera(camera: Camera, depth: float) -> InitialView:
     return InitialView(_point(pose[:, 3]), _point(target), fov, across / down)
 
 
-def bound(gaussians: Gaussians) -> tuple[Tensor, float]:
+def bounding_sphere(gaussians: Gaussians) -> tuple[Tensor, float]:
     """The middle (3,) and the radius of what a scene shows; needs no cameras.
 
     The sphere contains 98% of the opaque Gaussians, except for those much farther from the median
@@ -95,8 +95,8 @@ def bound(gaussians: Gaussians) -> tuple[Tensor, float]:
 
 
 def overview(gaussians: Gaussians) -> InitialView:
-    """A view of the `bound` of the scene from the front and slightly above; needs no cameras."""
-    middle, radius = bound(gaussians)
+    """A view of the `bounding_sphere` from the front and slightly above; needs no cameras."""
+    middle, radius = bounding_sphere(gaussians)
     direction = torch.tensor([0.0, -0.35, -1.0], dtype=torch.float64)
     position = middle + _OVERVIEW_DISTANCE * radius * direction / direction.norm()
     fov = math.degrees(2 * math.asin(1 / _OVERVIEW_DISTANCE))

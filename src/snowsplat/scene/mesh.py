@@ -58,7 +58,9 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return (total / np.where(length > 0, length, 1)).astype(np.float32)
 
 
-def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def compact_mesh(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices that a triangle uses, the triangles with new numbers, and the kept (V,) bool."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True

@@ -69,6 +69,6 @@ def opposite(origin: Origin) -> Origin:
     return (-origin[0], -origin[1], -origin[2])
 
 
-def added(a: Origin, b: Origin) -> Origin:
+def add_origins(a: Origin, b: Origin) -> Origin:
     """The origin of positions relative to ``a`` that are relative to ``b`` themselves."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])

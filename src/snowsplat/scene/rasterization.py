@@ -203,7 +203,7 @@ def rasterization(
             image = torch.cat([image, depth], dim=2) if with_colors else depth
         images.append(image)
         alphas.append(alpha[..., None])
-    return _stacked(images, of_views), _stacked(alphas, of_views), meta
+    return _stack_images(images, of_views), _stack_images(alphas, of_views), meta
 
 
 def _refuse_unsupported(
@@ -250,7 +250,7 @@ def _items(tensor: Tensor, dims: int) -> list[Tensor]:
     return [items.squeeze(0)] if len(items) == 1 else list(items.unbind(0))
 
 
-def _stacked(images: list[Tensor], of_views: tuple[int, ...]) -> Tensor:
+def _stack_images(images: list[Tensor], of_views: tuple[int, ...]) -> Tensor:
     """Images (H, W, X) as one tensor (…, C, H, W, X); planar images stay planar."""
     if len(images) == 1:
         return images[0].reshape(*of_views, *images[0].shape)
@@ -272,12 +272,14 @@ def _meta(
     }
     rows = [found.ids.long() for found in splats if found.ids is not None]
     if packed:
-        meta: dict[str, Any] = {name: _joined(parts) for name, parts in columns.items()}
+        meta: dict[str, Any] = {name: _join_rows(parts) for name, parts in columns.items()}
         indices = [divmod(i, of_views[-1]) for i in range(len(rows))]
         for name, j in (("batch_ids", 0), ("camera_ids", 1)):
             of_rows = zip(rows, indices, strict=True)
-            meta[name] = _joined([own.new_full((), at[j]).expand(own.shape) for own, at in of_rows])
-        meta["gaussian_ids"] = _joined(rows)
+            meta[name] = _join_rows(
+                [own.new_full((), at[j]).expand(own.shape) for own, at in of_rows]
+            )
+        meta["gaussian_ids"] = _join_rows(rows)
         if len(rows) == 1:
             return meta, [meta["means2d"]]
         return meta, meta["means2d"].split([len(own) for own in rows])
@@ -295,5 +297,5 @@ def _meta(
     return meta, [every[i, own] for i, own in enumerate(rows)]
 
 
-def _joined(parts: list[Tensor]) -> Tensor:
+def _join_rows(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -44,12 +44,14 @@ class Sight:
     directions: Tensor
 
 
-def reduced(camera: Camera) -> Camera:
+def reduced_camera(camera: Camera) -> Camera:
     """The camera with an image of at most about `SIDE` pixels."""
     return camera.downscaled(max(1, round(max(camera.width, camera.height) / SIDE)))
 
 
-def blended(gaussians: Gaussians, camera: Camera, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def blended_sums(
+    gaussians: Gaussians, camera: Camera, values: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """The ids (M,) of the Gaussians in a view, their depths (M,), and (M, 3) Σ w(p) g(p).
 
     ``values``: (H, W, 3) g for three sums.
@@ -105,8 +107,8 @@ def _by_cameras(gaussians: Gaussians, cameras: Sequence[Camera]) -> Sight:
     weights, density, squared = torch.zeros(3, len(means), dtype=torch.float64)
     directions = torch.zeros_like(found.directions)
     for camera in used:
-        small = reduced(camera)
-        ids, _, sums = blended(gaussians, small, torch.ones(small.height, small.width, 3))
+        small = reduced_camera(camera)
+        ids, _, sums = blended_sums(gaussians, small, torch.ones(small.height, small.width, 3))
         weights[ids] += sums[:, 0].double() * (camera.width / small.width) ** 2
         place, depth = camera.project(means)
         size = torch.tensor([camera.width, camera.height])

@@ -154,7 +154,7 @@ class _Mixture:
 
     def areas(self) -> Tensor:
         """(N,) A, see `simplify`."""
-        adjugate = _adjugate(_blurred(self.covariances, self.blurs))
+        adjugate = _adjugate(_blur(self.covariances, self.blurs))
         return _product(self.directions, adjugate).clamp_min(_TINY).sqrt()
 
     def masses(self) -> Tensor:
@@ -264,7 +264,7 @@ def _together(a: _Mixture, b: _Mixture, share: Tensor) -> _Mixture:
 def _overlap(a: _Mixture, b: _Mixture, mass_a: Tensor, mass_b: Tensor) -> Tensor:
     """(N,) the integral of α₁ α₂ in the views, in the unit of the masses: the product of two
     Gaussians is o₁ o₂ A₁ A₂ / A(Σ₁ + Σ₂) · exp(−½ Δᵀ (Σ₁ + Σ₂)⁻¹ Δ)."""
-    sums = _blurred(a.covariances + b.covariances, a.blurs + b.blurs)
+    sums = _blur(a.covariances + b.covariances, a.blurs + b.blurs)
     adjugate = _adjugate(sums)
     determinant = sums[0] * adjugate[0] + sums[3] * adjugate[3] + sums[4] * adjugate[4]
     offset = b.means - a.means
@@ -279,7 +279,7 @@ def _share(mass: Tensor, other: Tensor) -> Tensor:
     return mass / (mass + other).clamp_min(_TINY)
 
 
-def _blurred(covariances: Tensor, variances: Tensor) -> Tensor:
+def _blur(covariances: Tensor, variances: Tensor) -> Tensor:
     """(6, N) Σ + variance · I."""
     return torch.cat([covariances[:3] + variances, covariances[3:]])
 

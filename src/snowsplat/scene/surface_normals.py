@@ -29,7 +29,7 @@ def normals_of_depth(depth: Tensor, camera: Camera) -> Tensor:
     return pad(normals * squares.rsqrt(), (1, 1, 1, 1))
 
 
-def surrounded(shown: Tensor) -> Tensor:
+def interior_pixels(shown: Tensor) -> Tensor:
     """(H, W) bool: the pixels that are shown with all eight around them; False at the border."""
     rows = shown[:, :-2] & shown[:, 1:-1] & shown[:, 2:]
     return pad(rows[:-2] & rows[1:-1] & rows[2:], (1, 1, 1, 1))

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.data.lens.coverage import shown
+from snowsplat.data.lens.coverage import covered_pixels
 from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.resample import undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, lens_views, pinhole_view
@@ -288,7 +288,7 @@ def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int
 def _with_blank(mask: Image.Image | None, view: LensView) -> Image.Image | None:
     """``mask`` of a view, with the pixels masked that show nothing of the photo; None: nothing."""
     used = np.ones((view.height, view.width), bool) if mask is None else np.asarray(mask) >= 128
-    used &= shown(view, view.width, view.height)
+    used &= covered_pixels(view, view.width, view.height)
     return None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
 
 

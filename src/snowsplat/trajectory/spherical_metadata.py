@@ -66,8 +66,8 @@ def mark_as_spherical(path: Path) -> None:
                     continue
                 moov, start = head + source.read(size - 8), target.tell()
                 # What follows moves by the size of the metadata.
-                grown = len(_marked(moov, start, 0)) - len(moov)
-                target.write(_marked(moov, start, grown))
+                grown = len(_mark_box(moov, start, 0)) - len(moov)
+                target.write(_mark_box(moov, start, grown))
                 shutil.copyfileobj(source, target)
                 break
             else:
@@ -83,11 +83,11 @@ def _copy(source: BinaryIO, target: BinaryIO, count: int) -> None:
         count -= len(block)
 
 
-def _marked(box: bytes, start: int, shift: int) -> bytes:
+def _mark_box(box: bytes, start: int, shift: int) -> bytes:
     """The box with the metadata in it; file positions from ``start`` on are larger by ``shift``."""
     name = box[4:8]
     if name in _OFFSETS:
-        return _shifted(box, _OFFSETS[name], start, shift)
+        return _shift_positions(box, _OFFSETS[name], start, shift)
     if name in _ENTRIES:
         return _box(name, box[8:] + _projection())
     if name not in _CONTAINERS:
@@ -98,14 +98,14 @@ def _marked(box: bytes, start: int, shift: int) -> bytes:
         size = int.from_bytes(box[at : at + 4], "big")
         if size < 8:
             break
-        made += _marked(box[at : at + size], start, shift)
+        made += _mark_box(box[at : at + size], start, shift)
         at += size
     if name == b"trak":
         made += _box(b"uuid", _UUID + _XML)
     return _box(name, made)
 
 
-def _shifted(box: bytes, size: int, start: int, shift: int) -> bytes:
+def _shift_positions(box: bytes, size: int, start: int, shift: int) -> bytes:
     """A box of positions in the file, each of ``size`` bytes."""
     positions = (int.from_bytes(box[i : i + size], "big") for i in range(16, len(box), size))
     moved = (value + shift if value >= start else value for value in positions)

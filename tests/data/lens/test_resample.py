@@ -9,7 +9,7 @@ from PIL import Image
 
 from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.positions import Positions
-from snowsplat.data.lens.resample import resampled, undistort_image, undistort_mask
+from snowsplat.data.lens.resample import resample, undistort_image, undistort_mask
 from snowsplat.data.lens.views import LensView, pinhole_view
 
 LENSES = {
@@ -132,14 +132,14 @@ def reference(planes: np.ndarray, at: np.ndarray, wraps: bool) -> np.ndarray:
 
 
 def check(planes: np.ndarray, at: np.ndarray, wraps: bool = False) -> None:
-    """`resampled` at positions (H, W, 2), which are multiples of 1/256 pixel, is the reference."""
+    """`resample` at positions (H, W, 2), which are multiples of 1/256 pixel, is the reference."""
     height, width = at.shape[:2]
 
     class Exact(Grid):
         def positions(self, width, height):
             yield slice(0, height), Positions.exact(at.astype(np.float32))
 
-    made = resampled(planes, Exact(at, wraps), width, height).astype(float)
+    made = resample(planes, Exact(at, wraps), width, height).astype(float)
     assert np.abs(made - reference(planes, at, wraps).clip(0, 255)).max() <= 0.501
 
 
@@ -165,16 +165,16 @@ def test_positions_without_a_value_do_not_disturb_others():
     planes = np.random.default_rng(0).integers(0, 256, (3, 50, 60), dtype=np.uint8)
     nodes = np.stack(np.meshgrid(np.linspace(0, 60, 7), np.linspace(0, 50, 6)), -1)
     nodes = nodes.astype(np.float32)
-    whole = resampled(planes, Grid(nodes), 60, 50)
+    whole = resample(planes, Grid(nodes), 60, 50)
     assert np.array_equal(whole, planes)  # each pixel is at its own position
     nodes[2, 3] = np.nan
-    made = resampled(planes, Grid(nodes), 60, 50)
+    made = resample(planes, Grid(nodes), 60, 50)
     near = np.zeros((50, 60), bool)
     near[10:30, 20:40] = True
     assert np.array_equal(made[:, ~near], planes[:, ~near])
     assert (made[:, near] == planes[:, :1, 0]).all()
     nodes[2, 3] = np.inf
-    assert (resampled(planes, Grid(nodes), 60, 50)[:, near] >= 0).all()
+    assert (resample(planes, Grid(nodes), 60, 50)[:, near] >= 0).all()
 
 
 @pytest.mark.parametrize("name", LENSES)

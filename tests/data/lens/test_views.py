@@ -7,10 +7,10 @@ import pycolmap
 import pytest
 
 from snowsplat.data.lens.circle import image_circle
-from snowsplat.data.lens.coverage import shown
+from snowsplat.data.lens.coverage import covered_pixels
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.models import COLMAP_LENSES, lens_of
-from snowsplat.data.lens.resample import nearest, resampled
+from snowsplat.data.lens.resample import nearest, resample
 from snowsplat.data.lens.views import lens_views, look
 
 # Plausible coefficients by the names of COLMAP's parameters.
@@ -136,7 +136,7 @@ def test_shown_pixels_have_all_samples_in_the_photo_and_its_circle(name):
         for rows, found in view.strips(2 * width, 2 * height):
             samples[rows] = view.covered(found)
         expected = samples.reshape(height, 2, width, 2).all((1, 3))
-        assert np.array_equal(shown(view, width, height), expected)
+        assert np.array_equal(covered_pixels(view, width, height), expected)
 
 
 @pytest.mark.parametrize("name", ["circle of 220°", "panorama"])
@@ -161,7 +161,7 @@ def test_colours_of_a_wide_view_encode_its_rays(name):
         ahead = np.maximum(in_view[..., 2:], 0.05)
         position = view.params[0] * in_view[..., :2] / ahead
         photo = np.rint(127.5 + 120 * np.sin(position / 8)).astype(np.uint8).transpose(2, 0, 1)
-        made = resampled(photo, view, view.width, view.height).astype(float)
+        made = resample(photo, view, view.width, view.height).astype(float)
         u, v = (
             np.arange(size) + 0.5 - centre
             for size, centre in ((view.width, view.params[2]), (view.height, view.params[3]))

@@ -18,7 +18,7 @@ from snowsplat.data.colmap.types import (
     PointFile,
     check_count,
     checked_camera,
-    damaged,
+    damaged_model,
     track_rows,
 )
 from snowsplat.data.lens.lens import Lens
@@ -55,7 +55,7 @@ class _Cursor:
         self.offset = 0
         (self.count,) = self.take(_COUNT)
         if self.count * least_bytes > len(self.data) - self.offset:
-            raise damaged(path, f"it declares {self.count} {kind}, more than fit into it")
+            raise damaged_model(path, f"it declares {self.count} {kind}, more than fit into it")
 
     def take(self, layout: struct.Struct) -> tuple:
         if self.offset + layout.size > len(self.data):
@@ -80,10 +80,10 @@ class _Cursor:
     def finish(self) -> None:
         surplus = len(self.data) - self.offset
         if surplus:
-            raise damaged(self.path, f"{surplus} bytes are left over at its end")
+            raise damaged_model(self.path, f"{surplus} bytes are left over at its end")
 
     def truncated(self) -> UserError:
-        return damaged(self.path, "it is truncated")
+        return damaged_model(self.path, "it is truncated")
 
 
 def count_images(path: Path) -> int:

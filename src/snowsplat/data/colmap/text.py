@@ -17,7 +17,7 @@ from snowsplat.data.colmap.types import (
     PointFile,
     check_count,
     checked_camera,
-    damaged,
+    damaged_model,
     track_rows,
 )
 from snowsplat.data.lens.lens import Lens
@@ -89,7 +89,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             camera_id, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
-            raise damaged(path, f"not a camera: line {shown(line[:60])!r}") from None
+            raise damaged_model(path, f"not a camera: line {shown(line[:60])!r}") from None
         if model not in models:
             raise UserError(
                 "{path}: unknown camera model {model!r}; undistort the images with the program "
@@ -98,7 +98,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
                 model=shown(model[:40]),
             )
         if len(params) != len(models[model].parameters):
-            raise damaged(path, f"{len(params)} parameters for camera model {model[:40]}")
+            raise damaged_model(path, f"{len(params)} parameters for camera model {model[:40]}")
         cameras[camera_id] = checked_camera(path, models[model], width, height, params)
         check_count(path, "cameras", len(cameras))
     _warn_if_fewer(path, "cameras", len(cameras))
@@ -125,7 +125,7 @@ def read_observations(path: Path, wanted: Mapping[int, np.ndarray]) -> dict[int,
             try:
                 values = np.array([row or ["nan"] * 3 for row in rows], np.float64)
             except ValueError:
-                raise damaged(path, f"the observations of image {image.name[:80]}") from None
+                raise damaged_model(path, f"the observations of image {image.name[:80]}") from None
             found[image.number] = values.reshape(-1, 3)
     return found
 
@@ -140,7 +140,9 @@ def _images(path: Path) -> Iterator[tuple[ColmapImage, str]]:
         if image is not None and not _is_image(line):
             if _count_words(line) % 3:
                 name = image.name[:80]
-                raise damaged(path, f"the line after image {name} should hold its observations")
+                raise damaged_model(
+                    path, f"the line after image {name} should hold its observations"
+                )
             yield image, line
             image = None
         elif line:
@@ -151,7 +153,7 @@ def _images(path: Path) -> Iterator[tuple[ColmapImage, str]]:
                 pose = tuple(map(float, words[1:8]))
                 image = ColmapImage(words[9], int(words[8]), pose, int(words[0]))
             except (ValueError, IndexError):
-                raise damaged(path, f"not an image: line {shown(line[:60])!r}") from None
+                raise damaged_model(path, f"not an image: line {shown(line[:60])!r}") from None
             check_count(path, "images", count := count + 1)
     if image is not None:
         yield image, ""
@@ -192,7 +194,7 @@ def read_frames(path: Path) -> list[tuple[int, list[int]]]:
             data = zip(words[10::3], words[12::3], strict=True)
             frames.append((int(words[0]), [int(image) for kind, image in data if kind == "CAMERA"]))
         except (ValueError, IndexError):
-            raise damaged(path, f"not a frame: line {shown(line[:60])!r}") from None
+            raise damaged_model(path, f"not a frame: line {shown(line[:60])!r}") from None
         check_count(path, "frames", len(frames))
     return frames
 
@@ -210,10 +212,10 @@ def read_points(path: Path) -> PointFile:
                 block, np.float64, comments=None, usecols=(0, 1, 2, 3, 4, 5, 6, 7), ndmin=2
             )
         except (ValueError, IndexError) as error:
-            raise damaged(path, f"not points ({' '.join(str(error).split())[:90]})") from None
+            raise damaged_model(path, f"not points ({' '.join(str(error).split())[:90]})") from None
         colours = values[:, 4:7]
         if not ((colours >= 0) & (colours <= 255)).all():
-            raise damaged(path, "a colour is outside 0..255")
+            raise damaged_model(path, "a colour is outside 0..255")
         ids.append(values[:, 0].astype(np.int64))
         xyz.append(values[:, 1:4].copy())
         rgb.append(colours.astype(np.uint8))

@@ -57,7 +57,7 @@ def track_rows(pairs: Mapping[int, np.ndarray]) -> np.ndarray:
     return np.concatenate([np.empty((0, 3), np.int64), *rows]).astype(np.int64)
 
 
-def damaged(path: Path, problem: str) -> UserError:
+def damaged_model(path: Path, problem: str) -> UserError:
     """The error for a file that does not follow the format."""
     return UserError(
         "{path}: damaged: {problem}; copy the file again or run COLMAP again",
@@ -82,5 +82,5 @@ def checked_camera(
 ) -> Lens:
     """A camera whose image size is plausible; otherwise raise `UserError`."""
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
-        raise damaged(path, f"a camera has the size {width}x{height}")
+        raise damaged_model(path, f"a camera has the size {width}x{height}")
     return model(width, height, params)

@@ -120,6 +120,6 @@ def files_below(
     return sorted(found, key=natural_key)
 
 
-def folded(name: str) -> str:
+def fold_name(name: str) -> str:
     """A name as it is compared: without regard to case and to the form of Unicode."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())

@@ -25,7 +25,7 @@ from snowsplat.data.dataset import PosedImage
 from snowsplat.data.files.listing import (
     PHOTO_FOLDERS,
     files_below,
-    folded,
+    fold_name,
     folder_kind,
     original_of,
 )
@@ -114,7 +114,7 @@ def _find_in(folder: Path, photos: dict[str, str], found: FoundMasks) -> set[Pat
         for file in masks:
             bases = list(_bases_of_mask(PurePosixPath(file).name))
             if rank < len(bases):
-                key = folded(_parent(file)), bases[rank]
+                key = fold_name(_parent(file)), bases[rank]
                 by_key.setdefault(key, folder / file)
     open_photos = {p: r for p, r in photos.items() if p not in found.of}
     deepest = max((relative.count("/") for relative in open_photos.values()), default=0)
@@ -125,7 +125,7 @@ def _find_in(folder: Path, photos: dict[str, str], found: FoundMasks) -> set[Pat
             parts = relative.split("/")
             if level >= len(parts):
                 continue
-            parent = folded("/".join(parts[level:-1]))
+            parent = fold_name("/".join(parts[level:-1]))
             mask = next(
                 (m for base in _bases_of_photo(parts[-1]) if (m := by_key.get((parent, base)))),
                 None,
@@ -141,12 +141,12 @@ def _find_in(folder: Path, photos: dict[str, str], found: FoundMasks) -> set[Pat
 
 def _bases_of_photo(name: str) -> tuple[str, str]:
     """What the masks of a photo are called after: IMG.jpg, then IMG."""
-    return folded(name), folded(PurePosixPath(name).stem)
+    return fold_name(name), fold_name(PurePosixPath(name).stem)
 
 
 def _bases_of_mask(name: str) -> Iterator[str]:
     """What a mask is called after: its name without suffix, then also without the word "mask"."""
-    base = folded(PurePosixPath(name).stem)
+    base = fold_name(PurePosixPath(name).stem)
     yield base
     for pattern in (_MARKED_END, _MARKED_START):
         if marked := pattern.fullmatch(base):

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from snowsplat.data.files.listing import PHOTO_FOLDERS, folded
+from snowsplat.data.files.listing import PHOTO_FOLDERS, fold_name
 
 # The encodings of file names on computers whose names are not Unicode, and the Western ones that
 # programs take for granted if they do not know better.
@@ -158,7 +158,7 @@ def _keys(path: str, with_suffix: bool) -> Iterator[tuple[str, ...]]:
         if parts and not with_suffix:
             parts[-1] = PurePosixPath(parts[-1]).stem
         if parts:
-            yield tuple(folded(part) for part in parts[-_MOST_PARTS:])
+            yield tuple(fold_name(part) for part in parts[-_MOST_PARTS:])
 
 
 def _readings(text: str) -> list[str]:

@@ -12,7 +12,7 @@ from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.scene.origin import HERE, Origin, origin_of
 
 
-def moved_to_origin(
+def move_to_origin(
     posed: Sequence[PosedImage], points: Points | None
 ) -> tuple[list[PosedImage], Points | None, Origin]:
     """Cameras, points and the origin of a dataset as it is stored.

@@ -50,7 +50,7 @@ def lens_findings(
         *_field_of_view(width, height, fx, fy),
         *_aspect(fx, fy),
         *_principal_point(width, height, cx, cy),
-        *_known(math.sqrt(fx * fy), known_focal),
+        *_known_focal(math.sqrt(fx * fy), known_focal),
     ]
 
 
@@ -89,7 +89,7 @@ def _principal_point(width: int, height: int, cx: float, cy: float) -> list[Find
     return [Finding("principal point", text)]
 
 
-def _known(focal: float, known: float | None) -> list[Finding]:
+def _known_focal(focal: float, known: float | None) -> list[Finding]:
     if known is None or _AS_KNOWN[0] <= focal / known <= _AS_KNOWN[1]:
         return []
     text = (

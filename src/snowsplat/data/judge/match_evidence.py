@@ -69,15 +69,15 @@ class MatchEvidence:
         self._sample = sample
         self._features = [_features(photo) for photo in sample.photos]
         #: The pairs with enough matches, within the groups of the sample.
-        self.pairs = self._matched(same_group=True)
+        self.pairs = self._match_pairs(same_group=True)
 
     def widen(self) -> None:
         """Add pairs of different groups. If the names are shuffled, views of one group do not see
         the same things, but others do.
         """
-        self.pairs += self._matched(same_group=False)
+        self.pairs += self._match_pairs(same_group=False)
 
-    def _matched(self, *, same_group: bool) -> list[Pair]:
+    def _match_pairs(self, *, same_group: bool) -> list[Pair]:
         groups = self._sample.groups
         candidates = [
             Pair(a, b, *_matches(self._features[a], self._features[b]))

@@ -40,7 +40,7 @@ class PhotoSample:
     @classmethod
     def of(cls, views: Sequence[View], rig: Rig) -> PhotoSample:
         """Decode a sample of the photos. Photos that cannot be decoded are left out."""
-        group = _chosen(rig)
+        group = _choose_views(rig)
         workers = min(4, os.cpu_count() or 1)
         with ThreadPoolExecutor(workers, thread_name_prefix="snowsplat-judge") as pool:
             decoded = list(pool.map(lambda i: _photo(views[i]), group))
@@ -51,7 +51,7 @@ class PhotoSample:
         return len(self.views)
 
 
-def _chosen(rig: Rig) -> dict[int, int]:
+def _choose_views(rig: Rig) -> dict[int, int]:
     """The group of each view of the sample, by its index; sorted."""
     count = len(rig)
     anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).round().astype(int))

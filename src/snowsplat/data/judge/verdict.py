@@ -193,7 +193,7 @@ def _by_matches(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
 def _by_colours(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Finding]:
     """Photos without matches: only the colours of the points."""
     candidates = [*pose_repairs(rig), *point_repairs(rig)]
-    if repair := _coloured(candidates, colours, agreement):
+    if repair := _best_by_colours(candidates, colours, agreement):
         return [_mistake(repair, _of_colours(agreement))]
     return [_disorder(_of_colours(agreement), impossible=False)]
 
@@ -202,7 +202,7 @@ def _points(rig: Rig, colours: ColourEvidence, agreement: Agreement) -> list[Fin
     """The poses fit the photos, but the points do not fit both."""
     if agreement.agreeing >= _COLOURS_AGREE:  # the points cover only a part of the views
         return []
-    if repair := _coloured(point_repairs(rig), colours, agreement):
+    if repair := _best_by_colours(point_repairs(rig), colours, agreement):
         return [_mistake(repair, _of_colours(agreement))]
     if agreement.correlation >= _COLOURS_FIT:
         return []
@@ -216,7 +216,7 @@ def _by_both(
     """Neither the colours nor the matches fit the poses."""
     evidence = f"{_of_matches(fit)}, and {_of_colours(agreement)}"
     if repairs := _explaining(rig, matches, fit):
-        return [_mistake(_coloured(repairs, colours, agreement) or repairs[0], evidence)]
+        return [_mistake(_best_by_colours(repairs, colours, agreement) or repairs[0], evidence)]
     proven = len(matches.pairs) >= _PAIRS_FOR_PROOF and agreement.agreeing < _COLOURS_CONTRADICT
     return [_disorder(evidence, impossible=proven)]
 
@@ -248,7 +248,7 @@ def _explaining(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Repair]:
     return [repair for _, repair in sorted(found, key=lambda pair: pair[0])]
 
 
-def _coloured(
+def _best_by_colours(
     repairs: Iterable[Repair], colours: ColourEvidence, agreement: Agreement
 ) -> Repair | None:
     """The repair with which the colours agree best; None if they do with none of them."""

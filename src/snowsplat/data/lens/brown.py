@@ -18,7 +18,7 @@ class Brown(Perspective, model="BROWN", parameters="fx fy cx cy k1 k2 k3 k4 p1 p
 
     in_transforms = True
 
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         k1, k2, k3, k4, p1, p2, skew = self.coefficients
         factor = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
         du, dv = tangential(u, v, r2, p1, p2)

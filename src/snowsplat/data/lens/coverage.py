@@ -1,4 +1,4 @@
-"""`shown`: the pixels of a view that the photo shows."""
+"""`covered_pixels`: the pixels of a view that the photo shows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from snowsplat.data.lens.views import LensView
 _SAMPLES = 2  # of a pixel along each axis
 
 
-def shown(view: LensView | None, width: int, height: int) -> np.ndarray:
+def covered_pixels(view: LensView | None, width: int, height: int) -> np.ndarray:
     """(height, width) bool: the pixels of a view at this size that lie completely in the photo.
 
     None: a photo without distortion, all of whose pixels are shown.

@@ -19,9 +19,9 @@ class OpenCVFisheye(Lens, model="OPENCV_FISHEYE", parameters="fx fy cx cy k1 k2 
         sine = np.hypot(x, y)
         scale = np.where(sine > TINY, np.arctan2(sine, z) / np.maximum(sine, TINY), 1 / np.abs(z))
         u, v = x * scale, y * scale
-        return self.distorted(u, v, u * u + v * v)
+        return self.distort(u, v, u * u + v * v)
 
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         """Where the lens moves the position (u, v), at the angle r to the axis."""
         factor = np.zeros_like(r2)
         for coefficient in reversed(self.coefficients[:6]):
@@ -50,7 +50,7 @@ class ThinPrismFisheye(
 ):
     """Weng et al. 1992, on the angle."""
 
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         k1, k2, p1, p2, k3, k4, s1, s2 = self.coefficients
         radial = r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
         du, dv = tangential(u, v, r2, p1, p2)
@@ -65,8 +65,8 @@ class AriaFisheye(
 ):
     """Fisheye624 of Project Aria: six radial, two tangential and four thin prism coefficients."""
 
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
-        u, v = super().distorted(u, v, r2)
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+        u, v = super().distort(u, v, r2)
         p0, p1, s0, s1, s2, s3 = self.coefficients[6:]
         r2 = u * u + v * v
         du, dv = tangential(u, v, r2, p1, p0)

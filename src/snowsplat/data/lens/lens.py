@@ -83,7 +83,7 @@ class Lens(ABC):
         """Whether there is no distortion. A fisheye without coefficients is no pinhole."""
         return self.straight and not any(self.coefficients)
 
-    def named(self, *names: str) -> list[float]:
+    def values_of(self, *names: str) -> list[float]:
         """The values of parameters; 0 for those that the model does not have."""
         values = dict(zip(self.parameters, self.params, strict=True))
         return [values.get(name, 0.0) for name in names]
@@ -114,7 +114,7 @@ class Lens(ABC):
         if self.angular:
             angle = np.maximum(np.linalg.norm(start, axis=1, keepdims=True), TINY)
             start = start * np.tan(np.minimum(angle, 1.55)) / angle
-        return self._solved(
+        return self._newton(
             pixels,
             start,
             ray_of=lambda tangents: np.column_stack([tangents, np.ones(len(tangents))]),
@@ -131,14 +131,14 @@ class Lens(ABC):
         if not self.angular:
             tangent = np.maximum(np.linalg.norm(angles, axis=1, keepdims=True), TINY)
             angles = angles * np.arctan(tangent) / tangent
-        return _turned_axis(self._solved(pixels, angles, _turned_axis, step_of=lambda _: 1e-6))
+        return _turned_axis(self._newton(pixels, angles, _turned_axis, step_of=lambda _: 1e-6))
 
     def _central(self, pixels: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) relative to the principal point, in units of the focal lengths."""
         fx, fy, cx, cy = self.intrinsics
         return (np.asarray(pixels, np.float64) - (cx, cy)) / (fx, fy)
 
-    def _solved(
+    def _newton(
         self,
         pixels: np.ndarray,
         found: np.ndarray,

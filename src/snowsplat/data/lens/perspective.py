@@ -18,10 +18,10 @@ class Perspective(Lens):
     def image_of(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
         depth = np.where(z > 0, z, np.nan)
         u, v = x / depth, y / depth
-        return self.distorted(u, v, u * u + v * v)
+        return self.distort(u, v, u * u + v * v)
 
     @abstractmethod
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         """Where the lens moves the position (u, v), with r² = u² + v²."""
 
 
@@ -32,13 +32,13 @@ class FullOpenCV(
 
     in_transforms = True
 
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
-        k1, k2, k3, k4, k5, k6 = self.named("k1", "k2", "k3", "k4", "k5", "k6")
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+        k1, k2, k3, k4, k5, k6 = self.values_of("k1", "k2", "k3", "k4", "k5", "k6")
         factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         if k4 or k5 or k6:
             divisor = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
             factor = factor / np.where(divisor > 0, divisor, np.nan)
-        du, dv = tangential(u, v, r2, *self.named("p1", "p2"))
+        du, dv = tangential(u, v, r2, *self.values_of("p1", "p2"))
         return u * factor + du, v * factor + dv
 
 
@@ -67,7 +67,7 @@ class FieldOfView(Perspective, model="FOV", parameters="fx fy cx cy omega"):
 
     straight = False
 
-    def distorted(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
+    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
         (omega,) = self.coefficients
         if abs(omega) < 1e-6:
             return u, v

@@ -20,7 +20,7 @@ def undistort_image(image: Image.Image, view: LensView) -> Image.Image:
     # Premultiplied alpha, so that the colours of transparent pixels do not affect other pixels.
     mode = "RGBa" if image.mode == "RGBA" else image.mode
     pixels = np.asarray(image.convert(mode)).reshape(image.height, image.width, -1)
-    made = resampled(pixels.transpose(2, 0, 1), view, view.width, view.height)
+    made = resample(pixels.transpose(2, 0, 1), view, view.width, view.height)
     pixels = np.ascontiguousarray(made.transpose(1, 2, 0))
     return Image.frombytes(mode, (view.width, view.height), pixels.tobytes()).convert(image.mode)
 
@@ -30,7 +30,7 @@ def undistort_mask(mask: Image.Image, view: LensView) -> Image.Image:
     return undistort_image(mask, view).point(lambda value: 255 * (value >= 128))
 
 
-def resampled(
+def resample(
     planes: np.ndarray, view: LensView, width: int, height: int, scale: tuple[float, float] = (1, 1)
 ) -> np.ndarray:
     """(C, height, width) uint8: a photo (C, H, W) uint8 seen by a view at the given size.

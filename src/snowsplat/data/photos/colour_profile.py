@@ -158,8 +158,8 @@ def _adobe_rgb() -> bytes:
         b"gXYZ": (0.20528, 0.62567, 0.06087),
         b"bXYZ": (0.14919, 0.06322, 0.74457),
     }
-    white = _fixed(points[b"wtpt"])
-    tags = {name: b"XYZ \0\0\0\0" + _fixed(point) for name, point in points.items()}
+    white = _fixed_point(points[b"wtpt"])
+    tags = {name: b"XYZ \0\0\0\0" + _fixed_point(point) for name, point in points.items()}
     gamma = b"curv" + struct.pack(">IIHH", 0, 1, round(2.19921875 * 256), 0)
     tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), gamma)
     start = 128 + 4 + 12 * len(tags)
@@ -172,5 +172,5 @@ def _adobe_rgb() -> bytes:
     return head.ljust(128, b"\0") + table + body
 
 
-def _fixed(values: tuple[float, ...]) -> bytes:
+def _fixed_point(values: tuple[float, ...]) -> bytes:
     return b"".join(struct.pack(">i", round(65536 * value)) for value in values)

@@ -17,8 +17,8 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 from torch import Tensor
 
-from snowsplat.data.lens.coverage import shown
-from snowsplat.data.lens.resample import resampled
+from snowsplat.data.lens.coverage import covered_pixels
+from snowsplat.data.lens.resample import resample
 from snowsplat.data.lens.views import LensView
 from snowsplat.data.maps.mask_pixels import mask_levels
 from snowsplat.data.photos.bit_depth import eight_bits
@@ -113,7 +113,7 @@ def read_header(path: Path) -> Header:
 
     Raises: UserError: the file is missing or is not a readable image.
     """
-    with _opened(path, header_only=True) as image:
+    with _open(path, header_only=True) as image:
         # If a PNG has no EXIF data before its pixels, getexif() would decode it to find some.
         has_exif = "exif" in image.info or image.format == "TIFF"
         orientation = image.getexif().get(Base.Orientation, 1) if has_exif else 1
@@ -131,8 +131,8 @@ def load_image(source: ImageSource, background: Sequence[float] | None = None) -
 
     Raises: UserError: the file is missing, damaged, or not an image.
     """
-    planes = _decoded(source, background)
-    return torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
+    planes = _decode(source, background)
+    return torch.from_numpy(_resize_view(planes, source.view, source.width, source.height))
 
 
 def load_views(
@@ -143,13 +143,13 @@ def load_views(
 
     ``background`` and the errors are those of `load_image`.
     """
-    planes = _decoded(sources[0][0], background)
+    planes = _decode(sources[0][0], background)
     levels: dict[Path, np.ndarray] = {}
     made = []
     for source, mask in sources:
-        image = torch.from_numpy(_scaled(planes, source.view, source.width, source.height))
+        image = torch.from_numpy(_resize_view(planes, source.view, source.width, source.height))
         if mask is not None and not mask.blank and mask.path not in levels:
-            levels[mask.path] = _decoded_mask(mask)
+            levels[mask.path] = _decode_mask(mask)
         allowed = None if mask is None else _mask_of(levels.get(mask.path), mask)
         made.append(LoadedImage(image, allowed))
     return made
@@ -164,15 +164,15 @@ def load_thumbnail(source: ImageSource, side: int) -> np.ndarray:
     Raises: UserError: the file is missing, damaged, or not an image.
     """
     size = scaled_size(source.width, source.height, side)
-    with _opened(source.path) as opened:
+    with _open(source.path) as opened:
         opened.draft("RGB", (2 * side, 2 * side))  # only JPEG; the size is at least this one
-        planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
+        planes = _planes(_turn_upright(eight_bits(opened, source.path), source), source.path)
     if source.view is None:
         pictures = map(Image.fromarray, planes)
         small = [np.asarray(plane.resize(size, Image.Resampling.BOX)) for plane in pictures]
     else:
-        small = list(_scaled(planes, source.view, *size))
-    alpha = np.uint8(255) * shown(source.view, *size)
+        small = list(_resize_view(planes, source.view, *size))
+    alpha = np.uint8(255) * covered_pixels(source.view, *size)
     return np.stack([*small[:3], np.minimum(small[3], alpha) if len(small) == 4 else alpha])
 
 
@@ -183,7 +183,7 @@ def load_mask(source: ImageSource) -> Tensor:
 
     Raises: UserError: see `load_image`.
     """
-    return _mask_of(None if source.blank else _decoded_mask(source), source)
+    return _mask_of(None if source.blank else _decode_mask(source), source)
 
 
 def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
@@ -222,29 +222,29 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
     return resized
 
 
-def _decoded(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:
+def _decode(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:
     """The photo of a source as stored: planes of `load_image` before they are scaled."""
-    with _opened(source.path) as opened:
-        planes = _planes(_upright(eight_bits(opened, source.path), source), source.path)
+    with _open(source.path) as opened:
+        planes = _planes(_turn_upright(eight_bits(opened, source.path), source), source.path)
     return _with_alpha(planes, background) if planes.shape[0] == 4 else planes
 
 
-def _decoded_mask(source: ImageSource) -> np.ndarray:
+def _decode_mask(source: ImageSource) -> np.ndarray:
     """(H, W) uint8: the levels of a mask as stored."""
-    with _opened(source.path) as opened:
-        return mask_levels(_upright(opened, source))
+    with _open(source.path) as opened:
+        return mask_levels(_turn_upright(opened, source))
 
 
 def _mask_of(levels: np.ndarray | None, source: ImageSource) -> Tensor:
     """`load_mask` from levels as stored. None: the mask is white."""
-    covered = torch.from_numpy(shown(source.view, source.width, source.height))
+    covered = torch.from_numpy(covered_pixels(source.view, source.width, source.height))
     if levels is None:
         return covered
-    scaled = _scaled(levels[None], source.view, source.width, source.height)[0]
+    scaled = _resize_view(levels[None], source.view, source.width, source.height)[0]
     return torch.from_numpy(scaled >= 128) & covered
 
 
-def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) -> np.ndarray:
+def _resize_view(planes: np.ndarray, view: LensView | None, width: int, height: int) -> np.ndarray:
     """(C, height, width) uint8: an image (C, H, W) uint8, or a view of it, scaled down. A view has
     several samples per pixel if the photo has more detail than the result."""
     if view is None:
@@ -256,7 +256,7 @@ def _scaled(planes: np.ndarray, view: LensView | None, width: int, height: int) 
         planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduced)) for plane in planes])
         scale = scale[0] / reduced, scale[1] / reduced
     samples = max(1, round(ratio / reduced))
-    made = resampled(planes, view, samples * width, samples * height, scale)
+    made = resample(planes, view, samples * width, samples * height, scale)
     if len(made) == 4:  # premultiplied colours
         made[:3] = np.minimum(made[:3], made[3])
     return resize_area(made, width, height)
@@ -280,7 +280,7 @@ def _mean_over_columns(values: np.ndarray, count: int) -> np.ndarray:
     return means
 
 
-def _upright(image: Image.Image, source: ImageSource) -> Image.Image:
+def _turn_upright(image: Image.Image, source: ImageSource) -> Image.Image:
     return ImageOps.exif_transpose(image) if source.apply_orientation else image
 
 
@@ -315,7 +315,7 @@ def _with_alpha(planes: np.ndarray, background: Sequence[float] | None) -> np.nd
 
 
 @contextmanager
-def _opened(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
+def _open(path: Path, *, header_only: bool = False) -> Iterator[Image.Image]:
     """An image file. Raises UserError if it cannot be read, here or in the block."""
     try:
         with open_image(path, _FORMATS, header_only=header_only) as image:

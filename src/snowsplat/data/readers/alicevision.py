@@ -17,7 +17,7 @@ from snowsplat.data.readers.lenses import fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
-    damaged,
+    damaged_export,
     head_of,
     load_json,
     number,
@@ -66,7 +66,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             continue
         lens = lenses.get(str(view.get("intrinsicId")))
         if lens is None:
-            raise damaged(where, "has an intrinsic that is not in the file")
+            raise damaged_export(where, "has an intrinsic that is not in the file")
         transform = table(where, pose.get("transform"))
         rotation = numbers(where, transform.get("rotation"), 9).reshape(3, 3).T
         centre = numbers(where, transform.get("center"), 3)
@@ -102,7 +102,7 @@ def _lens(where: str, camera: dict[str, Any], version: tuple[float, ...]) -> Len
     else:
         sensor = number(where, camera, "sensorWidth", 36.0)
         if not sensor > 0:
-            raise damaged(where, f"the sensor width {sensor:g} is not valid")
+            raise damaged_export(where, f"the sensor width {sensor:g} is not valid")
         fx = number(where, camera, "focalLength") * width / sensor
         fy = fx / (number(where, camera, "pixelRatio", 1.0) or 1.0)
     centre = numbers(where, camera.get("principalPoint", [0, 0]), 2)

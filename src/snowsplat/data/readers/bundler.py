@@ -13,7 +13,7 @@ import numpy as np
 
 from snowsplat.data.dataset import usable_points
 from snowsplat.data.photos.decode import read_header
-from snowsplat.data.readers.lenses import centred, perspective
+from snowsplat.data.readers.lenses import centred_intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import head_of, load_text, numbers, rigid
 from snowsplat.util.errors import UserError
@@ -46,7 +46,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             continue
         header = read_header(photos.root / photo)
         size = header.width, header.height
-        lens = perspective(where, *size, centred(*size, focal), (k1, k2))
+        lens = perspective(where, *size, centred_intrinsics(*size, focal), (k1, k2))
         pose = rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
         found.add(photos, photo, lens, pose)
     xyz, rgb = [], []

@@ -12,7 +12,7 @@ from snowsplat.data.lens.brown import Brown
 from snowsplat.data.lens.fisheye import Equirectangular, OpenCVFisheye, ThinPrismFisheye
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.perspective import FullOpenCV, OpenCV, Pinhole
-from snowsplat.data.readers.values import damaged, size_of
+from snowsplat.data.readers.values import damaged_export, size_of
 
 #: fx, fy, cx, cy in pixels.
 Intrinsics = tuple[float, float, float, float]
@@ -37,7 +37,7 @@ def perspective(
 
     Raises: UserError: the size or a focal length is not valid.
     """
-    size = _checked(where, width, height, intrinsics)
+    size = _valid_size(where, width, height, intrinsics)
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if not any((k1, k2, k3, k4, p1, p2, skew)):
@@ -59,7 +59,7 @@ def fisheye(
     tangential: Sequence[float] = (0.0, 0.0),
 ) -> Lens:
     """An equidistant lens: θ (1 + k₁ θ² + k₂ θ⁴ + k₃ θ⁶ + k₄ θ⁸); arguments of `perspective`."""
-    size = _checked(where, width, height, intrinsics)
+    size = _valid_size(where, width, height, intrinsics)
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if p1 or p2:
@@ -74,14 +74,16 @@ def equirectangular(where: object, width: float, height: float) -> Lens:
     return Equirectangular(*size, (float(size[0]), float(size[1])))
 
 
-def centred(width: float, height: float, focal: float) -> Intrinsics:
+def centred_intrinsics(width: float, height: float, focal: float) -> Intrinsics:
     """One focal length, and the principal point in the middle."""
     return focal, focal, width / 2, height / 2
 
 
-def _checked(where: object, width: float, height: float, intrinsics: Intrinsics) -> tuple[int, int]:
+def _valid_size(
+    where: object, width: float, height: float, intrinsics: Intrinsics
+) -> tuple[int, int]:
     size = size_of(where, width, height)
     fx, fy, _, _ = intrinsics
     if not (0 < fx < 1e9 and 0 < fy < 1e9):
-        raise damaged(where, f"the focal lengths {fx:g} and {fy:g} pixels are not valid")
+        raise damaged_export(where, f"the focal lengths {fx:g} and {fy:g} pixels are not valid")
     return size

@@ -19,7 +19,7 @@ from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
-    damaged,
+    damaged_export,
     head_of,
     inverse,
     load_xml,
@@ -54,7 +54,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if chunk.find("cameras") is not None and chunk.find("sensors") is not None
     ]
     if not chunks:
-        raise damaged(path, "has no cameras")
+        raise damaged_export(path, "has no cameras")
     cameras = [list(_cameras(chunk)) for chunk in chunks]
     aligned = [sum(camera.find("transform") is not None for camera in each) for each in cameras]
     best = aligned.index(max(aligned))
@@ -97,7 +97,9 @@ def _read_chunk(
         key = camera.get("sensor_id")
         if key not in lenses:
             if key not in sensors:
-                raise damaged(where, f"has the sensor {quoted(key)}, which is not in the file")
+                raise damaged_export(
+                    where, f"has the sensor {quoted(key)}, which is not in the file"
+                )
             lenses[key] = _lens(f"{path}: sensor {quoted(key)}", sensors[key])
         groups.setdefault(camera.get("component_id"), []).append((photo, lenses[key], pose))
     if not groups:
@@ -131,7 +133,7 @@ def _similarity(where: str, transform: Element | None) -> tuple[float, np.ndarra
     translation = numbers(where, (transform.findtext("translation") or "0 0 0").split(), 3)
     scale = number(where, {"scale": transform.findtext("scale")}, "scale", 1.0)
     if not scale > 0:
-        raise damaged(where, f"the scale {scale:g} is not positive")
+        raise damaged_export(where, f"the scale {scale:g} is not positive")
     return scale, rigid(where, rotation, translation)
 
 
@@ -175,7 +177,7 @@ def _lens(where: str, sensor: Element) -> Lens:
         return equirectangular(where, *_size(where, size))
     calibration = _calibration(sensor)
     if calibration is None:
-        raise damaged(where, "has no calibration")
+        raise damaged_export(where, "has no calibration")
     kind = calibration.get("type", kind)
     own = calibration.find("resolution")
     size = size if own is None else own

@@ -17,7 +17,7 @@ from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
-    damaged,
+    damaged_export,
     head_of,
     load_json,
     number,
@@ -63,7 +63,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if pose is None:
             continue
         if not isinstance(key, int) or key not in lenses:
-            raise damaged(where, f"has the intrinsic {quoted(key)}, which is not in the file")
+            raise damaged_export(
+                where, f"has the intrinsic {quoted(key)}, which is not in the file"
+            )
         values = table(where, pose.get("value"))
         rotation = numbers(where, values.get("rotation"), 3, 3)
         centre = numbers(where, values.get("center"), 3)
@@ -97,7 +99,7 @@ def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, Lens]:
         value = table(where, entry.get("value"))
         identifier = value.get("polymorphic_id")
         if not isinstance(identifier, int) or not isinstance(entry.get("key"), int):
-            raise damaged(where, "has no identifier")
+            raise damaged_export(where, "has no identifier")
         # Only the first camera of a kind has the name of the kind.
         if isinstance(value.get("polymorphic_name"), str):
             names[identifier & _NAMED] = value["polymorphic_name"]

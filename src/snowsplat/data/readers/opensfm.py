@@ -17,7 +17,7 @@ from snowsplat.data.lens.lens import Lens
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
-    damaged,
+    damaged_export,
     head_of,
     load_json,
     number,
@@ -51,7 +51,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     scenes = list(objects(path, load_json(path)))
     shots = [table(f"{path}: shots", scene.get("shots")) for scene in scenes]
     if not scenes:
-        raise damaged(path, "has no reconstruction")
+        raise damaged_export(path, "has no reconstruction")
     largest = max(range(len(scenes)), key=lambda i: len(shots[i]))
     if len(scenes) > 1:
         logger.warning(
@@ -68,7 +68,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         shot = table(where, entry)
         key = shot.get("camera")
         if not isinstance(key, str) or key not in cameras:
-            raise damaged(where, f"has the camera {quoted(key)}, which is not in the file")
+            raise damaged_export(where, f"has the camera {quoted(key)}, which is not in the file")
         if (photo := found.photo(photos, name)) is None:
             continue
         if key not in lenses:

@@ -19,7 +19,7 @@ from snowsplat.data.photos.decode import read_header
 from snowsplat.data.readers.lenses import perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import damaged, from_opengl, head_of, load_text, number
+from snowsplat.data.readers.values import damaged_export, from_opengl, head_of, load_text, number
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -56,10 +56,10 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     try:
         rows = [row for row in csv.reader(lines[first + 1 :]) if row and row[0].strip()]
     except csv.Error as error:
-        raise damaged(path, f"not a complete CSV file ({error})") from None
+        raise damaged_export(path, f"not a complete CSV file ({error})") from None
     for row in rows:
         if len(row) != len(columns):
-            raise damaged(path, f"a line has {len(row)} columns instead of {len(columns)}")
+            raise damaged_export(path, f"a line has {len(row)} columns instead of {len(columns)}")
         values = dict(zip(columns, row, strict=True))
         where = f"{path}: camera {quoted(values['name'])}"
         found.total += 1

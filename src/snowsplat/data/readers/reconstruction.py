@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from snowsplat.data.dataset import Points, PosedImage, safe_name
-from snowsplat.data.files.listing import folded
+from snowsplat.data.files.listing import fold_name
 from snowsplat.data.files.photo_files import photos_below, warn_of_missing
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
@@ -64,7 +64,7 @@ class PhotoFolder:
             for suffix in ("", *IMAGE_SUFFIXES) if not is_photo(name) else ("",):
                 if is_file(self.root / (folder + name + suffix)) and is_photo(name + suffix):
                     return folder + name + suffix
-        last = folded(PurePosixPath(name).name)
+        last = fold_name(PurePosixPath(name).name)
         index = self._index()
         return self._nearest(name, index.get(last) or index.get(_stem(last)) or [])
 
@@ -109,7 +109,7 @@ class PhotoFolder:
             except OSError:  # a folder that cannot be read
                 photos = []
             for photo in (p for p in photos if _SMALLER.isdisjoint(p.split("/"))):
-                name = folded(PurePosixPath(photo).name)
+                name = fold_name(PurePosixPath(photo).name)
                 for key in {name, _stem(name)}:
                     self._by_name.setdefault(key, []).append(below + photo)
         return self._by_name
@@ -223,7 +223,7 @@ def program(
         folder.check()
         cameras = files[0]
         found = read(cameras, folder)
-        _check(name, cameras, folder, found)
+        _report_missing(name, cameras, folder, found)
         aligned = len(found.images) + len(found.missing)
         found.description = f"{name} {cameras.name}, {aligned} of {found.total} photos aligned"
         if found.points_from:
@@ -246,7 +246,9 @@ def _only_folder(folder: Path) -> list[Path]:
     return inside if len(inside) == 1 and inside[0].is_dir() else []
 
 
-def _check(program: str, cameras: Path, folder: PhotoFolder, found: Reconstruction) -> None:
+def _report_missing(
+    program: str, cameras: Path, folder: PhotoFolder, found: Reconstruction
+) -> None:
     if not found.images:
         if not found.missing:
             none = f"none of its {found.total} photos is aligned" if found.total else "no photos"

@@ -20,7 +20,7 @@ from snowsplat.data.photos.decode import is_photo
 from snowsplat.data.readers.lenses import Intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.data.readers.values import (
-    damaged,
+    damaged_export,
     from_opengl,
     head_of,
     load_json,
@@ -68,7 +68,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     values = table(path, load_json(path))
     poses = values.get("poses")
     if not isinstance(poses, list):
-        raise damaged(path, "has no list of poses")
+        raise damaged_export(path, "has no list of poses")
     width, height = number(path, values, "w"), number(path, values, "h")
     frames = values.get("perFrameIntrinsicCoeffs")
     own = frames if isinstance(frames, list) and len(frames) == len(poses) else None
@@ -85,7 +85,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             continue
         pose = numbers(where, entry, 7)
         if not 0.5 < np.linalg.norm(pose[:4]) < 2.0:
-            raise damaged(where, "the quaternion has no direction")
+            raise damaged_export(where, "the quaternion has no direction")
         if own is not None:
             fx, fy, cx, cy = numbers(where, own[index], 4).tolist()
             intrinsics = (fx, fy, cx, cy)

@@ -52,7 +52,7 @@ def lens_of(
         model = "F-Theta"
     kind = _MODELS.get(model)
     if kind is AriaFisheye:
-        numbers = _listed(where, values, _ARIA_COEFFICIENTS)
+        numbers = _distortion_params(where, values, _ARIA_COEFFICIENTS)
         return AriaFisheye(width, height, (*intrinsics, *numbers))
     if kind is None:
         raise UserError(
@@ -62,7 +62,7 @@ def lens_of(
             model=model[:40],
         )
     if isinstance(values.get("distortion_params"), list):
-        k1, k2, k3, k4, p1, p2 = _listed(where, values, 6)
+        k1, k2, k3, k4, p1, p2 = _distortion_params(where, values, 6)
         k5 = k6 = 0.0
     else:
         k1, k2, k3, k4, k5, k6, p1, p2 = (
@@ -96,7 +96,7 @@ def number_of(where: str, values: Mapping[str, Any], key: str) -> float | None:
     return float(value)
 
 
-def _listed(where: str, values: Mapping[str, Any], count: int) -> tuple[float, ...]:
+def _distortion_params(where: str, values: Mapping[str, Any], count: int) -> tuple[float, ...]:
     listed = values.get("distortion_params")
     numbers = [*listed] if isinstance(listed, list) else []
     if len(numbers) != count:

@@ -32,7 +32,7 @@ from snowsplat.data.maps.normal_file import read_normal_file
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import RenderOutput
-from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
+from snowsplat.scene.surface_normals import interior_pixels, normals_of_depth, rays_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import sharded_render
 from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_size, photo_for_map
@@ -230,7 +230,7 @@ def surfaces_of(depth: Tensor, alpha: Tensor, camera: Camera) -> tuple[Tensor, T
     with torch.no_grad():
         rays = rays_of(camera, depth)
         cosine = -(surfaces * rays).sum(0) / rays.square().sum(0).sqrt()
-        weight = surrounded(shown) * cosine.clamp_min(0.0)
+        weight = interior_pixels(shown) * cosine.clamp_min(0.0)
     return surfaces, weight
 
 

@@ -33,7 +33,7 @@ from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.splats import COLORS, Splats2D
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import rotation_from_quat
-from snowsplat.scene.surface_normals import normals_of_depth, rays_of, surrounded
+from snowsplat.scene.surface_normals import interior_pixels, normals_of_depth, rays_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.step.batch import Batch, Gradients, rounds
 
@@ -151,5 +151,5 @@ def consistency(splats: Splats2D, camera: Camera, capacity: Capacity | None = No
     from_depth = normals_of_depth(depth, camera)
     with torch.no_grad():
         # All nine pixels around have a depth. At the border of the image, the normals are 0.
-        weight = surrounded(shown) * -((from_depth * rays).sum(0) / lengths).clamp(max=0.0)
+        weight = interior_pixels(shown) * -((from_depth * rays).sum(0) / lengths).clamp(max=0.0)
     return (weight * (alpha.detach() - (normals * from_depth).sum(0))).mean()

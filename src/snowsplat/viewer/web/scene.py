@@ -19,7 +19,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat, shortest_rotation
-from snowsplat.scene.initial_view import InitialView, bound, overview, view_of_camera
+from snowsplat.scene.initial_view import InitialView, bounding_sphere, overview, view_of_camera
 from snowsplat.scene.orientation import VIEWING_DISTANCE, scene_up, up_of_surfaces
 from snowsplat.scene.render import render
 from snowsplat.trajectory.follow import training_path
@@ -219,8 +219,8 @@ def _change(direction: np.ndarray, depth: float, most: float = _TOO_LARGE) -> Si
 
 def _surfaces(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals (N, 3), areas (N,) and positions (N, 3) of a scene's surfaces: the flat opaque
-    Gaussians in its `bound`."""
-    middle, radius = bound(gaussians)
+    Gaussians in its `bounding_sphere`."""
+    middle, radius = bounding_sphere(gaussians)
     scales, axes = gaussians.log_scales.detach().double().sort(1)
     inside = (gaussians.means.detach().double() - middle).norm(dim=1) < radius
     flat = scales[:, 1] - scales[:, 0] > math.log(2)

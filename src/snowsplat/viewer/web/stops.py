@@ -21,7 +21,7 @@ from torch import Tensor
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import transform_points
-from snowsplat.scene.initial_view import InitialView, bound, view_of_camera
+from snowsplat.scene.initial_view import InitialView, bounding_sphere, view_of_camera
 from snowsplat.scene.render import render
 from snowsplat.trajectory.focus import focus_of, positions_of
 
@@ -56,11 +56,11 @@ def stops_of(
 ) -> Stops:
     """The stops of a scene, with the ``cameras`` of the photos in their order.
 
-    Without cameras, there are no stops, and the subject is the `bound` of the scene. ``depth``: the
-    distance of the targets of the views. ``background``: red, green, blue in 0..1.
+    Without cameras, there are no stops, and the subject is the `bounding_sphere` of the scene.
+    ``depth``: the distance of the targets of the views. ``background``: red, green, blue in 0..1.
     """
     if not cameras:
-        return Stops([], b"", *bound(gaussians), [])
+        return Stops([], b"", *bounding_sphere(gaussians), [])
     numbers = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST)).round().long().tolist()
     views = [view_of_camera(cameras[i], depth) for i in numbers]
     width = max(1, round(HEIGHT * views[0].aspect))

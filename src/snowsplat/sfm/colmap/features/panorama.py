@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.data.lens.fisheye import Equirectangular
-from snowsplat.data.lens.resample import resampled
+from snowsplat.data.lens.resample import resample
 from snowsplat.data.lens.views import LensView, lens_views
 from snowsplat.sfm.colmap.features.sift import Features, detect_in_grey, read_grey, read_mask
 
@@ -54,7 +54,7 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
 
 def _seen(grey: NDArray[np.uint8], view: LensView) -> NDArray[np.uint8]:
     """(h, w): a grey panorama (H, W) in a view."""
-    return np.asarray(resampled(grey[None], view, view.width, view.height)[0])
+    return np.asarray(resample(grey[None], view, view.width, view.height)[0])
 
 
 def _own_part(view: LensView) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image, ImageOps
 
-from snowsplat.data.files.listing import folded
+from snowsplat.data.files.listing import fold_name
 from snowsplat.data.maps.mask_pixels import has_shape, looks_like_mask
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, open_image, read_header
 
@@ -117,7 +117,7 @@ class _Groups:
 
 def _stem_and_kind(name: str) -> tuple[str, _Kind]:
     path = PurePosixPath(name)
-    stem = folded(path.stem)
+    stem = fold_name(path.stem)
     match = _COPY.fullmatch(stem)
     base = match[1] if match else stem
     kind = _Kind(str(path.parent), path.suffix.lower(), stem[len(base) :])
