@@ -24,6 +24,7 @@ import subprocess
 import tempfile
 import threading
 import time
+import xml.etree.ElementTree as ET
 from collections import deque
 from pathlib import Path
 from queue import Empty, Queue
@@ -315,12 +316,23 @@ def _error_text(details: dict[str, Any]) -> str:
     return str(details.get("exception", {}).get("description", details.get("text")))
 
 
+def english_text(report: Path) -> str:
+    """The words of a report, without those in Chinese."""
+    main = ET.parse(report).getroot().find("body/main")
+    assert main is not None
+    for parent in list(main.iter()):
+        for each in parent.findall("*[@lang='zh']"):
+            each.clear()
+    return " ".join("".join(main.itertext()).split())
+
+
 def chinese_labels(report: Path) -> list[str]:
     """The headings and labels of a report in a browser in Chinese; none is left in English."""
     shown = "[...document.querySelectorAll('h2, th, .card, summary')]"
     with Browser() as browser:
         page = browser.open(report.as_uri(), language="zh-CN")
-        labels: list[str] = page.evaluate(f"{shown}.map(e => e.lastChild?.data ?? '')")
+        page.evaluate("document.querySelectorAll('.card b').forEach(each => each.remove())")
+        labels: list[str] = page.evaluate(f"{shown}.map(each => each.innerText)")
         assert not page.errors
     left = re.sub(r"PSNR|SSIM|RMS|dB|ms", "", " ".join(labels))
     assert len(labels) > 20

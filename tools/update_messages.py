@@ -6,8 +6,10 @@ texts of messages that no longer exist are removed. A message that moves keeps i
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from babel.messages.catalog import Catalog
@@ -26,12 +28,31 @@ Key = str | tuple[str, str]
 
 def messages_of(source: Path = SOURCE) -> Iterator[tuple[str, Key]]:
     """The package and the key of each message; two texts: one and many."""
-    found = extract_from_dir(source, [("**.py", "python")], keywords=KEYWORDS, comment_tags=())
+    found = extract_from_dir(
+        source,
+        [("**.py", "python"), ("**.html.j2", "jinja2.ext:babel_extract")],
+        keywords=KEYWORDS | {"t": None},
+        comment_tags=(),
+    )
     for file, _, key, _, _ in found:
-        parts = Path(file).parts
-        # Texts with a space or a field; others are values, such as the name of a mode.
-        if isinstance(key, tuple) or any(mark in key for mark in " {%"):
+        # A single word may also be an item of a dictionary that is called `message`.
+        is_word = isinstance(key, str) and not any(mark in key for mark in " {%")
+        if not is_word or file.endswith(".j2") or key in _words(source / file):
+            parts = Path(file).parts
             yield parts[0] if len(parts) > 1 else "snowsplat", key
+
+
+@cache
+def _words(file: Path) -> set[str]:
+    """The first arguments of all calls of `message` in a module."""
+    calls = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+    return {
+        call.args[0].value
+        for call in calls
+        if isinstance(call, ast.Call)
+        and getattr(call.func, "id", "") == "message"
+        and isinstance(call.args[0], ast.Constant)
+    }
 
 
 def translations(folder: Path) -> Catalog:

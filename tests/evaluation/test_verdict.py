@@ -6,7 +6,8 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from snowsplat.evaluation.verdict import Reason, Verdict
-from snowsplat.util.messages import message
+from snowsplat.util.html import _environment
+from snowsplat.util.messages import Message, message
 
 MORE = message("take more")
 REMARK = Reason("good", message("all photos show one side"))
@@ -34,12 +35,26 @@ def test_lines():
         "  next time: take more",
     ]
     assert Verdict.of([REMARK]).lines(message("it")) == ["it: good", "  - all photos show one side"]
-    box = "".join(ET.fromstring(Verdict.of([REMARK, FEW]).html(PHOTOS)).itertext())
-    assert "11 photos are fewAlso: all photos show one side" in box
+
+
+def box_of(verdict: Verdict, what: Message) -> ET.Element:
+    """The box of a page, in English."""
+    template = _environment().get_template("evaluation/verdict.html.j2")
+    box = ET.fromstring(str(template.module.verdict_box(verdict, what)))
+    for parent in list(box.iter()):
+        for each in parent.findall("*[@lang='zh']"):
+            parent.remove(each)
+    return box
+
+
+def test_the_box_of_a_page():
+    words = [each.strip() for each in box_of(Verdict.of([REMARK, FEW]), PHOTOS).itertext()]
+    assert "11 photos are few" in words
+    assert "Also: all photos show one side" in words
 
 
 def test_html_is_escaped():
-    box = ET.fromstring(Verdict.of([FAR]).html(message("the scene")))
+    box = box_of(Verdict.of([FAR]), message("the scene"))
     assert box.attrib["class"] == "verdict poor"
     words = " ".join("".join(box.itertext()).split())
     assert words.startswith("The scene: poor; expect blurred or wrong parts")

@@ -28,6 +28,7 @@ from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.length import metres_of, stored_metres
 from snowsplat.util.errors import SettingError
 from snowsplat.util.files import write_json
+from snowsplat.util.messages import message
 
 FORMATS = ["ply", "compressed.ply", "spz", "sog", "glb", "splat", "lod-meta.json"]
 A, B = (0.0, 0.5, 2.0), (-1.0, 0.5, 2.0)  # a unit apart
@@ -142,7 +143,7 @@ def test_two_scales_are_one_too_many(plain: Path) -> None:
 def test_a_training_keeps_it(dataset: Path, tmp_path: Path) -> None:
     """From the record of `sfm`; a start that has a scale has priority over it."""
     shutil.copytree(dataset, tmp_path / "dataset")
-    placement = asdict(Placement(["gimbal"], 1.0, metres_per_unit=1.0))
+    placement = asdict(Placement([message("gimbal")], 1.0, metres_per_unit=1.0))
     stages = {"images": {"result": {PLACEMENT: placement}}}
     write_json(tmp_path / "dataset" / "sfm.json", {"stages": stages})
     metric = load_dataset(tmp_path / "dataset")

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from snowsplat.util.html import text
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import from_json
 
@@ -24,17 +23,6 @@ _MEANING = {
     "usable": message("{what}: usable, with limits"),
     "poor": message("{what}: poor; expect blurred or wrong parts"),
 }
-
-#: The style of `Verdict.html`.
-STYLE = """
-.verdict { border-left: 6px solid var(--soft); background: var(--card); border-radius: 8px;
-  padding: 12px 18px; margin: 18px 0; }
-.verdict b { font-size: 1.25rem; } .verdict ul { margin: 6px 0; padding-left: 1.3em; }
-.verdict.good { border-color: #2e8b57; } .verdict.usable { border-color: var(--accent); }
-.verdict.poor { border-color: var(--bad); }
-"""
-
-
 _NO_ADVICE = Message("")
 
 
@@ -103,19 +91,3 @@ class Verdict:
             *(f"  {mark}{why}" for mark, why in zip(marks, self.why(), strict=True)),
             *("  " + str(message("next time: {advice}", advice=each)) for each in self.advice),
         ]
-
-    def html(self, what: Message) -> str:
-        """The verdict as a box of a page with `STYLE`."""
-        reasons = "".join(f"<li>{text(sentence(why))}</li>" for why in self.why())
-        advice = "".join(f"<li>{text(sentence(advice))}</li>" for advice in self.advice)
-        return (
-            f'<div class="verdict {self.grade}"><b>{text(sentence(self.head(what)))}</b>'
-            + (f"<ul>{reasons}</ul>" if reasons else "")
-            + (f"<p>Next time:</p><ul>{advice}</ul>" if advice else "")
-            + "</div>"
-        )
-
-
-def sentence(clause: Message) -> str:
-    """A clause with a capital letter."""
-    return str(clause)[:1].upper() + str(clause)[1:]

@@ -34,6 +34,7 @@ import socket
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -67,6 +68,7 @@ from snowsplat.util.files import write_json
 from snowsplat.util.html import CHINESE
 from snowsplat.util.run_lock import is_locked
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
+from snowsplat.util.theme import THEME
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -93,6 +95,7 @@ _REPORT_POLICY = (
 # The page of a scene gets tools: a film, and editing. They come before the script of the page,
 # which looks for them. Levels of detail are edited in a page of their own, with all Gaussians.
 _TOOLS = (
+    '<link rel="stylesheet" href="../../../theme.css" />'
     '<link rel="stylesheet" href="../../../tools.css" />'
     '<script src="../../../chinese.js"></script><script src="../../../told.js"></script>'
     '<script type="module" src="../../../tools.js" data-page="{page}" data-edited="{edited}" '
@@ -127,7 +130,7 @@ class _Studio:
         self._locks: dict[tuple[str, str], asyncio.Lock] = defaultdict(asyncio.Lock)
 
     def routes(self) -> list[BaseRoute]:
-        page = [Route(f"/{name}", self._page) for name in ("", *_page_files(), CHINESE.name)]
+        page = [Route(f"/{name}", self._page) for name in _page_files()]
         scene = [
             ("", "GET", self._scene),
             ("", "DELETE", self._remove),
@@ -177,8 +180,7 @@ class _Studio:
         return find
 
     async def _page(self, request: Request) -> Any:
-        name = request.url.path.strip("/") or "index.html"
-        return _File(CHINESE if name == CHINESE.name else _PAGES / name)
+        return _File(_page_files()[request.url.path.strip("/")])
 
     async def _about(self, request: Request) -> Any:
         path = request.query_params.get("path", "")
@@ -447,8 +449,11 @@ def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request
     return endpoint
 
 
-def _page_files() -> list[str]:
-    return sorted(path.name for path in _PAGES.iterdir())
+@cache
+def _page_files() -> dict[str, Path]:
+    """The files of the page, by name; "" is the page itself."""
+    files = {path.name: path for path in (*_PAGES.iterdir(), THEME, CHINESE)}
+    return {"": files["index.html"], **files}
 
 
 def _summary(scene: Scene) -> dict[str, Any]:

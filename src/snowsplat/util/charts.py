@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from html import escape
+
+from markupsafe import Markup, escape
+
+from snowsplat.util.html import svg_text
+from snowsplat.util.messages import Message
 
 # Size of the chart in SVG units.
 _WIDTH = 520
@@ -18,31 +22,19 @@ _BOTTOM = 40
 _TICKS_X = 6
 _TICKS_Y = 5
 
-#: CSS for pages with charts.
-STYLE = """
-.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(340px, 100%), 1fr));
-  gap: 22px 28px; } .charts figure { max-width: 620px; }
-svg.chart { width: 100%; height: auto; display: block; overflow: visible; }
-.chart text { fill: var(--soft); font-size: 12px; font-variant-numeric: tabular-nums; }
-.chart .grid { stroke: var(--line); } .chart .dot { fill: var(--accent); }
-.chart .curve { fill: none; stroke: var(--accent); stroke-width: 2; stroke-linejoin: round; }
-@media (max-width: 600px) { .chart text { font-size: 15px; } }
-.chart .raw { fill: none; stroke: var(--accent); stroke-width: 1; opacity: .3; }
-"""
-
 _Points = Sequence[tuple[float, float]]
 
 
 def chart(
     points: _Points,
     *,
-    x_label: str,
-    y_label: str,
+    x_label: Message | str,
+    y_label: Message | str,
     raw: _Points = (),
     dots: bool = False,
     from_zero: bool = True,
-) -> str:
-    """An SVG element with a curve; "" if no point is finite.
+) -> Markup:
+    """An SVG element with a curve, for pages with `report/report.css`; "" if no point is finite.
 
     Args:
         points: (x, y) with ascending x. Points that are not finite are skipped.
@@ -54,7 +46,7 @@ def chart(
     """
     points, raw = _finite(points), _finite(raw)
     if not points:
-        return ""
+        return Markup()
     # The range of the y axis ignores the lowest and the highest 2% of the raw values. Otherwise a
     # single outlier would flatten the curve.
     ys = [y for _, y in points] + sorted(y for _, y in raw)[len(raw) // 50 : -(len(raw) // 50) - 1]
@@ -84,7 +76,8 @@ def chart(
         parts.append(f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle">{word}</text>')
     # The x label is at the end of the axis, below the tick labels.
     parts.append(
-        f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 4}" text-anchor="end">{escape(x_label)}</text>'
+        f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 4}" '
+        f'text-anchor="end">{svg_text(x_label)}</text>'
     )
     if raw:
         parts.append(f'<path class="raw" d="{_line([at(*point) for point in raw])}"/>')
@@ -94,7 +87,7 @@ def chart(
     if dots or len(places) == 1:
         parts += [f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>' for x, y in places]
     inner = "".join(parts)
-    return (
+    return Markup(
         f'<svg class="chart" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" '
         f'role="img"><title>{escape(y_label)}</title>{inner}</svg>'
     )

@@ -1,4 +1,4 @@
-"""`first_names`: some of many names, for a line of text."""
+"""Lists of names for a line of text."""
 
 from __future__ import annotations
 
@@ -13,3 +13,11 @@ def first_names(names: Sequence[str | Message], most: int) -> Message:
         return message("{names}", names=names)
     more = len(names) - most
     return message("{names} and {more} more", names=names[:most], more=more)
+
+
+def all_names(names: Sequence[str | Message]) -> Message:
+    """At least one name: "a and b"."""
+    listed = message("{name}", name=names[0])
+    for name in names[1:]:
+        listed = message("{first} and {last}", first=listed, last=name)
+    return listed

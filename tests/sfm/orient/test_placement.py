@@ -15,6 +15,7 @@ from snowsplat.scene.geometry import Similarity, look_at, rotation_from_quat
 from snowsplat.sfm.gps import east_north_up, location_of
 from snowsplat.sfm.ingest.photo import Attitude, Photo
 from snowsplat.sfm.orient import orientation
+from snowsplat.util.messages import message
 
 F64 = torch.float64
 HOME = np.array([52.5, 13.4, 40.0])
@@ -218,7 +219,7 @@ def test_a_gimbal_levels_photos_that_look_straight_down(model_of):
     assert tilt(found) < 0.1
     assert turn(found) < 0.1
     assert placement.level_error < 1
-    assert placement.north_from == "the gimbal angles of 18 photos"
+    assert str(placement.north_from) == "the gimbal angles of 18 photos"
     assert tilt(placed(model_of, poses, [], points)[0]) > 3
 
 
@@ -231,7 +232,7 @@ def test_yaws_that_contradict_one_another_are_not_used(model_of):
         opposite = tuple(-value for value in attitude.north)
         photos[i] = replace(photos[i], attitude=replace(attitude, north=opposite))
     found, placement = placed(model_of, poses, photos)
-    assert placement.north_from == "GPS positions of 18 photos"
+    assert str(placement.north_from) == "GPS positions of 18 photos"
     assert turn(found) < 2
     alone = [replace(photo, location=None) for photo in photos]
     assert placed(model_of, poses, alone)[1].north is None
@@ -287,13 +288,13 @@ def test_the_ground_levels_photos_that_look_ahead_and_down(model_of):
     others = random.uniform((-5, -20, 0), (45, 30, 8), (1500, 3))
     points = torch.from_numpy(np.concatenate([ground, others]))
     found, placement = placed(model_of, poses, [], points)
-    assert "the ground" in placement.up_from
+    assert message("the ground") in placement.up_from
     assert tilt(found) < 1
     # A wall beside the path is no ground, and neither is a ceiling.
     wall = torch.from_numpy(np.concatenate([ground[:, [0, 2, 1]] + np.array([0, 20, 0]), others]))
-    assert "the ground" not in placed(model_of, poses, [], wall)[1].up_from
+    assert message("the ground") not in placed(model_of, poses, [], wall)[1].up_from
     ceiling = torch.from_numpy(np.concatenate([ground + np.array([0, 0, 4]), others]))
-    assert "the ground" not in placed(model_of, poses, [], ceiling)[1].up_from
+    assert message("the ground") not in placed(model_of, poses, [], ceiling)[1].up_from
 
 
 def test_the_record_is_restored(model_of, tmp_path):
@@ -309,7 +310,9 @@ def test_the_record_is_restored(model_of, tmp_path):
     assert read_placement(tmp_path) == placement
     assert placement_of({}) is None
     assert placement_of({PLACEMENT: {"up_from": 3}}) is None
-    assert Placement(["the ground"], 12.3).lines() == ["level: from the ground, to about 12°"]
+    assert Placement([message("the ground")], 12.3).lines() == [
+        "level: from the ground, to about 12°"
+    ]
 
 
 @pytest.mark.parametrize("latitude", [-70.0, 0.0, 46.8])

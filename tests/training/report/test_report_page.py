@@ -3,7 +3,6 @@
 import json
 import re
 import xml.etree.ElementTree as ET
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +14,7 @@ from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.settings.config import TrainConfig
 
-from ...browser import chinese_labels
+from ...browser import chinese_labels, english_text
 
 pytestmark = pytest.mark.slow  # trains
 
@@ -52,10 +51,6 @@ def trained(tmp_path_factory) -> dict[str, Any]:
     }
 
 
-def words(page: Path) -> str:
-    return " ".join("".join(ET.parse(page).getroot().find("body/main").itertext()).split())
-
-
 def test_the_page_is_well_formed_and_self_contained(trained, tmp_path):
     page = tmp_path / "report.html"
     write_training_report(page, Trained(**trained))
@@ -74,7 +69,7 @@ def test_the_page_is_well_formed_and_self_contained(trained, tmp_path):
 
 def test_the_page_contains_the_results(trained, tmp_path):
     write_training_report(tmp_path / "report.html", Trained(**trained))
-    content = words(tmp_path / "report.html")
+    content = english_text(tmp_path / "report.html")
     evaluation = trained["evaluation"]
     for expected in (
         NAME,
@@ -104,7 +99,7 @@ def test_the_exposures_of_the_photos(trained, tmp_path):
     write_training_report(page, Trained(**trained, exposures=(0.5, -1.0, 0.5)))
     titles = [e.text for e in ET.parse(page).iter("{http://www.w3.org/2000/svg}title")]
     assert titles[-1] == "exposure, EV"
-    assert "Exposures of the photos" in words(page)
+    assert "Exposures of the photos" in english_text(page)
 
 
 def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path):
@@ -112,7 +107,7 @@ def test_without_held_out_photos_training_photos_are_evaluated(trained, tmp_path
     without_test = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
     changed = trained | {"dataset": without_test, "evaluation": None, "history": History()}
     write_training_report(tmp_path / "report.html", Trained(**changed))
-    content = words(tmp_path / "report.html")
+    content = english_text(tmp_path / "report.html")
     assert "No photos were held out" in content
     assert "8 photos of 48x36 used for training" in content
     assert "8 to train on, 0 held out" in content
@@ -124,7 +119,7 @@ def test_photos_that_are_left_out_are_named_and_not_evaluated(trained, tmp_path)
     without_test = type(dataset)(dataset.train, [], dataset.points, dataset.extent)
     changed = trained | {"dataset": without_test, "evaluation": None, "left_out": names}
     write_training_report(tmp_path / "report.html", Trained(**changed))
-    content = words(tmp_path / "report.html")
+    content = english_text(tmp_path / "report.html")
     assert f"camera poses are probably wrong: {names[0]}, {names[1]}." in content
     assert "6 photos of 48x36 used for training" in content
     assert content.count(names[0]) == 1
@@ -138,14 +133,14 @@ def test_train_writes_the_report_and_a_resumed_run_continues_its_curves(tmp_path
     out = tmp_path / "out"
     train = ["train", str(tmp_path / "photos"), "-o", str(out), "--eval", "-q"]
     assert main([*train, "--iterations", "20", "--checkpoint-every", "10"]) == 0
-    first = words(out / "report.html")
+    first = english_text(out / "report.html")
     again = ["train", "-o", str(out), "--resume", "-q", "--iterations", "30"]
     assert main([*again, "--test-iterations", "25"]) == 0
     history = json.loads((out / "history.json").read_text())
     assert sum(stretch["steps"] for stretch in history["stretches"]) == 30
     assert [measured["step"] for measured in history["measured"]] == [20, 25, 30]
     page = (out / "report.html").read_text()
-    assert words(out / "report.html") != first
+    assert english_text(out / "report.html") != first
     assert str(tmp_path) not in page
     assert "photos" in page
     assert main([*train, "--iterations", "10", "--overwrite"]) == 0

@@ -66,13 +66,12 @@ def test_what_is_served(viewer):
     assert status(page) == 200
     assert b"<title>a &lt;scene&gt; - snowsplat</title>" in page
     assert b"frame-ancestors 'self'" in page.partition(b"\r\n\r\n")[0]
-    names = {file.name for file in PAGE.iterdir()}
+    names = {file.name for file in PAGE.iterdir()} | {"theme.css"}
     assert {"index.html", "main.js", "style.css"} < names
     for name in names:
-        assert status(get(viewer.url, path(viewer.url) + name)) == 200, name
-        for used in re.findall(
-            r"""(?:from|src=|href=) ?["']([^"':]+)["']""", (PAGE / name).read_text()
-        ):
+        answer = get(viewer.url, path(viewer.url) + name)
+        assert status(answer) == 200, name
+        for used in re.findall(r"""(?:from|src=|href=) ?["']([^"':]+)["']""", answer.decode()):
             assert used.removeprefix("./") in names, (name, used)
     for name in ("live", "page", "../viewer.py", "main.js/", "."):
         assert status(get(viewer.url, path(viewer.url) + name)) == 404, name

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.util.messages import Message, message
+from snowsplat.util.names import all_names
 from snowsplat.util.safe_json import from_json
 
 #: The entry of the result of the stage "images" in sfm.json.
@@ -22,45 +24,69 @@ class Placement:
     In the frame of the scene, y points down. All fields can be stored as JSON.
     """
 
-    up_from: list[str]  # what the up direction was found from, as text for users
+    up_from: list[Message]  # what the up direction was found from, as text for users
     level_error: float  # degrees
     north: tuple[float, float, float] | None = None  # unit vector in the scene; None: unknown
-    north_from: str | None = None
+    north_from: Message | None = None
     north_error: float | None = None  # degrees
     metres_per_unit: float | None = None  # None: unknown
-    scale_from: str | None = None
+    scale_from: Message | None = None
     scale_error: float | None = None  # relative
     position_error: float | None = None  # m, of a GPS position, horizontal
     # Latitude, longitude (degrees) and altitude (m) of the origin of the scene.
     origin: tuple[float, float, float] | None = None
-    doubts: list[str] = field(default_factory=list)  # as text for users
+    doubts: list[Message] = field(default_factory=list)  # as text for users
 
     @property
     def is_metric(self) -> bool:
         """Whether a unit of the scene is a metre."""
         return self.metres_per_unit == 1.0
 
-    def lines(self) -> list[str]:
-        """Lines of text for users, without a full stop."""
-        found = [f"level: from {' and '.join(self.up_from)}, to about {_short(self.level_error)}°"]
+    def rows(self) -> list[tuple[Message, Message]]:
+        """What is known, for users: pairs of its name and a clause about it."""
+        error = _short(self.level_error)
+        found = [
+            (
+                message("level"),
+                message(
+                    "from {evidence}, to about {error}°",
+                    evidence=all_names(self.up_from),
+                    error=error,
+                ),
+            )
+        ]
         if self.north is not None and self.north_from and self.north_error is not None:
             x, _, z = self.north
-            turn = math.degrees(math.atan2(x, z)) % 360
-            aligned = "+z is north, +x is east"
-            other = f"{turn:.0f}° clockwise from +z, seen from above"
-            found.append(
-                f"north: {aligned if z > 1 - 1e-9 else other}; from {self.north_from}, to about "
-                f"{_short(self.north_error)}°"
+            where = message("+z is north, +x is east")
+            if z <= 1 - 1e-9:
+                turn = math.degrees(math.atan2(x, z)) % 360
+                where = message("{turn:.0f}° clockwise from +z, seen from above", turn=turn)
+            about = message(
+                "{where}; from {evidence}, to about {error}°",
+                where=where,
+                evidence=self.north_from,
+                error=_short(self.north_error),
             )
+            found.append((message("north"), about))
         if self.metres_per_unit and self.scale_from and self.scale_error:
-            unit = "1 unit is 1 m" if self.is_metric else f"1 unit is {self.metres_per_unit:.4g} m"
             gps = self.position_error
-            typical = f" ({_short(gps)} m typical error)" if gps else ""
-            found.append(
-                f"metric: {unit}, scale from {self.scale_from}{typical}, to about "
-                f"{_short(100 * self.scale_error)}%"
+            typical = message(" ({error} m typical error)", error=_short(gps)) if gps else ""
+            about = message(
+                "1 unit is {metres:.4g} m, scale from {evidence}{typical}, to about {error}%",
+                metres=self.metres_per_unit,
+                evidence=self.scale_from,
+                typical=typical,
+                error=_short(100 * self.scale_error),
             )
-        return found + [f"note: {doubt}" for doubt in self.doubts]
+            found.append((message("metric"), about))
+        return found + [(message("note"), doubt) for doubt in self.doubts]
+
+    def lines(self) -> list[str]:
+        """`rows` as lines of text without a full stop, in the language of the program."""
+        return [
+            str(message("{name}: {clause}", name=name, clause=clause))
+            for name, clause in self.rows()
+        ]
 
 
 def placement_of(images: Mapping[str, Any]) -> Placement | None:

@@ -26,16 +26,17 @@ from snowsplat.training.core.progress import Progress
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
+from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
 
 #: The files that `fit_image` writes to the output folder, and what they contain.
 FILES = {
-    "image.png": "the image that the Gaussians approximate the photo with",
-    "image.gimg": "the Gaussians, quantised: a compact file",
-    "image.svg": "an ellipse with a gradient for each Gaussian",
-    "forming.mp4": "a video of the fit",
-    "metrics.json": "PSNR and SSIM, and their course",
-    "report.html": "this page",
+    "image.png": message("the image that the Gaussians approximate the photo with"),
+    "image.gimg": message("the Gaussians, quantised: a compact file"),
+    "image.svg": message("an ellipse with a gradient for each Gaussian"),
+    "forming.mp4": message("a video of the fit"),
+    "metrics.json": message("PSNR and SSIM, and their course"),
+    "report.html": message("this page"),
 }
 _SIDES = (8, 8192)  # pixels along the longer side
 _VIDEO_SECONDS, _VIDEO_FPS = 5, 24

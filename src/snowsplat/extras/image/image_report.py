@@ -7,33 +7,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from markupsafe import Markup
 from PIL import Image
 from torch import Tensor
 
 from snowsplat.extras.image.model import COLORS, LOG_SIGMAS, OPACITY_LOGIT, ImageGaussians
 from snowsplat.pipeline.output.image_files import to_8bit
 from snowsplat.util import charts
-from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
-from snowsplat.util.html import cards, page, picture, table, text
+from snowsplat.util.html import picture, render_page
 from snowsplat.util.machine import processor_name, system_name
+from snowsplat.util.messages import Message, message
 
 # The page shows images with at least this many pixels along the longer side: the Gaussians are
 # rendered at a larger size, and the photo is enlarged.
 _LEAST_SIDE = 512
 # In the picture of the Gaussians, σ is multiplied by this factor, so that most do not overlap.
 _SHRUNK = 0.5
-
-_STYLE = (
-    charts.STYLE
-    + """
-.pictures { display: grid; gap: 18px 16px;
-  grid-template-columns: repeat(auto-fit, minmax(min(250px, 100%), 1fr)); }
-.pictures img, .pictures video { display: block; width: 100%; height: auto; border-radius: 4px; }
-.pictures .photo img { image-rendering: pixelated; }
-td { font-variant-numeric: tabular-nums; }
-"""
-)
 
 
 @dataclass(frozen=True)
@@ -64,34 +54,24 @@ class Fitted:
     gaussians: ImageGaussians  # the result of the fit
     moments: list[Moment]  # the course of the fit; the last one is the result
     compact: tuple[float, int, float]  # PSNR in dB, bytes and bits per pixel of the compact file
-    files: dict[str, str]  # names and descriptions of the files beside the page
+    files: dict[str, Message]  # names and descriptions of the files beside the page
     video: Path  # the video of the fit
 
 
 def write_image_report(path: Path, fitted: Fitted) -> None:
     """Write the page, atomically. Raises OSError if it cannot be written."""
-    end = fitted.moments[-1]
-    psnr, size, bits = fitted.compact
-    gaussians = fitted.gaussians
-    figures = [
-        (f"{end.psnr:.2f} dB", "PSNR"),
-        (f"{end.ssim:.4f}", "SSIM"),
-        (f"{len(gaussians):,}", f"Gaussians, {gaussians.blending}"),
-        (duration(end.seconds), f"for {end.step:,} steps"),
-        (f"{bits:.2f}", f"bits per pixel: {size:,} bytes, {psnr:.2f} dB"),
-    ]
-    body = [
-        f"<h1>{text(fitted.name)}</h1>\n<p>{gaussians.width} × {gaussians.height} pixels, "
-        f"approximated by {len(gaussians):,} 2D Gaussians.</p>",
-        cards(figures),
-        _pictures(fitted),
-        _curves(fitted.moments),
-        "<h2>Files</h2>\n"
-        + table([], [(text(name), text(about)) for name, about in fitted.files.items()]),
-        "<h2>Machine</h2>\n"
-        + table([], [("processor", text(processor_name())), ("system", text(system_name()))]),
-    ]
-    write_text(path, page(f"{fitted.name} – Gaussians", body, _STYLE))
+    video = base64.b64encode(fitted.video.read_bytes()).decode("ascii")
+    values = {
+        "title": f"{fitted.name} – Gaussians",
+        "end": fitted.moments[-1],
+        "pictures": _pictures(fitted),
+        "video": Markup("data:video/mp4;base64,") + video,
+        "curves": _curves(fitted.moments),
+        "processor": processor_name(),
+        "system": system_name(),
+    }
+    page = render_page("extras/image/image_report.html.j2", **vars(fitted) | values)
+    write_text(path, page)
 
 
 def shrunk(gaussians: ImageGaussians, image: Tensor) -> ImageGaussians:
@@ -109,27 +89,21 @@ def shrunk(gaussians: ImageGaussians, image: Tensor) -> ImageGaussians:
 
 
 @torch.no_grad()
-def _pictures(fitted: Fitted) -> str:
+def _pictures(fitted: Fitted) -> list[tuple[str, Markup, Message]]:
+    """A CSS class, a picture and its caption each."""
     gaussians, photo = fitted.gaussians, Image.fromarray(fitted.photo.numpy())
     scale = max(1, -(-_LEAST_SIDE // max(photo.size)))
     image = gaussians.render().clamp(0, 1)
     large, ellipses = gaussians.render(scale), shrunk(gaussians, image).render(scale)
-    video = base64.b64encode(fitted.video.read_bytes()).decode("ascii")
-    player = (
-        '<video controls="" autoplay="" loop="" muted="" '
-        f'src="data:video/mp4;base64,{video}"></video>'
-    )
-    figures = [
-        ("photo", picture(photo, "photo", 95), "The photo"),
-        ("", picture(_pixels(large), "the Gaussians", 92), "The Gaussians"),
-        ("", picture(_pixels(ellipses), "ellipses", 92), "The Gaussians at half their size"),
-        ("", player, "The fit; the video becomes faster towards the end"),
+    return [
+        ("photo", picture(photo, "photo", 95), message("The photo")),
+        ("", picture(_pixels(large), "the Gaussians", 92), message("The Gaussians")),
+        (
+            "",
+            picture(_pixels(ellipses), "ellipses", 92),
+            message("The Gaussians at half their size"),
+        ),
     ]
-    inner = "\n".join(
-        f'<figure class="{kind}">{html}<figcaption>{caption}</figcaption></figure>'
-        for kind, html, caption in figures
-    )
-    return f'<div class="pictures">{inner}</div>'
 
 
 def _pixels(image: Tensor) -> Image.Image:
@@ -137,16 +111,18 @@ def _pixels(image: Tensor) -> Image.Image:
     return Image.fromarray(to_8bit(image))
 
 
-def _curves(moments: list[Moment]) -> str:
-    drawings = [
-        ("PSNR, dB", [(m.seconds, m.psnr) for m in moments]),
-        ("SSIM", [(m.seconds, m.ssim) for m in moments]),
-        ("Gaussians", [(m.seconds, float(m.gaussians)) for m in moments]),
+def _curves(moments: list[Moment]) -> list[tuple[Message, Markup]]:
+    """Captions and drawings of the course of the fit."""
+    curves = {
+        message("PSNR, dB"): [(m.seconds, m.psnr) for m in moments],
+        message("SSIM"): [(m.seconds, m.ssim) for m in moments],
+        message("Gaussians"): [(m.seconds, float(m.gaussians)) for m in moments],
+    }
+    seconds = message("seconds")
+    return [
+        (
+            name,
+            charts.chart(points, x_label=seconds, y_label=name, from_zero=name.key == "Gaussians"),
+        )
+        for name, points in curves.items()
     ]
-    figures = "\n".join(
-        f"<figure><figcaption>{caption}</figcaption>"
-        + charts.chart(points, x_label="seconds", y_label=caption, from_zero=caption == "Gaussians")
-        + "</figure>"
-        for caption, points in drawings
-    )
-    return f'<h2>The fit</h2>\n<div class="charts">{figures}</div>'

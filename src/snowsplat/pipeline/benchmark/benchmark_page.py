@@ -10,21 +10,15 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from markupsafe import Markup
 from PIL import Image
 
 from snowsplat._version import __version__
 from snowsplat.pipeline.benchmark.job import WORST, SceneResult
-from snowsplat.pipeline.benchmark.suites import SUITES, Figures, Suite
+from snowsplat.pipeline.benchmark.suites import SUITES, Figures
 from snowsplat.util.duration import duration
 from snowsplat.util.files import write_json, write_text
-from snowsplat.util.html import page, picture, table, text
-
-_STYLE = """
-.wide { overflow-x: auto; } .wide td, .wide th { white-space: nowrap; }
-.wide tr:last-child td { font-weight: 600; }
-.worst { display: flex; flex-wrap: wrap; gap: 18px; }
-.worst figure { flex: 1 1 420px; } .worst img { max-width: 100%; border-radius: 4px; }
-"""
+from snowsplat.util.html import picture, render_page
 
 
 @dataclass(frozen=True)
@@ -161,48 +155,24 @@ def _escaped(cell: str) -> str:
 
 def _page(folder: Path, report: BenchmarkReport) -> str:
     suite = SUITES[report.suite]
-    heads, *rows = [[text(cell) for cell in line] for line in report.table()]
-    parts = [
-        f"<h1>{text(suite.title)}</h1>",
-        f"<p class='soft'>{text(_how(report, suite))}</p>",
-        f"<div class='wide'>{table(heads, rows)}</div>",
-        f"<p class='soft'>{text(_sources(suite))}</p>",
-        *(f"<p class='bad'>{text(line)}</p>" for line in report.failures.values()),
-        "<h2>The view with the lowest PSNR of each scene: photo, rendering</h2>",
-        "<div class='worst'>",
-        *(_figure(folder, result) for result in report.results),
-        "</div>",
-    ]
-    return page(f"{suite.title} - snowsplat", parts, _STYLE)
-
-
-def _how(report: BenchmarkReport, suite: Suite) -> str:
-    recipes = sorted({result.job.recipe for result in report.results})
-    machines = sorted({result.machine for result in report.results})
-    changed = {name: v for r in report.results for name, v in r.job.settings.items()}
-    settings = ", ".join(f"{name} {value}" for name, value in changed.items())
-    return (
-        f"{suite.protocol} Recipe {', '.join(recipes)}{f' ({settings})' if settings else ''}, "
-        f"snowsplat {__version__}, {', '.join(machines)}. The metrics are computed from renderings "
-        "that are not rounded to 8 bits. The memory is the peak of the process."
+    titles, *rows = report.table()
+    results = report.results
+    changed = {name: v for result in results for name, v in result.job.settings.items()}
+    return render_page(
+        "pipeline/benchmark/benchmark_page.html.j2",
+        title=f"{suite.title} - snowsplat",
+        suite=suite,
+        version=__version__,
+        titles=titles,
+        rows=rows,
+        failures=report.failures.values(),
+        recipes=", ".join(sorted({result.job.recipe for result in results})),
+        machines=", ".join(sorted({result.machine for result in results})),
+        settings=", ".join(f"{name} {value}" for name, value in changed.items()),
+        worst=[(result, _worst(folder, result)) for result in results],
     )
 
 
-def _sources(suite: Suite) -> str:
-    if not suite.published:
-        return ""
-    return (
-        f"Published: {suite.source}. The scenes and test photos are the same, the machines are "
-        "not. The figures can be compared exactly only if the photos are the official smaller ones."
-    )
-
-
-def _figure(folder: Path, result: SceneResult) -> str:
-    file = folder / result.job.scene / WORST
-    name, size = result.job.scene, "×".join(map(str, result.size))
-    caption = (
-        f"{name}: {result.worst}, {size}; {result.photos[0]} training photos, "
-        f"{result.photos[1]} test photos"
-    )
-    image = picture(Image.open(file).convert("RGB"), f"{name}, {result.worst}")
-    return f"<figure>{image}<figcaption>{text(caption)}</figcaption></figure>"
+def _worst(folder: Path, result: SceneResult) -> Markup:
+    with Image.open(folder / result.job.scene / WORST) as image:
+        return picture(image.convert("RGB"), f"{result.job.scene}, {result.worst}")

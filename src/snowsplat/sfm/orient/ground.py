@@ -8,6 +8,7 @@ import numpy as np
 
 from snowsplat.sfm.orient.cameras import Cameras
 from snowsplat.sfm.orient.up import Evidence, isotropic
+from snowsplat.util.messages import message
 
 # Standard deviation of the slope of the ground, a table or a street.
 _SLOPE = math.radians(3)
@@ -63,7 +64,7 @@ def of_ground(cameras: Cameras, known: Evidence) -> Evidence | None:
     below = ((cameras.centres - middle) @ normal > thickness).mean() >= _BELOW
     if not (large and below and normal @ known.up > math.cos(_LARGEST_ANGLE)):
         return None
-    return Evidence(("the ground",), normal, isotropic(normal, _SLOPE))
+    return Evidence((message("the ground"),), normal, isotropic(normal, _SLOPE))
 
 
 def _near(cameras: Cameras, reach: float) -> np.ndarray:

@@ -24,6 +24,7 @@ import numpy as np
 from snowsplat.sfm.colmap.features.sift import read_grey
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.orient.up import tangent
+from snowsplat.util.messages import Message, message, plural
 
 if TYPE_CHECKING:
     import pycolmap
@@ -64,7 +65,7 @@ class MarkerScale:
 
     metres_per_unit: float  # of the world of SfM
     error: float  # relative standard deviation
-    name: str  # as text for users: the markers and the number of photos
+    name: Message  # as text for users: the markers and the number of photos
     normals: np.ndarray  # (M, 3) unit vectors in the world of SfM, away from the paper
     tilts: np.ndarray  # (M,) their standard deviations, radians
 
@@ -98,7 +99,7 @@ class _Square:
 
 def scale_of_markers(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], folder: Path, side: float
-) -> tuple[MarkerScale | None, list[str]]:
+) -> tuple[MarkerScale | None, list[Message]]:
     """The scale of a model and the planes of the markers, and doubts as text for users.
 
     Args:
@@ -123,12 +124,17 @@ def scale_of_markers(
     squares = {name: square for name, s in sorted(views.items()) if (square := _square(s))}
     if not squares:
         most = max(map(len, views.values()), default=0)
-        why = f"no marker is a square in {_FEWEST} photos" if most else "no photo shows a marker"
+        why = message("no photo shows a marker")
         if 0 < most < _FEWEST:
-            why = f"a marker is in {most} {'photo' if most == 1 else 'photos'} only"
+            why = plural("a marker is in {n} photo only", "a marker is in {n} photos only", n=most)
+        elif most:
+            why = message("no marker is a square in {n} photos", n=_FEWEST)
         return None, [
-            f"the marker gives no scale: {why}; take more photos of it from near, or use "
-            "snowsplat convert --scale-to with a known distance"
+            message(
+                "the marker gives no scale: {why}; take more photos of it from near, or use "
+                "snowsplat convert --scale-to with a known distance",
+                why=why,
+            )
         ]
     # People print from one dictionary. Other patterns may look like a marker of another one.
     kinds = Counter[str]()
@@ -138,7 +144,7 @@ def scale_of_markers(
     return _combined({n: s for n, s in squares.items() if n.split()[0] == kind}, side)
 
 
-def _combined(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | None, list[str]]:
+def _combined(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | None, list[Message]]:
     """One scale from all markers, weighted by their errors."""
     sides = np.array([square.side for square in squares.values()])
     errors = np.array([square.error for square in squares.values()])
@@ -149,13 +155,21 @@ def _combined(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | N
     if (away > np.maximum(_AGREE * np.hypot(errors, error), _LEAST_AGREEMENT)).any():
         ratio = 100 * (sides.max() / sides.min() - 1)
         doubts.append(
-            f"the markers disagree about the scale by {ratio:.1f}%: are all of them of one size?"
+            message(
+                "the markers disagree about the scale by {ratio:.1f}%: are all of them of one "
+                "size?",
+                ratio=float(ratio),
+            )
         )
         error = max(error, float(away.max()))
     count = sum(square.photos for square in squares.values())
-    what = f"{len(squares)} markers" if len(squares) > 1 else f"the marker {next(iter(squares))}"
+    what = message("the marker {name}", name=next(iter(squares)))
+    if len(squares) > 1:
+        what = message("{n} markers", n=len(squares))
     common = np.hypot(_COMMON, 2 * _COMMON_PIXELS / max(s.pixels for s in squares.values()))
-    name = f"{what} of {1000 * side:.4g} mm in {count} views"
+    name = message(
+        "{what} of {side:.4g} mm in {count} views", what=what, side=1000 * side, count=count
+    )
     normals = np.array([square.normal for square in squares.values()])
     tilts = np.array([square.tilt for square in squares.values()])
     relative = float(np.hypot(error, common))

@@ -28,6 +28,8 @@ from snowsplat.sfm.orient.up import (
     robust_mean,
     with_markers,
 )
+from snowsplat.util.messages import Message, message
+from snowsplat.util.names import all_names
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,14 +63,14 @@ class Oriented:
 @dataclass(frozen=True)
 class _Gps:
     alignment: Alignment  # of the cameras to metres east, north and up of `origin`
-    name: str
+    name: Message
     origin: np.ndarray  # (3,) latitude, longitude (°), altitude (m)
 
 
 @dataclass(frozen=True)
 class _North:
     direction: np.ndarray  # (3,) horizontal unit vector in the world frame of SfM
-    name: str
+    name: Message
     error: float  # radians
 
 
@@ -139,8 +141,12 @@ def orientation(
                 gps.alignment.scale_error, measured.error
             ):
                 doubts.append(
-                    f"by the marker, the scene is {100 * abs(ratio - 1):.0f}% "
-                    f"{'larger' if ratio > 1 else 'smaller'} than by GPS; is its side right?"
+                    message(
+                        "by the marker, the scene is {share:.0f}% {larger} than by GPS; is its "
+                        "side right?",
+                        share=100 * abs(ratio - 1),
+                        larger=message("larger") if ratio > 1 else message("smaller"),
+                    )
                 )
         scale = measured.metres_per_unit
         placement = replace(
@@ -165,7 +171,7 @@ def _upright(cameras: Cameras, photos: Sequence[Photo | None]) -> Cameras:
     return replace(cameras, rotations=turned @ cameras.rotations)
 
 
-def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, list[str]]:
+def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, list[Message]]:
     """The up direction without GPS, and doubts as text for users."""
     attitudes = [None if photo is None else photo.attitude for photo in photos]
     evidence, doubts = of_sensors(cameras, attitudes)
@@ -180,7 +186,7 @@ def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, lis
 
 def _gps(
     cameras: Cameras, photos: Sequence[Photo | None], up: Evidence
-) -> tuple[_Gps | None, list[str]]:
+) -> tuple[_Gps | None, list[Message]]:
     """The GPS positions if they determine the scale, and doubts as text for users."""
     rows = [i for i, photo in enumerate(photos) if photo is not None and photo.location is not None]
     located = [photo for photo in photos if photo is not None and photo.location is not None]
@@ -191,18 +197,24 @@ def _gps(
     places, errors = east_north_up(locations, origin), position_errors(located)
     alignment = align(cameras.centres[rows], places, errors, up)
     if alignment is None:
-        return None, ["GPS gives no scale: the photos have fewer than three different positions"]
+        return None, [
+            message("GPS gives no scale: the photos have fewer than three different positions")
+        ]
     spread = float(np.sqrt(np.square(places[:, :2] - places[:, :2].mean(axis=0)).sum(1).mean()))
     if alignment.scale_error > _SCALE_ERROR or not alignment.agrees:
         if spread < _FAR_APART * float(np.median(errors)):
-            why = "the positions differ too little for their error"
+            why = message("the positions differ too little for their error")
         else:
-            why = "the positions do not agree with the camera poses"
-        return None, [f"GPS gives no scale: {why}"]
+            why = message("the positions do not agree with the camera poses")
+        return None, [message("GPS gives no scale: {why}", why=why)]
     doubts = []
     if alignment.up_away > _CONTRADICTION:
-        doubts.append(f"GPS positions and {' and '.join(up.names)} disagree about the level")
-    name = f"GPS positions of {len(located)} photos"
+        doubts.append(
+            message(
+                "GPS positions and {others} disagree about the level", others=all_names(up.names)
+            )
+        )
+    name = message("GPS positions of {n} photos", n=len(located))
     return _Gps(alignment, name, origin), doubts
 
 
@@ -217,8 +229,8 @@ def _north_of_sensors(
 ) -> _North | None:
     """North from the yaw of gimbals or else from compasses, if most of them agree."""
     for gimbal, name, usual in (
-        (True, "gimbal angles", _GIMBAL_YAW),
-        (False, "compasses", _COMPASS),
+        (True, message("gimbal angles"), _GIMBAL_YAW),
+        (False, message("compasses"), _COMPASS),
     ):
         rows = [
             _horizontal(rotation.T @ np.array(photo.attitude.north), up)
@@ -234,7 +246,8 @@ def _north_of_sensors(
         mean, spread = robust_mean(norths)
         wrong = (norths @ mean < math.cos(_WRONG_NORTH)).mean()
         if wrong <= _MOST_WRONG:
-            return _North(mean, f"the {name} of {len(rows)} photos", math.hypot(usual, spread))
+            about = message("the {name} of {n} photos", name=name, n=len(rows))
+            return _North(mean, about, math.hypot(usual, spread))
     return None
 
 

@@ -23,6 +23,8 @@ import numpy as np
 from snowsplat.scene.orientation import level_of_cameras
 from snowsplat.sfm.ingest.photo import Attitude
 from snowsplat.sfm.orient.cameras import Cameras
+from snowsplat.util.messages import Message, message, plural
+from snowsplat.util.names import all_names
 
 # Standard deviations of a single photo, and of the mean of many: sensors are not aligned with the
 # lens exactly.
@@ -47,7 +49,7 @@ _SHARE = 0.2
 class Evidence:
     """An up direction in the world frame of SfM, and how certain it is."""
 
-    names: tuple[str, ...]  # what it was found from, as text for users
+    names: tuple[Message, ...]  # what it was found from, as text for users
     up: np.ndarray  # (3,) unit vector
     precision: np.ndarray  # (3, 3) inverse covariance in 1/rad², of which ``up`` is the null space
 
@@ -60,18 +62,23 @@ class Evidence:
 
 def of_cameras(cameras: Cameras) -> Evidence:
     """The direction in which the photos are level; see `level_of_cameras`."""
-    return Evidence(("the way the photos were held",), *level_of_cameras(cameras.rotations))
+    return Evidence(
+        (message("the way the photos were held"),), *level_of_cameras(cameras.rotations)
+    )
 
 
 def of_sensors(
     cameras: Cameras, attitudes: Sequence[Attitude | None]
-) -> tuple[list[Evidence], list[str]]:
+) -> tuple[list[Evidence], list[Message]]:
     """The directions of gimbals and of accelerometers, and doubts as text for users.
 
     ``attitudes``: one per camera.
     """
     found, doubts = [], []
-    for gimbal, name in ((True, "gimbal angles"), (False, "accelerometers")):
+    for gimbal, name in (
+        (True, message("gimbal angles")),
+        (False, message("accelerometers")),
+    ):
         rows = [
             rotation.T @ np.array(attitude.up)
             for rotation, attitude in zip(cameras.rotations, attitudes, strict=True)
@@ -83,19 +90,24 @@ def of_sensors(
         mean, spread = robust_mean(ups)
         if spread > _LARGEST_SPREAD:
             doubts.append(
-                f"the {name} of the photos contradict the camera poses "
-                f"(by {math.degrees(spread):.0f}°), so they are not used"
+                message(
+                    "the {name} of the photos contradict the camera poses (by {angle:.0f}°), so "
+                    "they are not used",
+                    name=name,
+                    angle=math.degrees(spread),
+                )
             )
             continue
         each, all_ = _GIMBAL if gimbal else _ACCELEROMETER
         error = math.hypot(max(spread, each) / math.sqrt(len(ups)), all_)
-        found.append(Evidence((f"the {name} of {len(ups)} photos",), mean, isotropic(mean, error)))
+        about = message("the {name} of {n} photos", name=name, n=len(ups))
+        found.append(Evidence((about,), mean, isotropic(mean, error)))
     return found, doubts
 
 
 def with_markers(
     known: Evidence, normals: np.ndarray, errors: np.ndarray
-) -> tuple[Evidence, list[str]]:
+) -> tuple[Evidence, list[Message]]:
     """The mean of an up direction and the normals of the markers that lie flat, and doubts.
 
     A marker on a wall or on a slope says nothing about up. Where ``known`` is uncertain, even a
@@ -109,16 +121,22 @@ def with_markers(
     angles = np.arccos((normals @ known.up).clip(-1, 1))
     flat = angles < _LYING
     if flat.any():
-        name = "the marker" if flat.sum() == 1 else f"{flat.sum()} markers"
+        name = plural("the marker", "{n} markers", n=int(flat.sum()))
         mean, spread = robust_mean(normals[flat])
         error = math.hypot(max(spread, float(np.median(errors[flat]))), _PAPER)
         markers = Evidence((name,), mean, isotropic(mean, error))
         if _apart(known, markers) < _CONTRADICTION:
             return _mean(known, markers), []
-    what = "the marker does" if len(normals) == 1 else "the markers do"
     return known, [
-        f"{what} not lie flat (the angle to level is {math.degrees(angles.min()):.0f}°), so the "
-        f"level is that of {' and '.join(known.names)} alone"
+        plural(
+            "the marker does not lie flat (the angle to level is {angle:.0f}°), so the level is "
+            "that of {others} alone",
+            "the markers do not lie flat (the angle to level is {angle:.0f}°), so the level is "
+            "that of {others} alone",
+            n=len(normals),
+            angle=math.degrees(angles.min()),
+            others=all_names(known.names),
+        )
     ]
 
 
@@ -135,7 +153,7 @@ def robust_mean(units: np.ndarray) -> tuple[np.ndarray, float]:
     return mean, float(np.median(angles))
 
 
-def combined(evidence: Sequence[Evidence]) -> tuple[Evidence, list[str]]:
+def combined(evidence: Sequence[Evidence]) -> tuple[Evidence, list[Message]]:
     """The most likely direction, and contradictions as text for users.
 
     ``evidence`` begins with what is trusted most. What contradicts the direction found from the
@@ -148,8 +166,12 @@ def combined(evidence: Sequence[Evidence]) -> tuple[Evidence, list[str]]:
             best = _mean(best, other)
         elif angle > _SAID:
             doubts.append(
-                f"up differs by {math.degrees(angle):.0f}° between {' and '.join(best.names)} "
-                f"(used) and {' and '.join(other.names)}"
+                message(
+                    "up differs by {angle:.0f}° between {used} (used) and {other}",
+                    angle=math.degrees(angle),
+                    used=all_names(best.names),
+                    other=all_names(other.names),
+                )
             )
     return best, doubts
 

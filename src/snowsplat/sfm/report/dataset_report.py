@@ -5,28 +5,29 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.frame.placement import Placement, placement_of
 from snowsplat.data.photos.colour_profile import plain_pixels
-from snowsplat.evaluation import verdict
+from snowsplat.evaluation.verdict import Verdict
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.report.more_photos import Advice, advice
 from snowsplat.sfm.report.photo_problems import Problem, what_to_do
 from snowsplat.sfm.report.scene_map import PlacedPhoto, draw_scene
-from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
-from snowsplat.util.html import bar, cards, page, picture, table, text
-from snowsplat.util.messages import message
+from snowsplat.util.html import in_languages, render_page
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import printable
 
 _MAX_PICTURES = 24  # evenly spaced over the photos
@@ -35,20 +36,32 @@ _MAX_UNUSED = 200  # number of unused photos that are listed; the others are onl
 
 # By `focal_from` and `focal_held` of a camera; earlier versions did not have the latter.
 _FOCAL_FROM = {
-    ("exif", False): "from EXIF, refined",
-    ("exif", True): "from EXIF; the photos do not determine it",
-    ("guessed", False): "estimated from the photos",
-    ("guessed", True): "a usual one; the photos do not determine it",
+    ("exif", False): message("from EXIF, refined"),
+    ("exif", True): message("from EXIF; the photos do not determine it"),
+    ("guessed", False): message("estimated from the photos"),
+    ("guessed", True): message("a usual one; the photos do not determine it"),
 }
-_STAGES = {"photos": "reading photos", "poses": "estimating poses", "images": "undistorting"}
+_STAGES = {
+    "photos": message("reading photos"),
+    "poses": message("estimating poses"),
+    "images": message("undistorting"),
+}
 
-_STYLE = """
-.maps { display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start; }
-svg.map { width: 100%; height: auto; display: block; }
-.strip { display: flex; gap: 6px; overflow-x: auto; padding-bottom: 8px; }
-.strip img { height: 110px; border-radius: 4px; display: block; }
-td img { height: 74px; border-radius: 4px; display: block; }
-"""
+
+@dataclass(frozen=True)
+class _BadPhoto:
+    name: str
+    image: Image.Image
+    problem: Message
+
+
+@dataclass(frozen=True)
+class _Lens:
+    photos: int
+    size: str
+    focal: Message
+    model: str
+    parameters: str
 
 
 def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
@@ -61,26 +74,35 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
 
     Raises: UserError: the model in ``sparse/0`` or an image cannot be read.
     """
-    photos = _photos_with_poses(dataset, facts["gathered"]["photos"])
-    name = _name(facts["inputs"])
+    sfm, gathered, undistorted = facts["sfm"], facts["gathered"], facts["undistorted"]
+    photos = _photos_with_poses(dataset, gathered["photos"])
+    name, names = _name(facts["inputs"]), [photo.name for photo in photos]
     xyz, rgb = _points(dataset)
-    more, judged = advice(photos, xyz), verdict.Verdict.from_json(facts["verdict"])
-    placement = placement_of(facts["undistorted"])
-    body = [
-        _headline(name, facts),
-        "" if judged is None else judged.html(message("the photos")),
-        _cards(facts),
-        _your_photos(dataset, [photo.name for photo in photos], facts, more),
-        _maps(photos, xyz, rgb, more.places, placement),
-        _placed(placement),
-        _strip(dataset, [photo.name for photo in photos]),
-        _lenses(facts["sfm"], facts["undistorted"]),
-        _left_out(facts),
-        _timing(facts),
-        _next_step(dataset) if facts["alone"] else "",
-    ]
+    more = advice(photos, xyz)
+    placement = placement_of(undistorted)
+    unit = "m" if placement is not None and placement.is_metric else message("units")
     path = DatasetFolder(dataset).report
-    write_text(path, page(f"{name} – dataset", body, _STYLE + verdict.STYLE))
+    values = {
+        "title": f"{name} – dataset",
+        "name": name,
+        "photos": photos,
+        "verdict": Verdict.from_json(facts["verdict"]),
+        "advice": more,
+        "more_photos": _numbered(more),
+        "bad_photos": _bad_photos(dataset, facts["problems"]),
+        "drawings": draw_scene(photos, xyz, rgb, more.places, unit),
+        "placement": None if placement is None else _placed(placement),
+        "strip": _strip(dataset, names),
+        "lenses": [_lens(camera) for camera in sfm["cameras"]],
+        "sizes": [f"{width} × {height}" for width, height, *_ in undistorted["sizes"]],
+        "unused": [*sfm["unregistered"].items(), *gathered["skipped"]],
+        "listed": _MAX_UNUSED,
+        "stages": _STAGES,
+        "longest": max([*facts["seconds"].values(), 1e-9]),
+        "settings": json.dumps(facts["settings"], indent=2, ensure_ascii=False),
+        "command": _next_step(dataset) if facts["alone"] else None,
+    }
+    write_text(path, render_page("sfm/report/dataset_report.html.j2", **facts | values))
     return path
 
 
@@ -116,132 +138,40 @@ def _photos_with_poses(dataset: Path, gathered: Sequence[dict[str, Any]]) -> lis
     return photos
 
 
-# The parts of the page, from top to bottom
-
-
-def _headline(name: str, facts: dict[str, Any]) -> str:
-    sfm = facts["sfm"]
-    registered, unregistered = len(sfm["registered"]), len(sfm["unregistered"])
-    total = registered + unregistered
-    which = f"{registered} of {total}" if unregistered else f"all {total}"
-    summary = f"The poses of {which} photos were found."
-    lines = [f"<h1>{text(name)}</h1>", f"<p>{summary}</p>"]
-    if len(sfm["sub_models"]) > 1:
-        sizes = ", ".join(map(str, sfm["sub_models"]))
-        lines.append(
-            f'<p class="bad">The photos form {len(sfm["sub_models"])} separate groups ({sizes} '
-            "photos); only the largest is used. Take more photos in between to connect them.</p>"
-        )
-    return "\n".join(lines)
-
-
-def _cards(facts: dict[str, Any]) -> str:
-    sfm = facts["sfm"]
-    total = len(sfm["registered"]) + len(sfm["unregistered"])
-    error = sfm["reprojection_error"]
-    figures = [
-        (f"{len(sfm['registered'])} / {total}", "photos with a pose"),
-        (f"{sfm['points']:,}", f"points, {sfm['observations']:,} observations"),
-        ("–" if error is None else f"{error:.2f} px", "mean reprojection error"),
-        (str(len(sfm["cameras"])), "lens" if len(sfm["cameras"]) == 1 else "lenses"),
-        (duration(sum(facts["seconds"].values())), "total time"),
-    ]
-    return cards(figures)
-
-
-def _your_photos(dataset: Path, names: Sequence[str], facts: dict[str, Any], more: Advice) -> str:
-    """What was wrong, and what to do better, for the person who took the photos."""
-    lines = ["<p>No photo is blurred, too dark or too bright.</p>"]
-    without = len(facts["sfm"]["unregistered"]) + len(facts["gathered"]["skipped"])
-    if bad := facts["problems"]:
-        count = f"{len(bad)} of {len(names)} photos"
-        lines = [
-            f"<p>{count} may be better. Take them again, or leave them out if others show the same."
-            f"</p>\n{_bad_photos(dataset, bad)}"
-        ]
-    if without:
-        lines.append(f"<p>{without} photos were not used; the reasons are below.</p>")
-    lines += [
-        f"<p>Fixed to the frame: {text(note)}.</p>" for note in facts["gathered"].get("notes", [])
-    ]
-    lines += _more_photos(more)
-    return "<h2>Your photos</h2>\n" + "\n".join(lines)
-
-
-def _bad_photos(dataset: Path, bad: dict[str, Problem]) -> str:
-    rows = [
-        [picture(_reduced(_file_of(dataset, name)), name), text(name), text(what_to_do(problem))]
+def _bad_photos(dataset: Path, bad: dict[str, Problem]) -> list[_BadPhoto]:
+    return [
+        _BadPhoto(name, _reduced(_file_of(dataset, name)), what_to_do(problem))
         for name, problem in list(bad.items())[:_MAX_PICTURES]
     ]
-    rest = "" if len(bad) <= _MAX_PICTURES else f", and {len(bad) - _MAX_PICTURES:,} more"
-    names = ", ".join(list(bad)[_MAX_PICTURES:_MAX_UNUSED])
-    others = f'<p class="soft">{text(names)}{rest}.</p>' if rest else ""
-    return table(["", "photo", "what is wrong"], rows, "names") + others
 
 
-def _more_photos(more: Advice) -> list[str]:
-    lines = []
-    if more.seldom:
-        lines.append(
-            f"<p>{100 * more.seldom:.0f}% of the points are in at most three photos. There, the "
-            "scene will look right only from the places of these photos.</p>"
+def _numbered(more: Advice) -> list[tuple[Markup, Markup]]:
+    """The places for more photos, "1" or "1 to 3", and why."""
+    numbers = iter(range(1, len(more.reasons) + 1))
+    rows = []
+    for reason, same in groupby(more.reasons):
+        first, *rest = [next(numbers) for _ in same]
+        last = rest[-1] if rest else first
+        which = (
+            message("{first} to {last}", first=first, last=last) if rest else message(str(first))
         )
-    if len(more.places):
-        count = len(more.places)
-        photos = "a photo" if count == 1 else f"{count} more photos"
-        numbers = iter(range(1, count + 1))
-        reasons = []
-        for reason, same in groupby(more.reasons):
-            first, *rest = [next(numbers) for _ in same]
-            which = f"{first} to {rest[-1]}" if rest else str(first)
-            reasons.append([which, text(reason)])
-        lines.append(
-            f"<p>Take {photos} from the numbered places in the drawing from above:</p>\n"
-            f"{table([], reasons)}"
-        )
-    return lines
+        rows.append((in_languages(which), in_languages(reason)))
+    return rows
 
 
-def _maps(
-    photos: Sequence[PlacedPhoto],
-    xyz: np.ndarray,
-    rgb: np.ndarray,
-    marks: np.ndarray,
-    placement: Placement | None,
-) -> str:
-    unit = "m" if placement is not None and placement.is_metric else "units"
-    above = "From above. Orange: the cameras; white: the first camera."
-    above += " Numbers: places for more photos." if len(marks) else ""
-    above += " Blue: the path of the video." if any(p.sequence is not None for p in photos) else ""
-    captions = (above, "From the side.")
-    drawings = draw_scene(photos, xyz, rgb, marks, unit)
-    # Side by side, both drawings have the same scale: flex-grow is proportional to the width.
-    figures = "\n".join(
-        f'<figure style="flex:{drawing.width} 1 {drawing.width // 2}px;'
-        f'max-width:{2 * drawing.width}px">{drawing.svg}'
-        f"<figcaption>{caption}</figcaption></figure>"
-        for drawing, caption in zip(drawings, captions, strict=True)
-    )
-    return f'<h2>Cameras and points</h2>\n<div class="maps">{figures}</div>'
-
-
-def _placed(placement: Placement | None) -> str:
+def _placed(placement: Placement) -> list[tuple[Markup, Markup]]:
     """What the frame of the scene was found from."""
-    if placement is None:  # a dataset of an earlier version
-        return ""
-    rows = [[text(part) for part in line.split(": ", 1)] for line in placement.lines()]
-    return f"<h2>Level, north and scale</h2>\n{table([], rows)}"
+    return [(in_languages(name), in_languages(clause)) for name, clause in placement.rows()]
 
 
-def _strip(dataset: Path, names: Sequence[str]) -> str:
+def _strip(dataset: Path, names: Sequence[str]) -> list[tuple[Image.Image, str]]:
     count = min(len(names), _MAX_PICTURES)
     chosen = [names[i * len(names) // count] for i in range(count)]
-    images = "".join(
-        picture(_reduced(DatasetFolder(dataset).images / name), name)
+    return [
+        (_reduced(dataset / "images" / name), name)
         for name in chosen
-        if (DatasetFolder(dataset).images / name).is_file()
-    )
-    return f'<h2>Images</h2>\n<div class="strip">{images}</div>'
+        if (dataset / "images" / name).is_file()
+    ]
 
 
 def _file_of(dataset: Path, photo: str) -> Path:
@@ -262,70 +192,22 @@ def _reduced(path: Path) -> Image.Image:
     return small
 
 
-def _lenses(sfm: dict[str, Any], undistorted: dict[str, Any]) -> str:
-    rows = []
-    for camera in sfm["cameras"]:
-        width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
-        if camera["model"] == PANORAMA_MODEL:
-            size = f"{width} × {height}"
-            rows.append([str(camera["images"]), size, "all directions", camera["model"]])
-            continue
-        # The angle of view without distortion; that of the distorted lens differs a little.
-        half = max(width, height) / 2 / focal if focal > 0 else 0.0
-        fisheye = str(camera["model"]).endswith("FISHEYE")
-        angle = math.degrees(2 * (half if fisheye else math.atan(half)))
-        parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
-        focal_from = _FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))]
-        rows.append(
-            [
-                str(camera["images"]),
-                f"{width} × {height}",
-                f"{focal:.0f} px ({angle:.0f}°), {focal_from}",
-                f"{camera['model']} <span class='soft'>{parameters}</span>",
-            ]
-        )
-    sizes = ", ".join(f"{w} × {h}" for w, h, *_ in undistorted["sizes"])
-    how = "undistorted" if undistorted["resampled"] else "copied, as there is no distortion"
-    lenses = table(["photos", "size", "focal length (longer side)", "lens model"], rows)
-    said = ""
-    if zooms := sfm.get("zooms", ""):
-        said = f"<p>The photos have {text(zooms)}, so each group of them has its own lens.</p>\n"
-    if sfm.get("fisheye"):
-        said += f"<p>{text(sfm['fisheye'][0].upper() + sfm['fisheye'][1:])}.</p>\n"
-    return (
-        f'<h2>Lenses</h2>\n{said}{lenses}\n<p class="soft">Images for training: {sizes}, {how}.</p>'
+def _lens(camera: Mapping[str, Any]) -> _Lens:
+    width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
+    photos, size, model = int(camera["images"]), f"{width} × {height}", str(camera["model"])
+    if model == PANORAMA_MODEL:
+        return _Lens(photos, size, message("all directions"), model, "")
+    # The angle of view without distortion; that of the distorted lens differs a little.
+    half = max(width, height) / 2 / focal if focal > 0 else 0.0
+    angle = math.degrees(2 * (half if model.endswith("FISHEYE") else math.atan(half)))
+    about = message(
+        "{focal:.0f} px ({angle:.0f}°), {origin}",
+        focal=focal,
+        angle=angle,
+        origin=_FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))],
     )
-
-
-def _left_out(facts: dict[str, Any]) -> str:
-    entries = [
-        *((name, why) for name, why in facts["sfm"]["unregistered"].items()),
-        *((source, why) for source, why in facts["gathered"]["skipped"]),
-    ]
-    if not entries:
-        return ""
-    rows = [[text(name), text(why)] for name, why in entries[:_MAX_UNUSED]]
-    more = len(entries) - _MAX_UNUSED
-    rest = f'<p class="soft">… and {more:,} more, see sfm.json.</p>' if more > 0 else ""
-    return f"<h2>Photos not used</h2>\n{table(['photo', 'reason'], rows, 'names')}{rest}"
-
-
-def _timing(facts: dict[str, Any]) -> str:
-    seconds = facts["seconds"]
-    longest = max([*seconds.values(), 1e-9])
-    rows = []
-    for stage, value in seconds.items():
-        rows.append([text(_STAGES.get(stage, stage)), duration(value), bar(value / longest)])
-    sfm = facts["sfm"]
-    attempts = "".join(f"<li>{text(attempt)}</li>" for attempt in sfm["attempts"])
-    settings = text(json.dumps(facts["settings"], indent=2, ensure_ascii=False))
-    inputs = ", ".join(text(path) for path in facts["inputs"])
-    return (
-        f"<h2>Time and settings</h2>\n{table(['stage', 'time', ''], rows)}\n"
-        f'<p class="soft">Inputs: {inputs}. Matched pairs: {text(sfm["pairs"])}.</p>\n'
-        f"<ol>{attempts}</ol>\n"
-        f"<details><summary>Settings</summary><pre>{settings}</pre></details>"
-    )
+    parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
+    return _Lens(photos, size, about, model, parameters)
 
 
 def _name(inputs: Sequence[str]) -> str:
@@ -335,5 +217,4 @@ def _name(inputs: Sequence[str]) -> str:
 
 
 def _next_step(dataset: Path) -> str:
-    command = f"snowsplat train {shlex.quote(str(dataset))} -o {shlex.quote(dataset.name + '-out')}"
-    return f"<h2>Next step</h2>\n<pre>{text(command)}</pre>"
+    return f"snowsplat train {shlex.quote(str(dataset))} -o {shlex.quote(dataset.name + '-out')}"

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snowsplat.sfm.report.scene_map import PlacedPhoto
+from snowsplat.util.messages import Message, message
 
 #: At most this number of places is suggested.
 _PLACES = 5
@@ -38,7 +39,7 @@ class Advice:
     """Where more photos would help."""
 
     places: np.ndarray  # (K, 3) camera positions in the world frame, at most five
-    reasons: list[str]  # for each of them, what is missing there, as a phrase
+    reasons: list[Message]  # for each of them, what is missing there, as a phrase
     seldom: float  # share of the points, 0..1, that at most three photos show; 0 if it is below 5%
 
 
@@ -56,13 +57,13 @@ def advice(photos: Sequence[PlacedPhoto], xyz: np.ndarray) -> Advice:
     found = _gaps_around(centres, ahead) + _lonely(centres, ahead)
     seldom, place = _seen_seldom(photos, centres, xyz)
     if place is not None:
-        found.append((place, "this part of the scene is in few photos"))
+        found.append((place, message("this part of the scene is in few photos")))
     found = found[:_PLACES]
     places = np.array([place for place, _ in found]).reshape(-1, 3)
     return Advice(places, [reason for _, reason in found], seldom)
 
 
-def _gaps_around(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, str]]:
+def _gaps_around(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, Message]]:
     """Places in the largest gaps between cameras that surround a subject."""
     subject = _focus(centres, ahead)
     out = (centres - subject)[:, [0, 2]]
@@ -85,12 +86,15 @@ def _gaps_around(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarra
             angle = angles[i] + gaps[i] * step / (count + 1)
             place = np.array([radius * math.cos(angle), 0.0, radius * math.sin(angle)]) + subject
             place[1] = height
-            gap = f"{math.degrees(gaps[i]):.0f}° gap"
-            places.append((place, f"no photo shows the subject from here ({gap})"))
+            gap = message(
+                "no photo shows the subject from here ({angle:.0f}° gap)",
+                angle=math.degrees(gaps[i]),
+            )
+            places.append((place, gap))
     return places
 
 
-def _lonely(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, str]]:
+def _lonely(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, Message]]:
     """Places between photos that are far from all others and their nearest neighbours."""
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     # The photo itself, and other photos from its place, such as the views of a panorama.
@@ -99,7 +103,7 @@ def _lonely(centres: np.ndarray, ahead: np.ndarray) -> list[tuple[np.ndarray, st
     usual = float(np.median(nearest))
     lonely = np.flatnonzero(nearest > max(_FAR * usual, 1e-9))
     return [
-        ((centres[i] + centres[apart[i].argmin()]) / 2, "the next photos are far apart")
+        ((centres[i] + centres[apart[i].argmin()]) / 2, message("the next photos are far apart"))
         for i in lonely[np.argsort(-nearest[lonely], kind="stable")]
     ]
 

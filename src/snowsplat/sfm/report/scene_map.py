@@ -8,10 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 
 import numpy as np
+from markupsafe import Markup, escape
 
+from snowsplat.util.html import svg_text
+from snowsplat.util.messages import Message, message
+from snowsplat.util.theme import colours
+
+_AMBER, _BLUE, _NIGHT = (colours()[name] for name in ("amber", "blue", "night"))
 _WIDTH = 520  # of the largest drawing, in SVG units
 _HEIGHT = 400
 _MARGIN = 16
@@ -52,6 +57,7 @@ class _Projection:
     down: np.ndarray  # (3,) world direction that points down in the drawing
 
 
+_UNITS = message("units")
 _NO_MARKS = np.empty((0, 3))
 _Project = Callable[[np.ndarray], np.ndarray]  # (n, 3) world to (n, 2) of the drawing
 
@@ -63,7 +69,7 @@ _PROJECTIONS = (_Projection("From above", _X, -_Z), _Projection("From the side",
 class Drawing:
     """An SVG element and its width in SVG units; all drawings of a scene have the same scale."""
 
-    svg: str
+    svg: Markup
     width: int
 
 
@@ -72,7 +78,7 @@ def draw_scene(
     xyz: np.ndarray,
     rgb: np.ndarray,
     marks: np.ndarray = _NO_MARKS,
-    unit: str = "units",
+    unit: Message | str = _UNITS,
 ) -> list[Drawing]:
     """One drawing for each projection, of points (P, 3) and their colours (P, 3) uint8.
 
@@ -139,7 +145,7 @@ def _draw(
     extent: np.ndarray,
     scale: float,
     depth: float,
-    unit: str,
+    unit: Message | str,
 ) -> Drawing:
     width, height = (float(value) + 2 * _MARGIN for value in extent)
     axes = np.stack([projection.right, projection.down], 1)
@@ -153,7 +159,7 @@ def _draw(
         f'<rect width="{width:.0f}" height="{height:.0f}" rx="6" fill="#1f242c"/>',
         *_points(project(xyz), rgb),
         *_paths(photos, project),
-        '<g fill="#ffb454" fill-opacity="0.12" stroke="#ffb454" stroke-width="0.7" '
+        f'<g fill="{_AMBER}" fill-opacity="0.12" stroke="{_AMBER}" stroke-width="0.7" '
         'stroke-linejoin="round">',
     ]
     for i, photo in enumerate(photos):
@@ -165,7 +171,7 @@ def _draw(
             f"<title>{escape(photo.name)}</title></path>"
         )
     bar = _scale_bar(height, scale, unit)
-    svg = "\n".join([*parts, "</g>", *_marks(project(marks)), bar, "</svg>"])
+    svg = Markup("\n".join([*parts, "</g>", *_marks(project(marks)), bar, "</svg>"]))
     return Drawing(svg, round(width))
 
 
@@ -191,7 +197,7 @@ def _paths(photos: Sequence[PlacedPhoto], project: _Project) -> list[str]:
         centres = np.array([photo.centre for photo in photos if photo.sequence == sequence])
         way = " ".join(_svg_position(xy) for xy in project(centres))
         lines.append(
-            f'<polyline fill="none" stroke="#7cc7ff" stroke-width="1" points="{way}">'
+            f'<polyline fill="none" stroke="{_BLUE}" stroke-width="1" points="{way}">'
             f"<title>{escape(sequence)}</title></polyline>"
         )
     return lines
@@ -200,22 +206,23 @@ def _paths(photos: Sequence[PlacedPhoto], project: _Project) -> list[str]:
 def _marks(xy: np.ndarray) -> list[str]:
     """Numbered discs, counted from 1."""
     return [
-        f'<g><circle cx="{x:.1f}" cy="{y:.1f}" r="9" fill="#7cc7ff"/>'
-        f'<text x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle" fill="#14171b" font-size="12" '
+        f'<g><circle cx="{x:.1f}" cy="{y:.1f}" r="9" fill="{_BLUE}"/>'
+        f'<text x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle" fill="{_NIGHT}" font-size="12" '
         f'font-weight="600" font-family="sans-serif">{number}</text></g>'
         for number, (x, y) in enumerate(xy, 1)
     ]
 
 
-def _scale_bar(height: float, scale: float, unit: str) -> str:
+def _scale_bar(height: float, scale: float, unit: Message | str) -> str:
     power = 10.0 ** math.floor(math.log10(25 / scale))
     length = next(digit * power for digit in (1, 2, 5, 10) if digit * power * scale > 25)
     y, x = height - 10, 12.0
     start = _svg_position((x, y))
+    words = svg_text(message("{length:g} {unit}", length=length, unit=unit))
     return (
         f'<path d="M{start}h{length * scale:.1f}" stroke="#aab4c0" stroke-width="2"/>'
         f'<text x="{x:.0f}" y="{y - 6:.0f}" fill="#aab4c0" font-size="11" '
-        f'font-family="sans-serif">{length:g} {unit}</text>'
+        f'font-family="sans-serif">{words}</text>'
     )
 
 

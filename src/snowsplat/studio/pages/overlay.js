@@ -3,6 +3,10 @@
 import { make } from "./page.js";
 import { project } from "./selection.js";
 
+/** A colour of `theme.css`. */
+export const colour = (/** @type {string} */ name) =>
+    getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+
 /** @param {HTMLCanvasElement} canvas of the viewer */
 export function addOverlay(canvas) {
     const element = /** @type {HTMLCanvasElement} */ (make("canvas.snow-overlay", { hidden: true }));
@@ -39,9 +43,9 @@ export function addOverlay(canvas) {
             if (depth <= 0) return;
             drawing.beginPath();
             drawing.arc(x, y, number ? 11 : 5, 0, 7);
-            drawing.fillStyle = "#ffb454";
+            drawing.fillStyle = colour("amber");
             drawing.fill();
-            drawing.fillStyle = "#14171b";
+            drawing.fillStyle = colour("night");
             drawing.textAlign = "center";
             drawing.fillText(number, x, y + 4);
         },
@@ -52,7 +56,7 @@ export function addOverlay(canvas) {
          */
         lines(m, pairs) {
             drawing.lineWidth = 2;
-            drawing.strokeStyle = "#ffb454";
+            drawing.strokeStyle = colour("amber");
             drawing.beginPath();
             for (const pair of pairs) {
                 const [from, to] = pair.map(point => seen(m, point));

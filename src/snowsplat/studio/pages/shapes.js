@@ -1,5 +1,6 @@
 // The tools that select what is in a shape of the window: rectangle, lasso and brush.
 
+import { colour } from "./overlay.js";
 import { make } from "./page.js";
 import { within } from "./selection.js";
 import { say } from "./text.js";
@@ -59,8 +60,11 @@ export function addShapes({ canvas, centers, overlay, model, select }) {
         },
         draw() {
             if (!stroke.length) return;
-            overlay.drawing.fillStyle = overlay.drawing.strokeStyle = "#ffb45466";
+            overlay.drawing.save();
+            overlay.drawing.globalAlpha = 0.4;
+            overlay.drawing.fillStyle = overlay.drawing.strokeStyle = colour("amber");
             trace(overlay.drawing);
+            overlay.drawing.restore();
         },
     };
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from snowsplat.data import ImageLoader, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
-from snowsplat.util.html import picture, text
+from snowsplat.util.messages import Message, message
 
 #: Number of views that are shown, of those with the lowest and the highest PSNR.
 _WORST = 3
@@ -21,20 +22,21 @@ _BEST = 2
 #: The longer side of an image, in pixels: about that of a screen, on which it can be opened.
 _IMAGE_SIDE = 1280
 #: The mean difference of the channels that is drawn white.
-_WHITE_ERROR = 0.25
+WHITE_ERROR = 0.25
 
-# From 0 to `_WHITE_ERROR`: black, red, orange, white.
+# From 0 to `WHITE_ERROR`: black, red, orange, white.
 _ERROR_COLORS = np.array(
     [[0, 0, 0], [96, 14, 30], [200, 60, 20], [250, 170, 60], [255, 255, 255]], np.float32
 )
 
-#: CSS that the page needs.
-STYLE = """
-.views { display: flex; flex-wrap: wrap; gap: 18px 16px; }
-.triple { display: flex; gap: 5px; }
-.triple img { height: auto; max-height: 200px; width: auto; min-width: 0; flex: 0 1 auto;
-  object-fit: contain; border-radius: 3px; }
-"""
+
+@dataclass(frozen=True)
+class Compared:
+    """A view: its metrics, and by their names the photo, the rendering and the error."""
+
+    name: str
+    metrics: ViewMetrics
+    images: dict[str, Image.Image]
 
 
 def compared(
@@ -42,41 +44,37 @@ def compared(
     views: Sequence[View],
     evaluation: Evaluation,
     background: tuple[float, float, float],
-) -> str:
-    """HTML of the views with the lowest and the highest PSNR in ``evaluation``.
+) -> list[tuple[Message, list[Compared]]]:
+    """The views with the lowest and the highest PSNR in ``evaluation``, in groups with a title.
 
     Raises: UserError: a photo is missing or damaged.
     """
     color = torch.tensor(background, device=gaussians.means.device)
     order = sorted(evaluation.views, key=lambda metrics: metrics.psnr)
+    groups = {
+        message("Lowest PSNR"): order[:_WORST],
+        message("Highest PSNR"): order[: -_BEST - 1 : -1],
+    }
     if len(order) <= _WORST + _BEST:
-        groups = [("Photo, rendering, error", order)]
-    else:
-        groups = [
-            ("Lowest PSNR", order[:_WORST]),
-            ("Highest PSNR", order[: -_BEST - 1 : -1]),
-        ]
+        groups = {message("Photo, rendering, error"): order}
     by_name = {view.name: view for view in views}
-    parts = []
     with ImageLoader(views, device=gaussians.means.device) as loader:
-        for title, chosen in groups:
-            figures = "\n".join(
-                _triple(gaussians, color, by_name[one.name], one, loader)
-                for one in chosen
-                if one.name in by_name
+        return [
+            (
+                title,
+                [
+                    _compared(gaussians, color, by_name[one.name], one, loader)
+                    for one in chosen
+                    if one.name in by_name
+                ],
             )
-            parts.append(f'<h2>{title}</h2>\n<div class="views">{figures}</div>')
-    white = f"{100 * _WHITE_ERROR:.0f}%"
-    parts.append(
-        '<p class="soft">Photo, rendering, and error: the mean difference of red, green and blue, '
-        f"from black (0) to white ({white} of the range, or more).</p>"
-    )
-    return "\n".join(parts)
+            for title, chosen in groups.items()
+        ]
 
 
-def _triple(
-    gaussians: Gaussians, color: Tensor, view: View, figures: ViewMetrics, loader: ImageLoader
-) -> str:
+def _compared(
+    gaussians: Gaussians, color: Tensor, view: View, metrics: ViewMetrics, loader: ImageLoader
+) -> Compared:
     loaded = loader.get(view)
     photo = loaded.over(color)
     with torch.no_grad():
@@ -84,16 +82,12 @@ def _triple(
     difference = (image - photo).abs().mean(2)
     if loaded.mask is not None:
         difference = torch.where(loaded.mask, difference, 0.0)
-    images = "".join(
-        picture(reduced(pixels), f"{view.name}: {what}", quality=80)
-        for what, pixels in (
-            ("photo", _bytes(photo)),
-            ("rendering", _bytes(image)),
-            ("error", _error_in_color(difference.cpu().numpy())),
-        )
-    )
-    caption = f"{text(view.name)}: PSNR {figures.psnr:.2f} dB, SSIM {figures.ssim:.3f}"
-    return f'<figure><div class="triple">{images}</div><figcaption>{caption}</figcaption></figure>'
+    images = {
+        "photo": _bytes(photo),
+        "rendering": _bytes(image),
+        "error": _error_in_color(difference.cpu().numpy()),
+    }
+    return Compared(view.name, metrics, {what: reduced(each) for what, each in images.items()})
 
 
 def _bytes(image: Tensor) -> np.ndarray:
@@ -102,7 +96,7 @@ def _bytes(image: Tensor) -> np.ndarray:
 
 def _error_in_color(difference: np.ndarray) -> np.ndarray:
     """(H, W) in 0..1 -> (H, W, 3) uint8."""
-    position = np.clip(difference / _WHITE_ERROR, 0.0, 1.0) * (len(_ERROR_COLORS) - 1)
+    position = np.clip(difference / WHITE_ERROR, 0.0, 1.0) * (len(_ERROR_COLORS) - 1)
     low = np.minimum(position.astype(np.int64), len(_ERROR_COLORS) - 2)
     share = (position - low)[:, :, None]
     color = _ERROR_COLORS[low] * (1.0 - share) + _ERROR_COLORS[low + 1] * share

@@ -10,22 +10,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from PIL import Image
 
 from snowsplat import ops
 from snowsplat.data import Dataset
-from snowsplat.evaluation import verdict
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
 from snowsplat.training.report import masks, pictures
 from snowsplat.util import charts
-from snowsplat.util.duration import duration
 from snowsplat.util.files import write_text
-from snowsplat.util.html import bar, cards, page, table, text
+from snowsplat.util.html import in_languages, render_page
 from snowsplat.util.machine import memory_bytes, system_name
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.process import single_threaded
 
 #: Number of training views that are evaluated if no views were held out.
@@ -34,16 +33,6 @@ _TRAINING_VIEWS = 8
 _LISTED = 200
 #: Curves are averaged over this many parts of the training.
 _SMOOTHED = 40
-
-_STYLE = (
-    charts.STYLE
-    + pictures.STYLE
-    + masks.STYLE
-    + verdict.STYLE
-    + """
-td { font-variant-numeric: tabular-nums; }
-"""
-)
 
 
 @dataclass(frozen=True)
@@ -89,195 +78,84 @@ def write_training_report(path: Path, trained: Trained) -> None:
         evaluation = trained.evaluation
         if evaluation is None or not held_out:
             evaluation = evaluate_views(trained.gaussians, views, background=trained.background)
-        body = [
-            _headline(trained, evaluation, held_out),
-            "" if trained.verdict is None else trained.verdict.html(message("the scene")),
-            _cards(trained, evaluation, held_out),
-            _left_out(trained.left_out),
-            masks.masked(trained.dataset.train, trained.masks),
-            _poses(trained.poses),
-            *map(_poses, trained.doubts),
-            _curves(trained.history),
-            _exposures(trained.exposures),
-            pictures.compared(trained.gaussians, views, evaluation, trained.background),
-            _figures(evaluation, held_out),
-            _settings(trained),
-            _machine(trained),
-            _next(trained.folder),
-        ]
-    write_text(path, page(f"{trained.name} – training", body, _STYLE))
-
-
-# The parts of the page, from top to bottom
-
-
-def _headline(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
-    count = len(evaluation.views)
-    photos = f"{count} photo" if count == 1 else f"{count} photos"
-    if held_out:
-        how = f"Evaluated on {photos} of {evaluation.size} that were not used for training."
-        if trained.of_make:
-            how += (
-                " If there is time, make ends with a short training on all photos; all figures are "
-                "those of the scene before."
-            )
-    else:
-        how = (
-            f"No photos were held out: these are the metrics of {photos} of {evaluation.size} used "
-            "for training, which are better than those of new views. Use --eval to hold out every "
-            "8th photo."
+        errors = [(metrics, _rms(metrics.psnr)) for metrics in evaluation.views]
+        page = render_page(
+            "training/report/training_report.html.j2",
+            title=f"{trained.name} – training",
+            trained=trained,
+            evaluation=evaluation,
+            held_out=held_out,
+            masked=masks.masked(trained.dataset.train, trained.masks),
+            curves=_curves(trained.history),
+            exposures=_exposures(trained.exposures),
+            groups=pictures.compared(trained.gaussians, views, evaluation, trained.background),
+            white_error=pictures.WHITE_ERROR,
+            errors=errors,
+            largest_error=max([error for _, error in errors], default=0.0) or 1.0,
+            listed=_LISTED,
+            settings=json.dumps(trained.settings, indent=2, ensure_ascii=False),
+            machine=_machine(trained),
+            folder=shlex.quote(trained.folder),
         )
-    return f"<h1>{text(trained.name)}</h1>\n<p>{how}</p>"
+    write_text(path, page)
 
 
-def _cards(trained: Trained, evaluation: Evaluation, held_out: bool) -> str:
-    where = f"{'held-out' if held_out else 'training'} photos of {evaluation.size}"
-    figures = [
-        (f"{evaluation.psnr:.2f} dB", f"PSNR, {where}"),
-        (f"{evaluation.ssim:.3f}", f"SSIM, {where}"),
-        (f"{evaluation.psnr_aligned:.2f} dB", f"colour-aligned PSNR, {where}"),
-        (f"{len(trained.gaussians):,}", "Gaussians"),
-        (f"{trained.step:,}", "steps"),
-        (duration(trained.history.seconds), "of training"),
-    ]
-    return cards(figures)
-
-
-def _poses(line: str | None) -> str:
-    return "" if line is None else f"<p>{text(line[:1].upper() + line[1:])}.</p>"
-
-
-def _left_out(names: tuple[str, ...]) -> str:
-    """The photos whose poses are probably wrong."""
-    if not names:
-        return ""
-    rest = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
-    return (
-        f"<h2>Photos that the scene does not explain</h2>\n<p>Left out of the training, because "
-        f"their camera poses are probably wrong: {text(', '.join(names[:_LISTED]))}{rest}.</p>"
-    )
-
-
-def _curves(history: History) -> str:
+def _curves(history: History) -> list[tuple[Message, Markup]]:
+    """Captions and drawings of the course of the training; "" if there is nothing to draw."""
     stretches = history.stretches
     window = max(1, len(stretches) // _SMOOTHED)
     loss = [(float(s.step), s.loss) for s in stretches]
     psnr = [(float(m.step), m.psnr) for m in history.measured]
-    milliseconds = [(float(s.step), 1000 * s.seconds / s.steps) for s in stretches]
-    drawings = [
-        (
-            "Loss",
-            charts.chart(charts.smoothed(loss, window), raw=loss, x_label="steps", y_label="loss"),
-        ),
-        (
-            "PSNR of the held-out photos, dB",
-            charts.chart(
-                psnr if len(psnr) > 1 else [],  # a single value is in the headline
-                x_label="steps",
-                y_label="PSNR, dB",
-                dots=True,
-                from_zero=False,
-            ),
-        ),
-        (
-            "Gaussians",
-            charts.chart(
-                [(float(s.step), float(s.gaussians)) for s in stretches],
-                x_label="steps",
-                y_label="Gaussians",
-            ),
-        ),
-        (
-            "Time of a step, ms",
-            charts.chart(
-                charts.smoothed(milliseconds, window),
-                raw=milliseconds,
-                x_label="steps",
-                y_label="time of a step, ms",
-            ),
-        ),
-    ]
-    figures = "\n".join(
-        f"<figure><figcaption>{caption}</figcaption>{svg}</figure>"
-        for caption, svg in drawings
-        if svg
-    )
-    return f'<h2>The training</h2>\n<div class="charts">{figures}</div>' if figures else ""
+    gaussians = [(float(s.step), float(s.gaussians)) for s in stretches]
+    times = [(float(s.step), 1000 * s.seconds / s.steps) for s in stretches]
+    steps = message("steps")
 
+    def smooth(points: list[tuple[float, float]], label: Message) -> Markup:
+        curve = charts.smoothed(points, window)
+        return charts.chart(curve, raw=points, x_label=steps, y_label=label)
 
-def _exposures(exposures: tuple[float, ...]) -> str:
-    """The exposures of the training photos, in the order of their names."""
-    if not any(exposures):
-        return ""
-    drawing = charts.chart(
-        [(float(i), ev) for i, ev in enumerate(exposures, 1)],
-        x_label="training photo",
-        y_label="exposure, EV",
+    # A single PSNR is in the headline.
+    psnr_drawing = charts.chart(
+        psnr if len(psnr) > 1 else [],
+        x_label=steps,
+        y_label="PSNR, dB",
         dots=True,
         from_zero=False,
     )
-    return (
-        "<h2>Exposures of the photos</h2>\n<p>In EV (factors of two of light), relative to their "
-        "mean, which is the exposure of the scene.</p>\n"
-        f'<div class="charts"><figure>{drawing}</figure></div>'
+    count = message("Gaussians")
+    drawings = [
+        (message("Loss"), smooth(loss, message("loss"))),
+        (message("PSNR of the held-out photos, dB"), psnr_drawing),
+        (count, charts.chart(gaussians, x_label=steps, y_label=count)),
+        (message("Time of a step, ms"), smooth(times, message("time of a step, ms"))),
+    ]
+    return [(caption, drawing) for caption, drawing in drawings if drawing]
+
+
+def _exposures(exposures: tuple[float, ...]) -> Markup:
+    """The exposures of the training photos, in the order of their names."""
+    return charts.chart(
+        [(float(i), ev) for i, ev in enumerate(exposures, 1)] if any(exposures) else [],
+        x_label=message("training photo"),
+        y_label=message("exposure, EV"),
+        dots=True,
+        from_zero=False,
     )
 
 
-def _figures(evaluation: Evaluation, held_out: bool) -> str:
-    """The table of views. A bar shows the error of each view."""
-    errors = [_rms(metrics.psnr) for metrics in evaluation.views]
-    largest = max([*errors, 1e-9])
-    rows = [
-        [
-            text(metrics.name),
-            f"{metrics.psnr:.2f}&#160;dB",
-            f"{metrics.ssim:.3f}",
-            f"{metrics.psnr_aligned:.2f}&#160;dB",
-            f"{100 * error:.1f}%",
-            bar(error / largest),
-        ]
-        for metrics, error in list(zip(evaluation.views, errors, strict=True))[:_LISTED]
+def _machine(trained: Trained) -> list[tuple[Markup, str | Markup]]:
+    rows: list[tuple[Markup, str | Markup]] = [
+        (in_languages("trained on"), ops.device_name(trained.gaussians.means.device)),
+        (in_languages("system"), system_name()),
     ]
-    more = len(evaluation.views) - _LISTED
-    rest = f'<p class="soft">… and {more:,} more, see metrics.json.</p>' if more > 0 else ""
-    which = "held-out" if held_out else "evaluated"
-    heads = ["photo", "PSNR", "SSIM", "colour-aligned PSNR", "RMS error", ""]
-    return f"<h2>Each {which} photo</h2>\n{table(heads, rows)}{rest}"
-
-
-def _settings(trained: Trained) -> str:
-    dataset = trained.dataset
-    camera = dataset.train[0].camera
-    points = "none" if dataset.points is None else f"{len(dataset.points):,}"
-    rows = [
-        ["photos", f"{len(dataset.train)} to train on, {len(dataset.test)} held out"],
-        ["size", f"{camera.width} × {camera.height}"],
-        ["initial points", points],
-        ["degree of the spherical harmonics", str(trained.gaussians.sh_degree)],
-    ]
-    everything = text(json.dumps(trained.settings, indent=2, ensure_ascii=False))
-    return (
-        f"<h2>Settings</h2>\n{table([], rows)}\n"
-        f"<details><summary>All settings</summary><pre>{everything}</pre></details>"
-    )
-
-
-def _machine(trained: Trained) -> str:
-    rows = [
-        ["trained on", text(ops.device_name(trained.gaussians.means.device))],
-        ["system", text(system_name())],
-    ]
-    memory = [f"{trained.peak_bytes / 1e9:.1f} GB peak"] if trained.peak_bytes else []
+    memory = []
+    if trained.peak_bytes:
+        memory.append(message("{gb:.1f} GB peak", gb=trained.peak_bytes / 1e9))
     if memory_bytes():
-        memory.append(f"{memory_bytes() / 1e9:.0f} GB installed")
+        memory.append(message("{gb:.0f} GB installed", gb=memory_bytes() / 1e9))
     if memory:
-        rows.append(["memory", ", ".join(memory)])
-    return f"<h2>Machine</h2>\n{table([], rows)}"
-
-
-def _next(folder: str) -> str:
-    out = text(shlex.quote(folder))
-    return f"<h2>Next</h2>\n<pre>snowsplat view {out}\nsnowsplat render {out} --path ellipse</pre>"
+        rows.append((in_languages("memory"), in_languages("{parts}", parts=memory)))
+    return rows
 
 
 def _rms(psnr: float) -> float:

@@ -22,6 +22,7 @@ from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.trajectory.focus import focus_of, up_of, viewing_distance
 from snowsplat.util.errors import UserError
+from snowsplat.util.theme import THEME
 from snowsplat.viewer.http.served_file import ServedFile, served
 from snowsplat.viewer.http.server import WebServer
 from snowsplat.viewer.http.static import static_app
@@ -141,7 +142,7 @@ class NetworkViewer:
 
     def _app(self, label: str) -> ASGIApp:
         """What the server serves: the files of the page, and the connections of browsers."""
-        files = served(_PAGE, _PAGE.iterdir())
+        files = served(_PAGE, _PAGE.iterdir()) | served(THEME.parent, [THEME])
         title = f"<title>{html.escape(label)} - snowsplat</title>"
         page = (_PAGE / "index.html").read_text("utf-8").replace(_TITLE, title, 1)
         files[""] = ServedFile(page.encode(), "text/html; charset=utf-8")

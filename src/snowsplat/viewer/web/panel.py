@@ -18,6 +18,7 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
+from snowsplat.util.theme import with_colours
 from snowsplat.viewer.web.hiding import Hiding
 from snowsplat.viewer.web.stops import Stops
 
@@ -114,4 +115,4 @@ def script() -> str:
 
 def style() -> str:
     """The style sheet of the panel."""
-    return (_FOLDER / "panel.css").read_text(encoding="utf-8")
+    return with_colours((_FOLDER / "panel.css").read_text(encoding="utf-8"))
