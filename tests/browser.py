@@ -336,5 +336,5 @@ def chinese_labels(report: Path) -> list[str]:
         assert not page.errors
     left = re.sub(r"PSNR|SSIM|RMS|dB|ms", "", " ".join(labels))
     assert len(labels) > 20
-    assert not re.findall("[A-Za-z]{3,}", left)
+    assert not re.findall("[A-Za-z]{3,}", left), left
     return labels

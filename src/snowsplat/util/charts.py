@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from snowsplat.util.html import svg_text
 from snowsplat.util.messages import Message
@@ -87,9 +87,12 @@ def chart(
     if dots or len(places) == 1:
         parts += [f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="3.5"/>' for x, y in places]
     inner = "".join(parts)
+    title = svg_text(y_label, "title")
+    if not title.startswith("<"):
+        title = Markup("<title>{}</title>").format(title)
     return Markup(
         f'<svg class="chart" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" '
-        f'role="img"><title>{escape(y_label)}</title>{inner}</svg>'
+        f'role="img">{title}{inner}</svg>'
     )
 
 

@@ -2,8 +2,8 @@
 
 A template is a file ``*.html.j2`` beside the module that renders it. It extends
 `util/report/report.html.j2`, which has the style in light and dark, and the button for the
-language. The pages are also well-formed XML. Texts go through `in_languages`, in templates ``t``.
-All other values are escaped.
+language. The pages are also well-formed XML. Messages are shown in all languages; ``t`` is
+`in_languages`. All other values are escaped.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def sentence(text: object, stop: bool = False) -> Markup:
     )
 
 
-def svg_text(text: object) -> Markup:
-    """A text in each language for a ``<text>`` of SVG."""
-    return _elements(as_message(text), tag="tspan")
+def svg_text(text: object, tag: str = "tspan") -> Markup:
+    """A text in each language for a ``<text>`` of SVG, or as its elements ``tag``."""
+    return _elements(as_message(text), tag=tag)
 
 
 def _elements(
@@ -83,6 +83,13 @@ def picture(image: Image.Image, alt: str, quality: int = 75) -> Markup:
     )
 
 
+def _shown(value: object) -> str:
+    """What a template shows of a value: a message in all languages."""
+    if isinstance(value, Markup):
+        return value
+    return in_languages(value) if isinstance(value, Message) else printable(str(value))
+
+
 @cache
 def _environment() -> jinja2.Environment:
     import jinja2  # takes as long as all else of this module
@@ -91,7 +98,7 @@ def _environment() -> jinja2.Environment:
         loader=jinja2.FileSystemLoader(_PACKAGE),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
-        finalize=lambda value: value if isinstance(value, Markup) else printable(str(value)),
+        finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from PIL import Image
 
 from snowsplat.data.colmap import posed_camera, read_model, read_points
-from snowsplat.data.frame.placement import Placement, placement_of
+from snowsplat.data.frame.placement import placement_of
 from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.project.dataset_folder import DatasetFolder
@@ -26,7 +25,7 @@ from snowsplat.sfm.report.more_photos import Advice, advice
 from snowsplat.sfm.report.photo_problems import Problem, what_to_do
 from snowsplat.sfm.report.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.files import write_text
-from snowsplat.util.html import in_languages, render_page
+from snowsplat.util.html import render_page
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import printable
 
@@ -91,7 +90,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         "more_photos": _numbered(more),
         "bad_photos": _bad_photos(dataset, facts["problems"]),
         "drawings": draw_scene(photos, xyz, rgb, more.places, unit),
-        "placement": None if placement is None else _placed(placement),
+        "placement": None if placement is None else placement.rows(),
         "strip": _strip(dataset, names),
         "lenses": [_lens(camera) for camera in sfm["cameras"]],
         "sizes": [f"{width} × {height}" for width, height, *_ in undistorted["sizes"]],
@@ -145,7 +144,7 @@ def _bad_photos(dataset: Path, bad: dict[str, Problem]) -> list[_BadPhoto]:
     ]
 
 
-def _numbered(more: Advice) -> list[tuple[Markup, Markup]]:
+def _numbered(more: Advice) -> list[tuple[Message, Message]]:
     """The places for more photos, "1" or "1 to 3", and why."""
     numbers = iter(range(1, len(more.reasons) + 1))
     rows = []
@@ -155,13 +154,8 @@ def _numbered(more: Advice) -> list[tuple[Markup, Markup]]:
         which = (
             message("{first} to {last}", first=first, last=last) if rest else message(str(first))
         )
-        rows.append((in_languages(which), in_languages(reason)))
+        rows.append((which, reason))
     return rows
-
-
-def _placed(placement: Placement) -> list[tuple[Markup, Markup]]:
-    """What the frame of the scene was found from."""
-    return [(in_languages(name), in_languages(clause)) for name, clause in placement.rows()]
 
 
 def _strip(dataset: Path, names: Sequence[str]) -> list[tuple[Image.Image, str]]:

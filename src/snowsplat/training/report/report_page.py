@@ -22,7 +22,7 @@ from snowsplat.training.core.history import History
 from snowsplat.training.report import masks, pictures
 from snowsplat.util import charts
 from snowsplat.util.files import write_text
-from snowsplat.util.html import in_languages, render_page
+from snowsplat.util.html import render_page
 from snowsplat.util.machine import memory_bytes, system_name
 from snowsplat.util.messages import Message, message
 from snowsplat.util.process import single_threaded
@@ -143,10 +143,10 @@ def _exposures(exposures: tuple[float, ...]) -> Markup:
     )
 
 
-def _machine(trained: Trained) -> list[tuple[Markup, str | Markup]]:
-    rows: list[tuple[Markup, str | Markup]] = [
-        (in_languages("trained on"), ops.device_name(trained.gaussians.means.device)),
-        (in_languages("system"), system_name()),
+def _machine(trained: Trained) -> list[tuple[Message, Message | str]]:
+    rows: list[tuple[Message, Message | str]] = [
+        (message("trained on"), ops.device_name(trained.gaussians.means.device)),
+        (message("system"), system_name()),
     ]
     memory = []
     if trained.peak_bytes:
@@ -154,7 +154,7 @@ def _machine(trained: Trained) -> list[tuple[Markup, str | Markup]]:
     if memory_bytes():
         memory.append(message("{gb:.0f} GB installed", gb=memory_bytes() / 1e9))
     if memory:
-        rows.append((in_languages("memory"), in_languages("{parts}", parts=memory)))
+        rows.append((message("memory"), message("{parts}", parts=memory)))
     return rows
 
 
