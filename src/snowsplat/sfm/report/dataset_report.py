@@ -150,10 +150,9 @@ def _numbered(more: Advice) -> list[tuple[Message, Message]]:
     rows = []
     for reason, same in groupby(more.reasons):
         first, *rest = [next(numbers) for _ in same]
-        last = rest[-1] if rest else first
-        which = (
-            message("{first} to {last}", first=first, last=last) if rest else message(str(first))
-        )
+        which = message("{first}", first=first)
+        if rest:
+            which = message("{first} to {last}", first=first, last=rest[-1])
         rows.append((which, reason))
     return rows
 
