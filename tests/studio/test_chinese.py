@@ -24,16 +24,17 @@ from snowsplat.studio.app import _listing
 from snowsplat.studio.library import Library
 from snowsplat.studio.uploads import Upload, safe_path, write_part
 from snowsplat.util.errors import UserError, message_of
-from snowsplat.util.html import CHINESE
 from snowsplat.util.run_lock import Holder
 
-_TOLD = Path(__file__).parents[2] / "src/snowsplat/studio/pages/told.js"
+_PAGES = Path(__file__).parents[2] / "src/snowsplat/studio/pages"
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
 
 
 def translated(lines: list[str]) -> list[str]:
-    script = "".join(file.read_text("utf-8") for file in (CHINESE, _TOLD))
+    script = "".join(
+        file.read_text("utf-8") for file in (_PAGES / "chinese.js", _PAGES / "told.js")
+    )
     script += f"console.log(JSON.stringify({json.dumps(lines)}.map(snowsplatChinese)))"
     shown = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
     return json.loads(shown.stdout)

@@ -65,7 +65,6 @@ from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, uploads, write_part
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import write_json
-from snowsplat.util.html import CHINESE
 from snowsplat.util.run_lock import is_locked
 from snowsplat.util.safe_json import from_json, is_file, printable, read_json
 from snowsplat.util.theme import THEME
@@ -452,7 +451,7 @@ def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request
 @cache
 def _page_files() -> dict[str, Path]:
     """The files of the page, by name; "" is the page itself."""
-    files = {path.name: path for path in (*_PAGES.iterdir(), THEME, CHINESE)}
+    files = {path.name: path for path in (*_PAGES.iterdir(), THEME)}
     return {"": files["index.html"], **files}
 
 

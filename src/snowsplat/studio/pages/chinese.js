@@ -1,7 +1,7 @@
-// `snowsplatChinese`: sentences of reports in Chinese; `snowsplatChinese.learn` adds those of another
-// page. A text without a line here remains English. In English, "#" stands for a number, and "{}" for any
-// text, which is translated, too; in Chinese, {0} is the first of both. The script is part of well-formed
-// documents.
+// @ts-nocheck
+// `snowsplatChinese`: what the program tells in the studio, in Chinese; `told.js` adds more. A text without
+// a line here remains English. In English, "#" stands for a number, and "{}" for any text, which is
+// translated, too; in Chinese, {0} is the first of both.
 globalThis.snowsplatChinese = (() => {
     const TEXTS = {
         // Both reports
