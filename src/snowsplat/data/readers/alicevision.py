@@ -11,21 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.data.dataset import usable_points
 from snowsplat.data.lens.lens import Lens
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import (
-    damaged_export,
-    head_of,
-    load_json,
-    number,
-    numbers,
-    objects,
-    rigid,
-    table,
-)
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -36,7 +26,7 @@ _COUNTS |= {"brown": 5, "fisheye": 4, "fisheye4": 4}
 
 def is_alicevision(path: Path) -> bool:
     """Whether a file starts like one of AliceVision."""
-    head = head_of(path)
+    head = parse.head_of(path)
     return (
         path.suffix.lower() in (".sfm", ".json")
         and b'"version"' in head
@@ -46,18 +36,18 @@ def is_alicevision(path: Path) -> bool:
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras, and the points of the file or of a PLY file beside it."""
-    scene = table(path, load_json(path))
-    version = numbers(f"{path}: version", scene.get("version"), 3)
+    scene = parse.table(path, parse.load_json(path))
+    version = parse.numbers(f"{path}: version", scene.get("version"), 3)
     lenses = {
         str(each.get("intrinsicId")): _lens(f"{path}: intrinsic", each, tuple(version))
-        for each in objects(f"{path}: intrinsics", scene.get("intrinsics") or [])
+        for each in parse.objects(f"{path}: intrinsics", scene.get("intrinsics") or [])
     }
     poses = {
-        str(each.get("poseId")): table(f"{path}: pose", each.get("pose"))
-        for each in objects(f"{path}: poses", scene.get("poses") or [])
+        str(each.get("poseId")): parse.table(f"{path}: pose", each.get("pose"))
+        for each in parse.objects(f"{path}: poses", scene.get("poses") or [])
     }
     found = Reconstruction()
-    for view in objects(f"{path}: views", scene.get("views")):
+    for view in parse.objects(f"{path}: views", scene.get("views")):
         name = str(view.get("path"))
         where = f"{path}: view {quoted(name)}"
         found.total += 1
@@ -66,20 +56,18 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             continue
         lens = lenses.get(str(view.get("intrinsicId")))
         if lens is None:
-            raise damaged_export(where, "has an intrinsic that is not in the file")
-        transform = table(where, pose.get("transform"))
-        rotation = numbers(where, transform.get("rotation"), 9).reshape(3, 3).T
-        centre = numbers(where, transform.get("center"), 3)
-        cam = rigid(where, rotation, -rotation @ centre)
+            raise parse.damaged(where, "has an intrinsic that is not in the file")
+        transform = parse.table(where, pose.get("transform"))
+        rotation = parse.numbers(where, transform.get("rotation"), 9).reshape(3, 3).T
+        centre = parse.numbers(where, transform.get("center"), 3)
+        cam = parse.rigid(where, rotation, -rotation @ centre)
         if (photo := found.photo(photos, name)) is None:
             continue
         found.add(photos, photo, lens, cam)
-    points = list(objects(f"{path}: structure", scene.get("structure") or []))
-    if points:
-        xyz = np.stack([numbers(path, point.get("X"), 3) for point in points])
-        rgb = np.stack([numbers(path, p.get("color", [128] * 3), 3) for p in points])
-        found.points = usable_points(path, xyz, np.clip(rgb, 0, 255))
-    elif found.images:
+    points = parse.objects(f"{path}: structure", scene.get("structure") or [])
+    rows = [(point.get("X"), point.get("color", [128] * 3)) for point in points]
+    found.add_points(path, str(path), rows)
+    if not rows and found.images:
         points_beside(path.parent, found)
     return found
 
@@ -95,21 +83,21 @@ def _lens(where: str, camera: dict[str, Any], version: tuple[float, ...]) -> Len
             where=where,
             kind=quoted(kind),
         )
-    width, height = number(where, camera, "width"), number(where, camera, "height")
+    width, height = parse.number(where, camera, "width"), parse.number(where, camera, "height")
     if "pxFocalLength" in camera:
         given = camera["pxFocalLength"]
-        fx, fy = numbers(where, given if isinstance(given, list) else [given, given], 2)
+        fx, fy = parse.numbers(where, given if isinstance(given, list) else [given, given], 2)
     else:
-        sensor = number(where, camera, "sensorWidth", 36.0)
+        sensor = parse.number(where, camera, "sensorWidth", 36.0)
         if not sensor > 0:
-            raise damaged_export(where, f"the sensor width {sensor:g} is not valid")
-        fx = number(where, camera, "focalLength") * width / sensor
-        fy = fx / (number(where, camera, "pixelRatio", 1.0) or 1.0)
-    centre = numbers(where, camera.get("principalPoint", [0, 0]), 2)
+            raise parse.damaged(where, f"the sensor width {sensor:g} is not valid")
+        fx = parse.number(where, camera, "focalLength") * width / sensor
+        fy = fx / (parse.number(where, camera, "pixelRatio", 1.0) or 1.0)
+    centre = parse.numbers(where, camera.get("principalPoint", [0, 0]), 2)
     if version < (1, 2, 1):  # from the corner of the photo
         centre = centre - (width / 2, height / 2)
     count = _COUNTS[kind]
-    k = numbers(where, camera.get("distortionParams") or [0.0] * count, count).tolist()
+    k = parse.numbers(where, camera.get("distortionParams") or [0.0] * count, count).tolist()
     cx, cy = centre + np.array([width / 2 + 0.5, height / 2 + 0.5])
     intrinsics = (float(fx), float(fy), float(cx), float(cy))
     if kind.startswith("fisheye"):

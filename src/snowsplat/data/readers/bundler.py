@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.dataset import usable_points
 from snowsplat.data.photos.decode import read_header
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import centred_intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import head_of, load_text, numbers, rigid
 from snowsplat.util.errors import UserError
 
 #: Other files than bundle.out may be of an earlier step.
@@ -27,19 +26,21 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 def is_bundler(path: Path) -> bool:
     """Whether a file starts like one of Bundler."""
-    return head_of(path).lstrip().lower().startswith(b"# bundle file")
+    return parse.head_of(path).lstrip().lower().startswith(b"# bundle file")
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras and points."""
-    lines = (line for line in load_text(path).splitlines() if line[:1] != "#" and line.strip())
-    cameras, count = numbers(path, next(lines, "").split(), 2).astype(int).tolist()
+    lines = (
+        line for line in parse.load_text(path).splitlines() if line[:1] != "#" and line.strip()
+    )
+    cameras, count = parse.numbers(path, next(lines, "").split(), 2).astype(int).tolist()
     names = _names(path, photos.root, cameras)
     found = Reconstruction(total=cameras)
     for index, name in enumerate(names):
         where = f"{path}: camera {index}"
-        focal, k1, k2 = numbers(where, next(lines, "").split(), 3)
-        rows = [numbers(where, next(lines, "").split(), 3) for _ in range(4)]
+        focal, k1, k2 = parse.numbers(where, next(lines, "").split(), 3)
+        rows = [parse.numbers(where, next(lines, "").split(), 3) for _ in range(4)]
         if focal == 0:  # not aligned
             continue
         if (photo := found.photo(photos, name)) is None:
@@ -47,15 +48,11 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         header = read_header(photos.root / photo)
         size = header.width, header.height
         lens = perspective(where, *size, centred_intrinsics(*size, focal), (k1, k2))
-        pose = rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
+        pose = parse.rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
         found.add(photos, photo, lens, pose)
-    xyz, rgb = [], []
-    for _ in range(count):
-        xyz.append(numbers(path, next(lines, "").split(), 3))
-        rgb.append(numbers(path, next(lines, "").split(), 3))
-        next(lines, "")  # the photos that show it
-    if xyz:
-        found.points = usable_points(path, np.stack(xyz), np.clip(np.stack(rgb), 0, 255))
+    # The third line of a point lists the photos that show it.
+    lists = ([next(lines, "").split() for _ in range(3)][:2] for _ in range(count))
+    found.add_points(path, str(path), lists)
     return found
 
 
@@ -64,7 +61,7 @@ def _names(path: Path, root: Path, count: int) -> list[str]:
     folders = dict.fromkeys((path.parent, root, root / "prepare"))
     lists = [f for folder in folders for p in ("*.lst", "*.txt") for f in sorted(folder.glob(p))]
     for file in lists:
-        names = [line.strip() for line in load_text(file).splitlines() if line.strip()]
+        names = [line.strip() for line in parse.load_text(file).splitlines() if line.strip()]
         if names[:1] == [str(count)]:  # some lists start with their length
             names = names[1:]
         names = [_FOCAL.sub("", name) for name in names]

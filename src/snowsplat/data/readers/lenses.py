@@ -12,7 +12,7 @@ from snowsplat.data.lens.brown import Brown
 from snowsplat.data.lens.fisheye import Equirectangular, OpenCVFisheye, ThinPrismFisheye
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.perspective import FullOpenCV, OpenCV, Pinhole
-from snowsplat.data.readers.values import damaged_export, size_of
+from snowsplat.data.readers import parse
 
 #: fx, fy, cx, cy in pixels.
 Intrinsics = tuple[float, float, float, float]
@@ -70,7 +70,7 @@ def fisheye(
 
 def equirectangular(where: object, width: float, height: float) -> Lens:
     """A panorama of the whole sphere."""
-    size = size_of(where, width, height)
+    size = parse.size_of(where, width, height)
     return Equirectangular(*size, (float(size[0]), float(size[1])))
 
 
@@ -82,8 +82,8 @@ def centred_intrinsics(width: float, height: float, focal: float) -> Intrinsics:
 def _valid_size(
     where: object, width: float, height: float, intrinsics: Intrinsics
 ) -> tuple[int, int]:
-    size = size_of(where, width, height)
+    size = parse.size_of(where, width, height)
     fx, fy, _, _ = intrinsics
     if not (0 < fx < 1e9 and 0 < fy < 1e9):
-        raise damaged_export(where, f"the focal lengths {fx:g} and {fy:g} pixels are not valid")
+        raise parse.damaged(where, f"the focal lengths {fx:g} and {fy:g} pixels are not valid")
     return size

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.photos.image_file import reason_of
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import centred_intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import damaged_export, from_opengl, numbers
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
@@ -33,8 +33,8 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if stored.ndim != 2 or stored.shape[1] != _COLUMNS or len(stored) > _MOST_ROWS:
             raise ValueError(f"it has the shape {stored.shape}")
     except Exception as error:  # numpy raises many kinds
-        raise damaged_export(path, f"not a table of poses ({reason_of(error)})") from None
-    rows = numbers(path, stored, len(stored), _COLUMNS)
+        raise parse.damaged(path, f"not a table of poses ({reason_of(error)})") from None
+    rows = parse.numbers(path, stored, len(stored), _COLUMNS)
     files = photos.sorted_files()
     if len(files) != len(rows):
         raise UserError(
@@ -50,7 +50,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         where = f"{path}: pose {index}"
         down, right, back, position, (height, width, focal) = row[:15].reshape(3, 5).T
         lens = perspective(where, width, height, centred_intrinsics(width, height, focal))
-        pose = from_opengl(where, np.column_stack([right, -down, back, position]))
+        pose = parse.from_opengl(where, np.column_stack([right, -down, back, position]))
         found.add(photos, file, lens, pose)
     return found
 

@@ -15,19 +15,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from snowsplat.data.lens.lens import Lens
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import (
-    damaged_export,
-    head_of,
-    inverse,
-    load_xml,
-    number,
-    numbers,
-    rigid,
-    size_of,
-)
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -42,7 +33,7 @@ _FAR = 1000.0
 
 def is_metashape(path: Path) -> bool:
     """Whether a file starts like cameras that Metashape has exported."""
-    head = head_of(path)
+    head = parse.head_of(path)
     return path.suffix.lower() == ".xml" and b"<document" in head and b"<chunk" in head
 
 
@@ -50,11 +41,11 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras, and the points of a PLY file beside it."""
     chunks = [
         chunk
-        for chunk in load_xml(path).iter("chunk")
+        for chunk in parse.load_xml(path).iter("chunk")
         if chunk.find("cameras") is not None and chunk.find("sensors") is not None
     ]
     if not chunks:
-        raise damaged_export(path, "has no cameras")
+        raise parse.damaged(path, "has no cameras")
     cameras = [list(_cameras(chunk)) for chunk in chunks]
     aligned = [sum(camera.find("transform") is not None for camera in each) for each in cameras]
     best = aligned.index(max(aligned))
@@ -90,14 +81,14 @@ def _read_chunk(
         transform = camera.find("transform")
         if transform is None:
             continue
-        matrix = numbers(where, (transform.text or "").split(), 16).reshape(4, 4)
-        pose = rigid(where, matrix[:3, :3], matrix[:3, 3])
+        matrix = parse.numbers(where, (transform.text or "").split(), 16).reshape(4, 4)
+        pose = parse.rigid(where, matrix[:3, :3], matrix[:3, 3])
         if (photo := found.photo(photos, label)) is None:
             continue
         key = camera.get("sensor_id")
         if key not in lenses:
             if key not in sensors:
-                raise damaged_export(
+                raise parse.damaged(
                     where, f"has the sensor {quoted(key)}, which is not in the file"
                 )
             lenses[key] = _lens(f"{path}: sensor {quoted(key)}", sensors[key])
@@ -115,10 +106,10 @@ def _read_chunk(
     given = worlds.get(component)
     scale, world = _world(given if given is not None else whole, groups[component])
     for photo, lens, pose in groups[component]:
-        world_from_cam = rigid(
+        world_from_cam = parse.rigid(
             path, world[:, :3] @ pose[:, :3], scale * world[:, :3] @ pose[:, 3] + world[:, 3]
         )
-        found.add(photos, photo, lens, inverse(world_from_cam))
+        found.add(photos, photo, lens, parse.inverse(world_from_cam))
     # The points may be in the frame of the chunk, or in that of the chunk in world units.
     similar = np.column_stack([scale * world[:, :3], world[:, 3]])
     points_beside(path.parent, found, (np.eye(4)[:3], similar, world))
@@ -129,12 +120,12 @@ def _similarity(where: str, transform: Element | None) -> tuple[float, np.ndarra
     """Scale and rigid part (3, 4) of world_from_chunk; None if it is not given."""
     if transform is None or transform.find("rotation") is None:
         return None
-    rotation = numbers(where, (transform.findtext("rotation") or "").split(), 9).reshape(3, 3)
-    translation = numbers(where, (transform.findtext("translation") or "0 0 0").split(), 3)
-    scale = number(where, {"scale": transform.findtext("scale")}, "scale", 1.0)
+    rotation = parse.numbers(where, (transform.findtext("rotation") or "").split(), 9).reshape(3, 3)
+    translation = parse.numbers(where, (transform.findtext("translation") or "0 0 0").split(), 3)
+    scale = parse.number(where, {"scale": transform.findtext("scale")}, "scale", 1.0)
     if not scale > 0:
-        raise damaged_export(where, f"the scale {scale:g} is not positive")
-    return scale, rigid(where, rotation, translation)
+        raise parse.damaged(where, f"the scale {scale:g} is not positive")
+    return scale, parse.rigid(where, rotation, translation)
 
 
 def _world(
@@ -177,7 +168,7 @@ def _lens(where: str, sensor: Element) -> Lens:
         return equirectangular(where, *_size(where, size))
     calibration = _calibration(sensor)
     if calibration is None:
-        raise damaged_export(where, "has no calibration")
+        raise parse.damaged(where, "has no calibration")
     kind = calibration.get("type", kind)
     own = calibration.find("resolution")
     size = size if own is None else own
@@ -192,9 +183,9 @@ def _lens(where: str, sensor: Element) -> Lens:
     values = {element.tag: element.text for element in calibration if element.text}
 
     def value(name: str) -> float:
-        return number(where, values, name, 0.0)
+        return parse.number(where, values, name, 0.0)
 
-    focal, cx, cy = number(where, values, "f"), value("cx"), value("cy")
+    focal, cx, cy = parse.number(where, values, "f"), value("cx"), value("cy")
     intrinsics = (focal + value("b1"), focal, width / 2 + cx, height / 2 + cy)
     radial = [value(name) for name in ("k1", "k2", "k3", "k4")]
     tangential = value("p2"), value("p1")  # x += p₁ (r² + 2 x²) + 2 p₂ x y
@@ -213,7 +204,9 @@ def _lens(where: str, sensor: Element) -> Lens:
 
 def _size(where: str, resolution: Element) -> tuple[int, int]:
     sides = {key: resolution.get(key) for key in ("width", "height")}
-    return size_of(where, number(where, sides, "width"), number(where, sides, "height"))
+    return parse.size_of(
+        where, parse.number(where, sides, "width"), parse.number(where, sides, "height")
+    )
 
 
 READER = program("Metashape", ("*.xml",), is_metashape, read)

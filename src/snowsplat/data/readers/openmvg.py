@@ -9,23 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from snowsplat.data.dataset import usable_points
 from snowsplat.data.lens.lens import Lens
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import (
-    damaged_export,
-    head_of,
-    load_json,
-    number,
-    numbers,
-    objects,
-    rigid,
-    table,
-)
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -43,17 +31,20 @@ _NAMED = (1 << 30) - 1 | 1 << 30  # of an identifier; the highest bit tells that
 
 def is_openmvg(path: Path) -> bool:
     """Whether a file starts like one of OpenMVG."""
-    return path.suffix.lower() == ".json" and b'"sfm_data_version"' in head_of(path)
+    return path.suffix.lower() == ".json" and b'"sfm_data_version"' in parse.head_of(path)
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras and points."""
-    scene = table(path, load_json(path))
+    scene = parse.table(path, parse.load_json(path))
     lenses = _lenses(path, scene)
     where = f"{path}: extrinsics"
-    poses = {number(where, pose, "key"): pose for pose in objects(where, scene.get("extrinsics"))}
+    poses = {
+        parse.number(where, pose, "key"): pose
+        for pose in parse.objects(where, scene.get("extrinsics"))
+    }
     found = Reconstruction()
-    for view in objects(f"{path}: views", scene.get("views")):
+    for view in parse.objects(f"{path}: views", scene.get("views")):
         data = _data(f"{path}: view", view)
         name = f"{data.get('local_path') or ''}/{data.get('filename')}"
         where = f"{path}: view {quoted(name)}"
@@ -63,43 +54,40 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if pose is None:
             continue
         if not isinstance(key, int) or key not in lenses:
-            raise damaged_export(
-                where, f"has the intrinsic {quoted(key)}, which is not in the file"
-            )
-        values = table(where, pose.get("value"))
-        rotation = numbers(where, values.get("rotation"), 3, 3)
-        centre = numbers(where, values.get("center"), 3)
-        cam = rigid(where, rotation, -rotation @ centre)
+            raise parse.damaged(where, f"has the intrinsic {quoted(key)}, which is not in the file")
+        values = parse.table(where, pose.get("value"))
+        rotation = parse.numbers(where, values.get("rotation"), 3, 3)
+        centre = parse.numbers(where, values.get("center"), 3)
+        cam = parse.rigid(where, rotation, -rotation @ centre)
         if (photo := found.photo(photos, name)) is None:
             continue
         found.add(photos, photo, lenses[key], cam)
-    xyz = [
-        numbers(f"{path}: structure", table(path, point.get("value")).get("X"), 3)
-        for point in objects(f"{path}: structure", scene.get("structure") or [])
-    ]
+    points = parse.objects(f"{path}: structure", scene.get("structure") or [])
+    rows = [(parse.table(path, point.get("value")).get("X"), [128] * 3) for point in points]
     if found.images:  # the points of the file have no colours
         points_beside(path.parent, found)
-    if xyz and found.points is None:
-        found.points = usable_points(path, np.stack(xyz), np.full((len(xyz), 3), 128))
+    if found.points is None:
+        found.add_points(path, f"{path}: structure", rows)
     return found
 
 
 def _data(where: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     """The object behind a pointer of the library that writes the file."""
-    return table(
-        where, table(where, table(where, entry.get("value")).get("ptr_wrapper")).get("data")
+    return parse.table(
+        where,
+        parse.table(where, parse.table(where, entry.get("value")).get("ptr_wrapper")).get("data"),
     )
 
 
 def _lenses(path: Path, scene: dict[str, Any]) -> dict[int, Lens]:
     names: dict[int, str] = {}
     lenses = {}
-    for entry in objects(f"{path}: intrinsics", scene.get("intrinsics")):
+    for entry in parse.objects(f"{path}: intrinsics", scene.get("intrinsics")):
         where = f"{path}: intrinsic {quoted(entry.get('key'))}"
-        value = table(where, entry.get("value"))
+        value = parse.table(where, entry.get("value"))
         identifier = value.get("polymorphic_id")
         if not isinstance(identifier, int) or not isinstance(entry.get("key"), int):
-            raise damaged_export(where, "has no identifier")
+            raise parse.damaged(where, "has no identifier")
         # Only the first camera of a kind has the name of the kind.
         if isinstance(value.get("polymorphic_name"), str):
             names[identifier & _NAMED] = value["polymorphic_name"]
@@ -118,13 +106,13 @@ def _lens(where: str, kind: str, data: dict[str, Any]) -> Lens:
     # Some versions nest the fields of the base class.
     while isinstance(data.get("value0"), dict):
         data = {**data["value0"], **{key: v for key, v in data.items() if key != "value0"}}
-    width, height = number(where, data, "width"), number(where, data, "height")
+    width, height = parse.number(where, data, "width"), parse.number(where, data, "height")
     if kind == "spherical":
         return equirectangular(where, width, height)
-    focal = number(where, data, "focal_length")
-    cx, cy = numbers(where, data.get("principal_point"), 2) + 0.5
+    focal = parse.number(where, data, "focal_length")
+    cx, cy = parse.numbers(where, data.get("principal_point"), 2) + 0.5
     name, count = _DISTORTION[kind]
-    k = numbers(where, data.get(name), count).tolist() if count else []
+    k = parse.numbers(where, data.get(name), count).tolist() if count else []
     intrinsics = (focal, focal, float(cx), float(cy))
     if kind == "fisheye":
         return fisheye(where, width, height, intrinsics, k)

@@ -12,20 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.data.dataset import usable_points
 from snowsplat.data.lens.lens import Lens
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import equirectangular, fisheye, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import (
-    damaged_export,
-    head_of,
-    load_json,
-    number,
-    numbers,
-    objects,
-    rigid,
-    table,
-)
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -42,16 +32,16 @@ def is_opensfm(path: Path) -> bool:
     """Whether a file starts like one of OpenSfM."""
     if path.suffix.lower() != ".json":
         return False
-    head = head_of(path, 1 << 16).lstrip(b"\xef\xbb\xbf \t\r\n")
+    head = parse.head_of(path, 1 << 16).lstrip(b"\xef\xbb\xbf \t\r\n")
     return head[:1] == b"[" and any(key in head for key in (b'"cameras"', b'"shots"'))
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras and points of the largest reconstruction."""
-    scenes = list(objects(path, load_json(path)))
-    shots = [table(f"{path}: shots", scene.get("shots")) for scene in scenes]
+    scenes = list(parse.objects(path, parse.load_json(path)))
+    shots = [parse.table(f"{path}: shots", scene.get("shots")) for scene in scenes]
     if not scenes:
-        raise damaged_export(path, "has no reconstruction")
+        raise parse.damaged(path, "has no reconstruction")
     largest = max(range(len(scenes)), key=lambda i: len(shots[i]))
     if len(scenes) > 1:
         logger.warning(
@@ -60,33 +50,28 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             len(scenes),
             len(shots[largest]),
         )
-    cameras = table(f"{path}: cameras", scenes[largest].get("cameras"))
+    cameras = parse.table(f"{path}: cameras", scenes[largest].get("cameras"))
     lenses: dict[str, Lens] = {}
     found = Reconstruction(total=len(shots[largest]))
     for name, entry in shots[largest].items():
         where = f"{path}: shot {quoted(name)}"
-        shot = table(where, entry)
+        shot = parse.table(where, entry)
         key = shot.get("camera")
         if not isinstance(key, str) or key not in cameras:
-            raise damaged_export(where, f"has the camera {quoted(key)}, which is not in the file")
+            raise parse.damaged(where, f"has the camera {quoted(key)}, which is not in the file")
         if (photo := found.photo(photos, name)) is None:
             continue
         if key not in lenses:
-            lenses[key] = _lens(f"{path}: camera {quoted(key)}", table(where, cameras[key]))
-        rotation = _rotation(numbers(where, shot.get("rotation"), 3))
-        pose = rigid(where, rotation, numbers(where, shot.get("translation"), 3))
+            lenses[key] = _lens(f"{path}: camera {quoted(key)}", parse.table(where, cameras[key]))
+        rotation = _rotation(parse.numbers(where, shot.get("rotation"), 3))
+        pose = parse.rigid(where, rotation, parse.numbers(where, shot.get("translation"), 3))
         found.add(photos, photo, lenses[key], pose)
-    _read_points(path, table(f"{path}: points", scenes[largest].get("points") or {}), found)
+    where = f"{path}: points"
+    entries = parse.table(where, scenes[largest].get("points") or {}).values()
+    points = (parse.table(where, entry) for entry in entries)
+    rows = ((point.get("coordinates"), point.get("color", [128.0] * 3)) for point in points)
+    found.add_points(path, where, rows)
     return found
-
-
-def _read_points(path: Path, entries: dict[str, Any], found: Reconstruction) -> None:
-    points = [table(f"{path}: points", entry) for entry in entries.values()]
-    if points:
-        where = f"{path}: points"
-        xyz = np.stack([numbers(where, point.get("coordinates"), 3) for point in points])
-        rgb = [numbers(where, point.get("color", [128.0] * 3), 3) for point in points]
-        found.points = usable_points(path, xyz, np.clip(np.stack(rgb), 0, 255))
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
@@ -101,7 +86,7 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
 
 def _lens(where: str, camera: dict[str, Any]) -> Lens:
     kind = camera.get("projection_type", "perspective")
-    width, height = number(where, camera, "width"), number(where, camera, "height")
+    width, height = parse.number(where, camera, "width"), parse.number(where, camera, "height")
     if kind in _SPHERICAL:
         return equirectangular(where, width, height)
     if kind not in _PERSPECTIVE + _FISHEYE:
@@ -113,10 +98,10 @@ def _lens(where: str, camera: dict[str, Any]) -> Lens:
         )
 
     def value(key: str, default: float | None = 0.0) -> float:
-        return number(where, camera, key, default)
+        return parse.number(where, camera, key, default)
 
     unit = max(width, height)
-    focal = number(where, camera, "focal_x" if "focal_x" in camera else "focal")
+    focal = parse.number(where, camera, "focal_x" if "focal_x" in camera else "focal")
     intrinsics = (
         unit * focal,
         unit * value("focal_y", focal),

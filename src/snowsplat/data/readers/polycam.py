@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.photos.decode import read_header
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import from_opengl, load_json, number, table
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
 
@@ -31,7 +31,7 @@ def is_polycam(cameras: Path) -> bool:
     images = cameras.parent / dict(_PAIRS).get(cameras.name, "")
     first = min(cameras.glob("*.json"), default=None) if images.is_dir() else None
     try:
-        values = load_json(first) if first else None
+        values = parse.load_json(first) if first else None
     except UserError:
         return False
     return isinstance(values, dict) and "fx" in values and "t_23" in values
@@ -59,17 +59,15 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         found.total += 1
         if (photo := found.photo(photos, f"{prefix}/{images}/{file.stem}")) is None:
             continue
-        values = table(file, load_json(file))
-        fx, fy, cx, cy = (number(file, values, key) for key in ("fx", "fy", "cx", "cy"))
+        values = parse.table(file, parse.load_json(file))
+        fx, fy, cx, cy = (parse.number(file, values, key) for key in ("fx", "fy", "cx", "cy"))
         if "width" not in values:  # as in corrected cameras since 2025
             header = read_header(photos.root / photo)
             values |= {"width": header.width, "height": header.height}
-        width, height = number(file, values, "width"), number(file, values, "height")
+        width, height = parse.number(file, values, "width"), parse.number(file, values, "height")
         lens = perspective(file, width, height, (fx, fy, cx, cy))
-        entries = [
-            number(file, values, f"t_{row}{column}") for row in range(3) for column in range(4)
-        ]
-        pose = from_opengl(file, np.reshape(entries, (3, 4)))
+        entries = [parse.number(file, values, f"t_{i // 4}{i % 4}") for i in range(12)]
+        pose = parse.from_opengl(file, np.reshape(entries, (3, 4)))
         depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
         confidence = keyframes / "confidence" / f"{file.stem}.png"
         found.add(
@@ -77,9 +75,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             photo,
             lens,
             pose,
-            depth,
-            _MILLIMETRE,
-            confidence if is_file(confidence) else None,
+            depth=depth,
+            depth_unit=_MILLIMETRE,
+            depth_confidence=confidence if is_file(confidence) else None,
         )
     return found
 

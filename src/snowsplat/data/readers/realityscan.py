@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data.photos.decode import read_header
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import damaged_export, from_opengl, head_of, load_text, number
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
@@ -35,13 +35,13 @@ def is_realityscan(path: Path) -> bool:
     """Whether a file is a table of cameras, with or without all columns that are needed."""
     if path.suffix.lower() != ".csv":
         return False
-    lines = head_of(path).decode("utf-8-sig", "replace").splitlines()
+    lines = parse.head_of(path).decode("utf-8-sig", "replace").splitlines()
     return any(line.startswith("#") and set(_columns(line)) >= _POSITIONS for line in lines[:2])
 
 
 def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     """Read cameras, and the points of a PLY file beside it."""
-    lines = load_text(path).splitlines()
+    lines = parse.load_text(path).splitlines()
     first = next(i for i, line in enumerate(lines) if set(_columns(line)) >= _POSITIONS)
     columns = _columns(lines[first])
     if not set(columns) >= _NEEDED:
@@ -56,10 +56,10 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     try:
         rows = [row for row in csv.reader(lines[first + 1 :]) if row and row[0].strip()]
     except csv.Error as error:
-        raise damaged_export(path, f"not a complete CSV file ({error})") from None
+        raise parse.damaged(path, f"not a complete CSV file ({error})") from None
     for row in rows:
         if len(row) != len(columns):
-            raise damaged_export(path, f"a line has {len(row)} columns instead of {len(columns)}")
+            raise parse.damaged(path, f"a line has {len(row)} columns instead of {len(columns)}")
         values = dict(zip(columns, row, strict=True))
         where = f"{path}: camera {quoted(values['name'])}"
         found.total += 1
@@ -68,17 +68,19 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         header = read_header(photos.root / photo)
         width, height = header.width, header.height
         unit = max(width, height)
-        focal = number(where, values, "f") * unit / 36.0
-        cx = number(where, values, "px", 0.0) * unit + width / 2
-        cy = number(where, values, "py", 0.0) * unit + height / 2
-        radial = [number(where, values, f"k{i}", 0.0) for i in (1, 2, 3, 4)]
-        tangential = number(where, values, "t2", 0.0), number(where, values, "t1", 0.0)
+        focal = parse.number(where, values, "f") * unit / 36.0
+        cx = parse.number(where, values, "px", 0.0) * unit + width / 2
+        cy = parse.number(where, values, "py", 0.0) * unit + height / 2
+        radial = [parse.number(where, values, f"k{i}", 0.0) for i in (1, 2, 3, 4)]
+        tangential = parse.number(where, values, "t2", 0.0), parse.number(where, values, "t1", 0.0)
         lens = perspective(where, width, height, (focal, focal, cx, cy), radial, tangential)
         division &= radial[0] != 0 and not any((*radial[1:], *tangential))
-        position = [number(where, values, key) for key in ("x", "y", "alt")]
-        angles = [math.radians(number(where, values, k)) for k in ("heading", "pitch", "roll")]
+        position = [parse.number(where, values, key) for key in ("x", "y", "alt")]
+        angles = [
+            math.radians(parse.number(where, values, k)) for k in ("heading", "pitch", "roll")
+        ]
         pose = np.column_stack([_rotation(*angles), position])
-        found.add(photos, photo, lens, from_opengl(where, pose))
+        found.add(photos, photo, lens, parse.from_opengl(where, pose))
     _warn(path, found, division)
     points_beside(path.parent, found)
     return found

@@ -4,18 +4,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
 
-from snowsplat.data.dataset import Points, PosedImage, safe_name
+from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.listing import fold_name
 from snowsplat.data.files.photo_files import photos_below, warn_of_missing
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
+from snowsplat.data.readers import parse
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.safe_json import is_file, quoted
@@ -150,24 +152,21 @@ class Reconstruction:
         return photo
 
     def add(
-        self,
-        photos: PhotoFolder,
-        photo: str,
-        lens: Lens,
-        cam_from_world: np.ndarray,
-        depth: Path | None = None,
-        depth_unit: float = 1.0,
-        depth_confidence: Path | None = None,
+        self, photos: PhotoFolder, photo: str, lens: Lens, cam_from_world: np.ndarray, **maps: Any
     ) -> None:
-        """Add a photo, by its file relative to the root of ``photos``, and its pose (3, 4) float64
-        in OpenCV axes; see `PosedImage`."""
-        camera = Camera(
-            lens.width, lens.height, *lens.intrinsics, torch.from_numpy(cam_from_world.copy())
-        )
-        image = PosedImage.below(photos.root, photo, camera, lens)
-        self.images.append(
-            replace(image, depth=depth, depth_unit=depth_unit, depth_confidence=depth_confidence)
-        )
+        """Add a photo, by its file relative to the root of ``photos``, with its pose (3, 4) float64
+        in OpenCV axes. ``maps``: those of `PosedImage`."""
+        pose = torch.from_numpy(cam_from_world.copy())
+        camera = Camera(lens.width, lens.height, *lens.intrinsics, pose)
+        self.images.append(replace(PosedImage.below(photos.root, photo, camera, lens), **maps))
+
+    def add_points(self, path: Path, where: str, rows: Iterable[Sequence[Any]]) -> None:
+        """Take the points of the file ``path``: positions and colours in 0..255, from lists of
+        numbers. ``where``: the start of error messages."""
+        points = [[parse.numbers(where, values, 3) for values in row] for row in rows]
+        if points:
+            xyz, rgb = map(np.stack, zip(*points, strict=True))
+            self.points = usable_points(path, xyz, np.clip(rgb, 0, 255))
 
 
 @dataclass(frozen=True)

@@ -17,17 +17,9 @@ import torch
 
 from snowsplat.data.maps.map_file import MAP_SUFFIXES
 from snowsplat.data.photos.decode import is_photo
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import Intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.data.readers.values import (
-    damaged_export,
-    from_opengl,
-    head_of,
-    load_json,
-    number,
-    numbers,
-    table,
-)
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import is_file
@@ -47,7 +39,7 @@ def is_record3d(path: Path) -> bool:
         return True
     if path.name not in ("metadata.json", "metadata") or not is_file(path):
         return False
-    head = head_of(path, 1 << 24)
+    head = parse.head_of(path, 1 << 24)
     return b'"poses"' in head and b'"K"' in head
 
 
@@ -65,11 +57,11 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             "and use the folder",
             path=path,
         )
-    values = table(path, load_json(path))
+    values = parse.table(path, parse.load_json(path))
     poses = values.get("poses")
     if not isinstance(poses, list):
-        raise damaged_export(path, "has no list of poses")
-    width, height = number(path, values, "w"), number(path, values, "h")
+        raise parse.damaged(path, "has no list of poses")
+    width, height = parse.number(path, values, "w"), parse.number(path, values, "h")
     frames = values.get("perFrameIntrinsicCoeffs")
     own = frames if isinstance(frames, list) and len(frames) == len(poses) else None
     intrinsics = _intrinsics(path, values)
@@ -83,20 +75,20 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if file is None:
             found.missing.append(f"{images.name}/{index}.jpg")
             continue
-        pose = numbers(where, entry, 7)
+        pose = parse.numbers(where, entry, 7)
         if not 0.5 < np.linalg.norm(pose[:4]) < 2.0:
-            raise damaged_export(where, "the quaternion has no direction")
+            raise parse.damaged(where, "the quaternion has no direction")
         if own is not None:
-            fx, fy, cx, cy = numbers(where, own[index], 4).tolist()
+            fx, fy, cx, cy = parse.numbers(where, own[index], 4).tolist()
             intrinsics = (fx, fy, cx, cy)
         lens = perspective(where, width, height, intrinsics)
         rotation = rotation_from_quat(torch.from_numpy(pose[[3, 0, 1, 2]])).numpy()
-        cam = from_opengl(where, np.column_stack([rotation, pose[4:]]))
+        cam = parse.from_opengl(where, np.column_stack([rotation, pose[4:]]))
         names = (path.parent / "depth" / f"{file.stem}{suffix}" for suffix in MAP_SUFFIXES)
         depth = next((name for name in names if is_file(name)), None)
         compressed |= depth is None and is_file(file.with_suffix(".depth"))
         photo = file.relative_to(photos.root).as_posix()
-        found.add(photos, photo, lens, cam, depth)
+        found.add(photos, photo, lens, cam, depth=depth)
     if compressed:
         logger.warning(
             "%s: the depth maps are compressed (LZFSE), which is not supported; not used; export "
@@ -129,7 +121,7 @@ def _frames(path: Path, images: Path, count: int) -> dict[int, Path]:
 
 def _intrinsics(path: Path, values: dict[str, Any]) -> Intrinsics:
     """fx, fy, cx, cy from K, which is stored by columns; some converters store it by rows."""
-    k = numbers(f"{path}: K", values.get("K"), 9).reshape(3, 3).T
+    k = parse.numbers(f"{path}: K", values.get("K"), 9).reshape(3, 3).T
     k = k.T if k[2, 0] or k[2, 1] else k
     return float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
 

@@ -34,9 +34,9 @@ from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, warn_of_missing
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.data.points_ply import read_points as read_points_ply
+from snowsplat.data.readers import parse
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
 from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_of
-from snowsplat.data.readers.values import load_json
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
@@ -188,7 +188,7 @@ def _posed_image(
 
 
 def _read_json(path: Path) -> _Json:
-    scene = load_json(path, _JSON_RATIO)
+    scene = parse.load_json(path, _JSON_RATIO)
     if not isinstance(scene, dict) or not isinstance(scene.get("frames"), list):
         raise UserError(
             "{path}: has no list of frames, so it does not describe a dataset", path=path

@@ -27,7 +27,7 @@ _MOST = 1e15
 _MOST_SIDE = 1_000_000
 
 
-def damaged_export(where: object, problem: str) -> UserError:
+def damaged(where: object, problem: str) -> UserError:
     """The error for a file that does not follow its format."""
     return UserError("{where}: {problem}; export the file again", where=where, problem=problem)
 
@@ -88,7 +88,7 @@ def load_xml(path: Path) -> Element:
         parser.Parse(data, True)
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:
-        raise damaged_export(path, f"not a complete XML file ({quoted(error)})") from None
+        raise damaged(path, f"not a complete XML file ({quoted(error)})") from None
 
 
 def head_of(path: Path, size: int = 1 << 12) -> bytes:
@@ -111,7 +111,7 @@ def numbers(where: object, value: Any, *shape: int) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not (np.abs(array) < _MOST).all():
-        raise damaged_export(where, f"should be {math.prod(shape)} numbers, not {quoted(value)}")
+        raise damaged(where, f"should be {math.prod(shape)} numbers, not {quoted(value)}")
     return array
 
 
@@ -129,28 +129,28 @@ def number(
     except (TypeError, ValueError, OverflowError):
         result = math.nan
     if not abs(result) < _MOST:
-        raise damaged_export(where, f"{key} should be a number, not {quoted(value)}")
+        raise damaged(where, f"{key} should be a number, not {quoted(value)}")
     return result
 
 
 def size_of(where: object, width: float, height: float) -> tuple[int, int]:
     """Width and height in pixels; raises `UserError` if they are not plausible."""
     if not (1 <= width <= _MOST_SIDE and 1 <= height <= _MOST_SIDE):
-        raise damaged_export(where, f"the image size {width:g}x{height:g} is not valid")
+        raise damaged(where, f"the image size {width:g}x{height:g} is not valid")
     return round(width), round(height)
 
 
 def objects(where: object, value: Any) -> Iterator[dict[str, Any]]:
     """The objects of a JSON list; raises `UserError` if it is not a list of objects."""
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
-        raise damaged_export(where, "should be a list of objects")
+        raise damaged(where, "should be a list of objects")
     return iter(value)
 
 
 def table(where: object, value: Any) -> dict[str, Any]:
     """A JSON object; raises `UserError` for other values."""
     if not isinstance(value, dict):
-        raise damaged_export(where, f"should be an object, not {quoted(value)}")
+        raise damaged(where, f"should be an object, not {quoted(value)}")
     return value
 
 
@@ -165,7 +165,7 @@ def rigid(where: object, rotation: np.ndarray, translation: np.ndarray) -> np.nd
     u, _, vt = np.linalg.svd(rotation)
     nearest = u @ vt
     if np.abs(nearest - rotation).max() > 1e-2 or np.linalg.det(nearest) < 0:
-        raise damaged_export(where, "the rotation of the camera is not a rotation")
+        raise damaged(where, "the rotation of the camera is not a rotation")
     return np.column_stack([nearest, translation])
 
 
