@@ -19,8 +19,8 @@ from babel.messages.pofile import read_po, write_po
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "snowsplat"
 LANGUAGE = "zh"
 # The calls whose first text is a message. For others: the positions of the texts.
-_ERRORS = ("UserError", "InUse", "Diverged", "OtherScene", "ProcessLost", "NoPosesError", "NoSpace")
-_CALLS = ("message", "needed", "warning", "info", *_ERRORS, "UnknownScene")
+_ERRORS = ("UserError", "Problem", "InUse", "Diverged", "OtherScene", "ProcessLost", "NoPosesError")
+_CALLS = ("message", "needed", "warning", "info", *_ERRORS, "NoSpace", "UnknownScene")
 KEYWORDS = dict.fromkeys(_CALLS) | {"plural": (1, 2), "SettingError": (2,), "_InUse": (2,)}
 
 Key = str | tuple[str, str]

@@ -9,8 +9,9 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from snowsplat.cli.command import Command
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.flags import Flag, flags_of
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import from_json, printable, read_json
 from snowsplat.util.settings import kinds_of, setting, suggestion
 
@@ -53,9 +54,9 @@ def with_file(command: type[Command], given: Mapping[str, Any]) -> dict[str, Any
         flag = flags.get(spelling)
         if flag is None or flag.key == KEY:
             names = [name[2:] for name in flags if name.startswith("--")]
-            advice = suggestion(spelling[2:], names) or "; remove it"
+            advice = suggestion(spelling[2:], names) or message("remove it")
             raise UserError(
-                "{file}: {name}: unknown{advice}", file=file, name=printable(key), advice=advice
+                "{file}: {name}: unknown; {advice}", file=file, name=printable(key), advice=advice
             )
         if flag.key in values or value is None:
             continue
@@ -117,11 +118,11 @@ def _value(flag: Flag, value: Any) -> Any:
     """
     if flag.type is bool:
         if not isinstance(value, bool):
-            raise ValueError("use true or false")
+            raise Problem("use true or false")
         return value or None
     values = value if isinstance(value, list) else [value]
     if any(isinstance(each, dict | list) for each in values):
-        raise ValueError("a table is no value of a flag")
+        raise Problem("a table is no value of a flag")
     kinds = [kind for kind in kinds_of(flag.type) if kind is not NoneType]
     if get_origin(kinds[0]) is tuple:
         return tuple(_item(each, [get_args(kinds[0])[0]]) for each in values)

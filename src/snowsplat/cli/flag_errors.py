@@ -18,18 +18,18 @@ from snowsplat.cli.command import Command
 from snowsplat.cli.subcommands import SUBCOMMANDS
 from snowsplat.training.settings.recipes import RECIPES
 from snowsplat.util.flags import flags_of
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import printable
-from snowsplat.util.settings import allowed, kinds_of, shown
-from snowsplat.util.settings import suggestion as similar
+from snowsplat.util.settings import allowed, kinds_of, shown, suggestion
 
 _FLAG = re.compile(r"-[^\d.]")
 _FRAME = "│|╭╮╰╯─┌┐└┘+-= "
 
 
-def explained(command: type[Command], arguments: Sequence[str], message: str) -> str:
+def explained(command: type[Command], arguments: Sequence[str], printed: str) -> Message:
     """Why the arguments of a subcommand are invalid, on one line.
 
-    ``message``: what tyro has printed; it is used if the arguments do not show the reason.
+    ``printed``: what tyro has printed; it is used if the arguments do not show the reason.
     """
     flags, subcommand = spellings(command), command.__name__.lower()
     names = [each.partition("=")[0] for each in arguments if _FLAG.match(each)]
@@ -39,16 +39,17 @@ def explained(command: type[Command], arguments: Sequence[str], message: str) ->
         for name, spelling in unknown.items()
         if spelling not in flags
     }
-    if told := [f"{printable(name)}: {use}" for name, use in advised.items() if use]:
-        return "; ".join(told)
+    for name, use in advised.items():
+        if use:
+            return message("{name}: {use}", name=printable(name), use=use)
     for number, argument in enumerate(arguments):
         if not _FLAG.match(argument):
             continue
         name, given, value = argument.partition("=")
         spelling = name.replace("_", "-")
         if spelling not in flags:
-            advice = similar(spelling, list(flags)) or "; leave it out"
-            return f"{printable(name)}: unknown flag{advice}"
+            advice = suggestion(spelling, list(flags)) or message("leave it out")
+            return message("{name}: unknown flag; {advice}", name=printable(name), advice=advice)
         hint, valid = flags[spelling]
         kinds = [each for each in kinds_of(hint) if each is not NoneType]
         if kinds == [bool]:
@@ -57,26 +58,33 @@ def explained(command: type[Command], arguments: Sequence[str], message: str) ->
         if get_origin(kinds[0]) is tuple:
             kinds = [get_args(kinds[0])[0]]
         elif not texts:
-            return f"{spelling}: needs a value; use {valid}"
+            return message("{flag}: needs a value; use {allowed}", flag=spelling, allowed=valid)
         else:
             texts = texts[:1]
         for text in texts:
             if not any(_is_of(text, each) for each in kinds):
-                return f"{spelling}: {shown(text)} is not valid; use {valid}"
-    if extra := re.search(r"Unrecognized options: (.*)", message):
+                return message(
+                    "{flag}: {value} is not valid; use {allowed}",
+                    flag=spelling,
+                    value=shown(text),
+                    allowed=valid,
+                )
+    if extra := re.search(r"Unrecognized options: (.*)", printed):
         usage = SUBCOMMANDS[subcommand].usage
-        what = f"{printable(extra[1].strip(_FRAME))}: too many names"
-        recipe = next((each for each in arguments if each in RECIPES), None)
-        advice = f"; use --recipe {recipe}" if recipe else ""
-        return f"{what}{advice}; snowsplat {subcommand} {usage}"
-    lines = [line.strip(_FRAME) for line in message.splitlines()[1:]]
+        names = printable(extra[1].strip(_FRAME))
+        what = message("{names}: too many names", names=names)
+        if recipe := next((each for each in arguments if each in RECIPES), None):
+            what = message("{what}; use --recipe {recipe}", what=what, recipe=recipe)
+        return Message(f"{what}; snowsplat {subcommand} {usage}")
+    lines = [line.strip(_FRAME) for line in printed.splitlines()[1:]]
     end = lines.index("") if "" in lines else len(lines)
-    return " ".join(lines[:end]).rstrip(".") or "invalid flags"
+    of_parser = " ".join(lines[:end]).rstrip(".")
+    return Message(of_parser) if of_parser else message("invalid flags")
 
 
-def spellings(command: type[Command]) -> dict[str, tuple[Any, str]]:
+def spellings(command: type[Command]) -> dict[str, tuple[Any, Message]]:
     """Each spelling of a flag of a subcommand -> the type of its value, and what is allowed."""
-    known: dict[str, tuple[Any, str]] = {"-h": (bool, ""), "--help": (bool, "")}
+    known = dict.fromkeys(("-h", "--help"), (bool, Message("")))
     for flag in flags_of(command):
         # The declaration is that of the setting, the type that of the command line.
         declared = (flag.declared,) if flag.type == flag.hint or flag.declared.parse else ()

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from snowsplat.util.errors import Problem
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.safe_json import from_json, read_json
 
@@ -39,12 +40,14 @@ class Note:
 
     def __post_init__(self) -> None:
         if not 0 < len(self.title) <= _LONGEST_TITLE or len(self.text) > _LONGEST_TEXT:
-            raise ValueError(
-                f"an annotation has a title of 1 to {_LONGEST_TITLE} characters, and a text of "
-                f"at most {_LONGEST_TEXT}"
+            raise Problem(
+                "an annotation has a title of 1 to {longest_title} characters, and a text of at "
+                "most {longest_text}",
+                longest_title=_LONGEST_TITLE,
+                longest_text=_LONGEST_TEXT,
             )
         if not is_view(self.view):
-            raise ValueError("the view of an annotation is none")
+            raise Problem("the view of an annotation is none")
 
 
 @dataclass(frozen=True)
@@ -76,13 +79,13 @@ class EditRecord:
 
     def __post_init__(self) -> None:
         if self.turn is not None and not is_rotation(self.turn):
-            raise ValueError("the rotation is none")
+            raise Problem("the rotation is none")
         if not 0 < self.scale < math.inf:
-            raise ValueError(f"the scale {self.scale} is not positive")
+            raise Problem("the scale {scale} is not positive", scale=self.scale)
         if self.start is not None and not is_view(self.start):
-            raise ValueError("the initial view is none")
+            raise Problem("the initial view is none")
         if len(self.notes) > MOST_NOTES:
-            raise ValueError(f"a scene has at most {MOST_NOTES} annotations")
+            raise Problem("a scene has at most {most_notes} annotations", most_notes=MOST_NOTES)
 
 
 @dataclass(frozen=True)
@@ -120,18 +123,22 @@ class PageEdit:
         # This checks these values.
         EditRecord("", 0, self.scale, self.title, self.start, self.notes or (), self.turn)
         if self.hidden is not None and not min(self.hidden[3:]) > 0:
-            raise ValueError("the sliders hide everything")
+            raise Problem("the sliders hide everything")
         if not 1e-9 < self.scale < 1e9:
-            raise ValueError(f"a scene cannot become {self.scale:g} times as large")
+            raise Problem("a scene cannot become {scale:g} times as large", scale=self.scale)
         if self.count < 1 or len(self.bits()) != -(-self.count // 8):
-            raise ValueError(f"{8 * len(self.bits())} bits are not those of {self.count} Gaussians")
+            raise Problem(
+                "{bits} bits are not those of {count} Gaussians",
+                bits=8 * len(self.bits()),
+                count=self.count,
+            )
 
     def bits(self) -> bytes:
         """Raises ValueError: they are not in base64."""
         try:
             return base64.b64decode(self.removed, validate=True)
         except binascii.Error:
-            raise ValueError("the removed Gaussians are not in base64") from None
+            raise Problem("the removed Gaussians are not in base64") from None
 
 
 def is_view(numbers: list[float]) -> bool:

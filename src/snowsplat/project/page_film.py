@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 from snowsplat.project.edit_record import is_view
+from snowsplat.util.errors import Problem
 
 #: Width and height of the films, in pixels.
 SIZES = ("1920x1080", "1080x1920", "1080x1080")
@@ -44,17 +45,25 @@ class PageFilm:
     def __post_init__(self) -> None:
         least = 3 if self.loop else 2
         if not least <= len(self.keys) <= _MOST_KEYS:
-            raise ValueError(f"a film needs {least} to {_MOST_KEYS} keys")
+            raise Problem(
+                "a film needs {least} to {most_keys} keys", least=least, most_keys=_MOST_KEYS
+            )
         if not all(is_view(key) and all(map(math.isfinite, key)) for key in self.keys):
-            raise ValueError("a key is no view")
+            raise Problem("a key is no view")
         if self.speeds and len(self.speeds) != len(self.keys):
-            raise ValueError(f"{len(self.speeds)} speeds are not those of {len(self.keys)} keys")
+            raise Problem(
+                "{speeds} speeds are not those of {keys} keys",
+                speeds=len(self.speeds),
+                keys=len(self.keys),
+            )
         if not all(_SLOWEST <= speed <= _FASTEST for speed in self.speeds):
-            raise ValueError(f"the speeds are from {_SLOWEST:g} to {_FASTEST:g}")
+            raise Problem(
+                "the speeds are from {slowest:g} to {fastest:g}", slowest=_SLOWEST, fastest=_FASTEST
+            )
         if not 0 < self.seconds <= _LONGEST:
-            raise ValueError(f"a film has at most {_LONGEST:g} seconds")
+            raise Problem("a film has at most {longest:g} seconds", longest=_LONGEST)
         if self.size not in SIZES:
-            raise ValueError(f"the sizes are {', '.join(SIZES)}")
+            raise Problem("the sizes are {sizes}", sizes=", ".join(SIZES))
 
     def pixels(self) -> tuple[int, int]:
         """Width and height."""

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import re
 
+from snowsplat.util.errors import Problem
+
 #: What is written after a number, in metres.
 UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 _LENGTH = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*([a-z]+)", re.IGNORECASE)
@@ -27,7 +29,11 @@ def metres_of(text: str) -> float:
     metres = float(found[1]) * unit if found and unit else 0.0
     if not _LEAST < metres < _MOST:
         known = ", ".join(UNITS)
-        raise ValueError(f"{text!r} is not a length; use a number with its unit ({known}): 0.45m")
+        raise Problem(
+            "{text!r} is not a length; use a number with its unit ({known}): 0.45m",
+            text=text,
+            known=known,
+        )
     return metres
 
 

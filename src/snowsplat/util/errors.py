@@ -52,3 +52,18 @@ class SettingError(UserError):
         self.problem = message(problem, **values) if isinstance(problem, str) else problem
         super().__init__(message("{setting}: {problem}", setting=setting, problem=self.problem))
         self.args = (setting, self.problem)  # by which pickle makes the error again
+
+
+class Problem(ValueError):
+    """What is wrong with a value, a file or a part of one; who catches it says with which.
+
+    Attributes:
+        message: see `UserError`.
+    """
+
+    def __init__(self, key: str | Message, /, **values: Any) -> None:
+        self.message = message(key, **values) if isinstance(key, str) else key
+        super().__init__(self.message)
+
+    def __str__(self) -> str:
+        return str(self.message)

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from snowsplat.util.errors import Problem
 from snowsplat.util.messages import Message
 
 _Kind = TypeVar("_Kind")
@@ -42,7 +43,7 @@ def read_json(path: Path, ratio: int = _RATIO) -> Any:
         ValueError: see `parse_json`; or ``path`` is a pipe or a device.
     """
     if path.exists() and not path.is_file():  # reading a pipe may never end
-        raise ValueError("not a file")
+        raise Problem("not a file")
     return parse_json(path.read_bytes(), ratio)
 
 
@@ -58,18 +59,18 @@ def parse_json(data: bytes, ratio: int = _RATIO) -> Any:
     """
     needed = sum(data.count(sign) * size for sign, size in _BYTES_OF.items())
     if needed > _ALWAYS_ALLOWED + ratio * len(data):
-        raise ValueError("too many values")
+        raise Problem("too many values")
     try:
         value = json.loads(data.decode("utf-8-sig"))
     except RecursionError:
-        raise ValueError("nested too deeply") from None
+        raise Problem("nested too deeply") from None
     level = [value] if isinstance(value, dict | list) else []
     for _ in range(_MAX_DEPTH):
         inner = (each.values() if isinstance(each, dict) else each for each in level)
         level = [value for values in inner for value in values if isinstance(value, dict | list)]
         if not level:
             return value
-    raise ValueError("nested too deeply")
+    raise Problem("nested too deeply")
 
 
 def check_header(path: Path) -> None:
@@ -82,11 +83,11 @@ def check_header(path: Path) -> None:
         ValueError: the header is too large, or ``path`` is a pipe or a device.
     """
     if path.exists() and not path.is_file():
-        raise ValueError("not a file")
+        raise Problem("not a file")
     with open(path, "rb") as file:
         size = int.from_bytes(file.read(8), "little")
     if size > _MAX_HEADER:
-        raise ValueError("too many tensors")
+        raise Problem("too many tensors")
 
 
 def is_file(path: Path) -> bool:
@@ -135,17 +136,16 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
         ValueError: a value has another type or is not finite, or a field is unknown or missing.
     """
     if not isinstance(values, dict):
-        raise ValueError(f"not a {kind.__name__}")
+        raise Problem("not a {kind}", kind=kind.__name__)
     hints = _hints(kind)  # type: ignore[arg-type]
     known = {field.name for field in fields(kind) if field.init}  # type: ignore[arg-type]
     if not values.keys() <= known:
-        raise ValueError(
-            f"unknown field of {kind.__name__}: {quoted(sorted(values.keys() - known)[0])}"
-        )
+        unknown = quoted(sorted(values.keys() - known)[0])
+        raise Problem("unknown field of {kind}: {name}", kind=kind.__name__, name=unknown)
     try:
         return kind(**{name: _as(hints[name], value) for name, value in values.items()})
     except TypeError as error:  # a field is missing
-        raise ValueError(str(error)) from None
+        raise Problem(str(error)) from None
 
 
 @functools.cache
@@ -186,4 +186,5 @@ def _as(hint: Any, value: Any) -> Any:
         return from_json(hint, value)
     elif isinstance(hint, type) and type(value) is hint:
         return value
-    raise ValueError(f"{quoted(value)} is not of type {getattr(hint, '__name__', hint)}")
+    kind = getattr(hint, "__name__", hint)
+    raise Problem("{value} is not of type {kind}", value=quoted(value), kind=kind)

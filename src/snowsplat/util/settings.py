@@ -31,8 +31,8 @@ from typing import (
     get_type_hints,
 )
 
-from snowsplat.util.errors import SettingError
-from snowsplat.util.messages import Message
+from snowsplat.util.errors import Problem, SettingError
+from snowsplat.util.messages import Message, as_message, message
 from snowsplat.util.safe_json import printable
 
 #: A moment of the training: a step (int), or a fraction of all steps (float).
@@ -60,7 +60,7 @@ class Setting:
     # What is valid, if the limits cannot say it, for a message: "use <allowed>".
     allowed: str | None = None
     # Called with a value of the declared type; returns what is wrong with it, or None.
-    check: Callable[[Any], str | None] | None = None
+    check: Callable[[Any], Message | str | None] | None = None
     # The placeholder of the value of the flag; "": a flag without a value; None: there is no flag.
     metavar: str | None = None
     aliases: tuple[str, ...] = ()  # other spellings of the flag
@@ -184,13 +184,13 @@ def checked(name: str, value: Any, hint: Any, declared: Setting = _UNDECLARED) -
         value = _typed(value, hint, declared)
         problem = declared.check(value) if declared.check and value is not None else None
     except ValueError as error:
-        problem = str(error)
+        problem = as_message(error)
     if problem is None:
         return value
-    advice = "" if "; " in problem else f"; use {allowed(hint, declared)}"
-    raise SettingError(
-        name, "{value} {problem}{advice}", value=shown(value), problem=problem, advice=advice
-    )
+    wrong = message("{value} {problem}", value=shown(value), problem=as_message(problem))
+    if "; " in str(problem):
+        raise SettingError(name, wrong)
+    raise SettingError(name, "{wrong}; use {allowed}", wrong=wrong, allowed=allowed(hint, declared))
 
 
 def shown(value: Any) -> str:
@@ -198,49 +198,68 @@ def shown(value: Any) -> str:
     return printable(" ".join(repr(value).split()))[:80]
 
 
-def suggestion(name: str, known: Sequence[str]) -> str:
-    """``"; did you mean NAME?"``, or an empty text if no known name is similar."""
+def suggestion(name: str, known: Sequence[str]) -> Message | None:
+    """``"did you mean NAME?"``, or None if no known name is similar."""
     similar = get_close_matches(name, known, 1)
-    return f"; did you mean {similar[0]}?" if similar else ""
+    return message("did you mean {name}?", name=similar[0]) if similar else None
 
 
-def allowed(hint: Any, declared: Setting = _UNDECLARED) -> str:
+def allowed(hint: Any, declared: Setting = _UNDECLARED) -> Message:
     """The valid values, in words: "a number from 0 to 1"."""
     if declared.allowed:
-        return declared.allowed
+        return as_message(declared.allowed)
     kinds = [kind for kind in kinds_of(hint) if kind is not NoneType]
     if int in kinds and float in kinds:
-        least = "above 0" if declared.above is not None else "0 or more"
-        most = declared.largest_fraction
-        fraction = "0.5" if math.isinf(most) else f"0.5, at most {most:.1f}"
-        return f"a whole number, {least}, or a fraction such as {fraction}"
-    return " or ".join(_words(kind, declared) for kind in kinds)
+        least = message("0 or more") if declared.above is None else message("above 0")
+        if math.isinf(most := declared.largest_fraction):
+            return message("a whole number, {least}, or a fraction such as 0.5", least=least)
+        return message(
+            "a whole number, {least}, or a fraction such as 0.5, at most {most:.1f}",
+            least=least,
+            most=most,
+        )
+    return _alternatives([_words(kind, declared) for kind in kinds])
 
 
-def _words(kind: Any, declared: Setting) -> str:
+def _alternatives(words: Sequence[Message]) -> Message:
+    *first, last = words
+    return message("{first} or {last}", first=first, last=last) if first else last
+
+
+def _words(kind: Any, declared: Setting) -> Message:
     if get_origin(kind) is Literal:
-        *first, last = map(str, get_args(kind))
-        return f"{', '.join(first)} or {last}" if first else last
+        return _alternatives([Message(str(value)) for value in get_args(kind)])
     if get_origin(kind) in (tuple, list):
-        return f"a list; each item is {allowed(get_args(kind)[0], declared)}"
+        item = allowed(get_args(kind)[0], declared)
+        return message("a list; each item is {item}", item=item)
     if kind is int or kind is float:
-        noun = "a whole number" if kind is int else "a number"
-        return f"{noun}{_limits(declared)}"
-    names = {bool: "True or False", str: "a text", Path: "a path"}
-    return names.get(kind, f"a {getattr(kind, '__name__', kind)}")
-
-
-def _limits(declared: Setting) -> str:
-    if declared.least is not None and declared.most is not None:
-        return f" from {declared.least:g} to {declared.most:g}"
-    words = {
-        "of at least": declared.least,
-        "above": declared.above,
-        "at most": declared.most,
-        "below": declared.below,
+        noun = message("a whole number") if kind is int else message("a number")
+        return message("{noun}{limits}", noun=noun, limits=_limits(declared))
+    names = {
+        bool: message("True or False"),
+        str: message("a text"),
+        Path: message("a path"),
     }
-    limits = " and ".join(f"{word} {n:g}" for word, n in words.items() if n is not None)
-    return f" {limits}" if limits else ""
+    return names.get(kind) or message("a {kind}", kind=getattr(kind, "__name__", kind))
+
+
+def _limits(declared: Setting) -> Message:
+    least, most = declared.least, declared.most
+    if least is not None and most is not None:
+        return message(" from {least:g} to {most:g}", least=least, most=most)
+    limits = []
+    if least is not None:
+        limits.append(message("of at least {limit:g}", limit=least))
+    if declared.above is not None:
+        limits.append(message("above {limit:g}", limit=declared.above))
+    if most is not None:
+        limits.append(message("at most {limit:g}", limit=most))
+    if declared.below is not None:
+        limits.append(message("below {limit:g}", limit=declared.below))
+    if not limits:
+        return Message("")
+    both = message("{one} and {other}", one=limits[0], other=limits[-1])
+    return message(" {limits}", limits=both if len(limits) > 1 else limits[0])
 
 
 def kinds_of(hint: Any) -> tuple[Any, ...]:
@@ -257,31 +276,33 @@ def _item_kinds(hint: Any, count: int) -> list[Any]:
 
 
 def _typed(value: Any, hint: Any, declared: Setting) -> Any:
-    """``value`` with the types of Python; raises ValueError with what is wrong."""
-    problem = "has the wrong type"
+    """``value`` with the types of Python; raises Problem with what is wrong."""
+    problem = Problem("has the wrong type")
     for kind in kinds_of(hint):
         try:
             return _of_kind(value, kind, hint, declared)
         except TypeError:
             continue
-        except ValueError as error:
-            problem = str(error)
-    raise ValueError(problem)
+        except Problem as error:
+            problem = error
+    raise problem
 
 
 def _of_kind(value: Any, kind: Any, hint: Any, declared: Setting) -> Any:
-    """Raises TypeError if the type is another one, ValueError if only the value is wrong."""
+    """Raises TypeError if the type is another one, Problem if only the value is wrong."""
     origin = get_origin(kind)
     if origin is Literal:
         if isinstance(value, str) and value in get_args(kind):
             return value
-        raise ValueError("is unknown")
+        raise Problem("is unknown")
     if origin in (tuple, list):
         if not isinstance(value, list | tuple):
             raise TypeError
         kinds = _item_kinds(kind, len(value))
         if len(kinds) != len(value):
-            raise ValueError(f"has {len(value)} items instead of {len(kinds)}")
+            raise Problem(
+                "has {found} items instead of {count}", found=len(value), count=len(kinds)
+            )
         return origin(_typed(item, each, declared) for item, each in zip(value, kinds, strict=True))
     if kind is int or kind is float:
         return _number(value, kind, hint, declared)
@@ -299,16 +320,16 @@ def _number(value: Any, kind: type, hint: Any, declared: Setting) -> int | float
     if isinstance(value, Integral):
         number: int | float = int(value)
         if abs(number) > _LARGEST:
-            raise ValueError("is too large")
+            raise Problem("is too large")
     else:
         number = float(value)
         if not math.isfinite(number):
-            raise ValueError("is not finite")
+            raise Problem("is not finite")
         if int in kinds_of(hint) and number > declared.largest_fraction:
-            raise ValueError("is too large for a fraction")
+            raise Problem("is too large for a fraction")
     least, most, above, below = declared.least, declared.most, declared.above, declared.below
     if (least is not None and number < least) or (above is not None and number <= above):
-        raise ValueError("is too small")
+        raise Problem("is too small")
     if (most is not None and number > most) or (below is not None and number >= below):
-        raise ValueError("is too large")
+        raise Problem("is too large")
     return number

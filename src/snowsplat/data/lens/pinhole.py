@@ -12,6 +12,7 @@ import numpy as np
 
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.positions import node_grid
+from snowsplat.util.errors import Problem
 
 _CROPPED = 0.95  # of width and height; without blank borders, an image shows more of the photo
 _BORDER_SAMPLES = 513  # positions on each border of a photo, among them the corners and the middle
@@ -52,7 +53,7 @@ def pinhole_of(lens: Lens) -> Pinhole:
                 high = middle
         min_width, min_height = _MIN_FRACTION * lens.width, _MIN_FRACTION * lens.height
         if low == 0 or made.width < min_width or made.height < min_height:
-            raise ValueError("less than a fifth of the width or height can be undistorted")
+            raise Problem("less than a fifth of the width or height can be undistorted")
     nodes = node_grid(made.width, made.height, lambda x, y: _to_photo(lens, made, x, y))
     used = np.ptp(nodes, axis=(0, 1)) / (lens.width, lens.height)
     return replace(made, cropped=bool(used.min() < _CROPPED))

@@ -21,6 +21,7 @@ import numpy as np
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.pinhole import pinhole_of
 from snowsplat.data.lens.positions import Positions, node_grid
+from snowsplat.util.errors import Problem
 
 # Radians: a pinhole image of a wider field has too many pixels near its border.
 _WIDEST = math.radians(120.0)
@@ -175,7 +176,7 @@ def rotated_view(
     focal = _central_scale(lens)
     half_width, half_height = (focal * math.tan(angle) for angle in half_angles)
     if max(half_width, half_height) > 0.5 * _LARGEST * max(lens.width, lens.height):
-        raise ValueError("its pixels are compressed too much near the centre")
+        raise Problem("its pixels are compressed too much near the centre")
     width, height = (max(1, math.ceil(2 * half)) for half in (half_width, half_height))
     rows = tuple(tuple(float(value) for value in row) for row in rotation)
     view = LensView(
@@ -206,7 +207,7 @@ def lens_views(lens: Lens, circle: float | None = None) -> tuple[LensView, ...]:
     Raises: ValueError: the model is valid only in a small part of the photo.
     """
     if not all(map(math.isfinite, lens.params)):
-        raise ValueError("a parameter is not finite")
+        raise Problem("a parameter is not finite")
     field = _field(lens, circle)
     quarter = _DIRECTIONS // 4
     reach = [float(angle) for angle in field.reach[::quarter]]  # right, down, left, up
@@ -279,7 +280,7 @@ def _central_scale(lens: Lens) -> float:
     scales = np.linalg.norm(pixel[::2] - pixel[1::2], axis=1) / (2 * step)
     scale = float(scales.max())
     if not 1.0 <= scale < 1e9:
-        raise ValueError("its focal length is not valid")
+        raise Problem("its focal length is not valid")
     return scale
 
 

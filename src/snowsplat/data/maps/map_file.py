@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.data.photos.image_file import MOST_PIXELS, TOO_LARGE, open_image, reason_of
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.safe_json import is_file
 
 #: Suffixes of the files that `read_map` reads.
@@ -46,7 +46,7 @@ def read_map(path: Path, kind: str, pick: Pick) -> np.ndarray:
             return _read_exr(path, pick)
         with open_image(path, ("PNG", "TIFF")) as image:
             if image.mode == "P":
-                raise ValueError("it has a palette of colours; save the values")
+                raise Problem("it has a palette of colours; save the values")
             return np.asarray(image)
     except UserError:
         raise
@@ -62,7 +62,7 @@ def read_map(path: Path, kind: str, pick: Pick) -> np.ndarray:
 def _read_npy(path: Path) -> np.ndarray:
     values = np.load(path, mmap_mode="r", allow_pickle=False)
     if values.size > 3 * MOST_PIXELS:
-        raise ValueError(TOO_LARGE)
+        raise Problem(TOO_LARGE)
     return np.array(values)
 
 
@@ -78,10 +78,14 @@ def _read_exr(path: Path, pick: Pick) -> np.ndarray:
         box = header.header()["dataWindow"]
         width, height = (int(high - low) + 1 for low, high in zip(*box, strict=True))
         if width * height > MOST_PIXELS:
-            raise ValueError(TOO_LARGE)
+            raise Problem(TOO_LARGE)
     with OpenEXR.File(str(path)) as file:
         channels = file.channels()
         try:
             return np.array(pick({name: channel.pixels for name, channel in channels.items()}))
         except KeyError as error:
-            raise ValueError(f"no channel {error.args[0]}, but {', '.join(channels)}") from None
+            raise Problem(
+                "no channel {args}, but {channels}",
+                args=error.args[0],
+                channels=", ".join(channels),
+            ) from None

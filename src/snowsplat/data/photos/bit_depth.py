@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from snowsplat.data.photos.image_file import open_image
+from snowsplat.util.errors import Problem
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ def eight_bits(image: Image.Image, path: Path) -> Image.Image:
         Exception: anything that Pillow raises for a damaged file.
     """
     if image.mode == "F":
-        raise ValueError("floating-point pixels are not supported")
+        raise Problem("floating-point pixels are not supported")
     if not _is_deep(image):
         return image
     scale = _scale_of(path)

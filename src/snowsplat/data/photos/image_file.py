@@ -9,6 +9,8 @@ from typing import BinaryIO
 
 from PIL import Image, features
 
+from snowsplat.util.errors import Problem
+
 #: Formats that depend on how Pillow was built.
 OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
 #: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
@@ -98,22 +100,23 @@ def _check_header(file: BinaryIO) -> None:
             if len(head) < 8 or head[4:] == b"IEND":
                 return
             file.seek(int.from_bytes(head[:4], "big") + 4, 1)
-        raise ValueError("too many chunks")
+        raise Problem("too many chunks")
     if start.startswith(_JPEG):
         header = start + file.read(_LONGEST_HEADER)
         if len(header) > _LONGEST_HEADER and _SCAN not in _segments(header):
-            raise ValueError("too many bytes before its pixels")
+            raise Problem("too many bytes before its pixels")
 
 
 def _check_size(image: Image.Image) -> None:
     width, height = image.size
     if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
-        raise ValueError(TOO_LARGE)
+        raise Problem(TOO_LARGE)
     # Pillow's decoders in Python take a second per million pixels, and one of them does not check
     # the offsets in the file.
     if any(tile[0] in Image.DECODERS for tile in getattr(image, "tile", ())):
-        raise ValueError(
-            f"an uncommon kind of {image.format}, which is slow to read; save it as PNG"
+        raise Problem(
+            "an uncommon kind of {format}, which is slow to read; save it as PNG",
+            format=image.format,
         )
     if image.format == "TIFF":
         tags = getattr(image, "tag_v2", {})
@@ -121,13 +124,13 @@ def _check_size(image: Image.Image) -> None:
         if not all(isinstance(side, int) for side in sides) or (
             sides[0] * sides[1] > max(_MOST_TILE_PIXELS, width * height)
         ):
-            raise ValueError("has tiles larger than the image")
+            raise Problem("has tiles larger than the image")
 
 
 def _check_scans(image: Image.Image, path: Path) -> None:
     scans = sum(marker == _SCAN for marker in _segments(path.read_bytes()))
     if scans * image.width * image.height > _MOST_SCANNED_PIXELS:
-        raise ValueError(f"too many scans ({scans}) for its size")
+        raise Problem("too many scans ({scans}) for its size", scans=scans)
 
 
 def _segments(data: bytes) -> Iterator[bytes]:
@@ -139,4 +142,4 @@ def _segments(data: bytes) -> Iterator[bytes]:
             return
         yield marker[0]
         at = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
-    raise ValueError("too many segments")
+    raise Problem("too many segments")

@@ -14,7 +14,7 @@ from snowsplat.data.photos.image_file import reason_of
 from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import centred_intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.safe_json import is_file
 
 _COLUMNS = 17
@@ -31,7 +31,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     try:
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
         if stored.ndim != 2 or stored.shape[1] != _COLUMNS or len(stored) > _MOST_ROWS:
-            raise ValueError(f"it has the shape {stored.shape}")
+            raise Problem("it has the shape {shape}", shape=stored.shape)
     except Exception as error:  # numpy raises many kinds
         raise parse.damaged(path, f"not a table of poses ({reason_of(error)})") from None
     rows = parse.numbers(path, stored, len(stored), _COLUMNS)

@@ -11,7 +11,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import reading
 from snowsplat.util.safe_json import quoted, read_json
 
@@ -74,11 +74,11 @@ def load_xml(path: Path) -> Element:
         nonlocal count
         count += 1
         if count > most:
-            raise ValueError("too many elements")
+            raise Problem("too many elements")
         builder.start(tag, attributes)
 
     def refuse(*_: object) -> None:
-        raise ValueError("has a document type")
+        raise Problem("has a document type")
 
     parser.StartElementHandler = start
     parser.EndElementHandler = builder.end

@@ -26,7 +26,7 @@ import torch
 
 from snowsplat.extras.image.model import ANGLE, OPACITY_LOGIT, ImageGaussians, column_count
 from snowsplat.extras.image.options import MOST_GAUSSIANS, Blending
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import atomic_path
 
 SUFFIX = ".gimg"
@@ -78,7 +78,7 @@ def encode(gaussians: ImageGaussians) -> bytes:
     """The content of a compact file. Raises ValueError as `write_compact`."""
     rows = gaussians.rows.detach().cpu().double().numpy().copy()
     if not (len(rows) and np.isfinite(rows).all()):
-        raise ValueError("there are no Gaussians, or a value is not finite")
+        raise Problem("there are no Gaussians, or a value is not finite")
     rows[:, ANGLE] %= np.pi  # an ellipse that is rotated by 180° is the same
     if gaussians.blending == "front-to-back":
         rows[:, OPACITY_LOGIT] = rows[:, OPACITY_LOGIT].clip(-_LARGEST_LOGIT, _LARGEST_LOGIT)
@@ -107,23 +107,23 @@ def encode(gaussians: ImageGaussians) -> bytes:
 def decode(data: bytes) -> ImageGaussians:
     """The Gaussians in the content of a compact file. Raises ValueError if it is damaged."""
     if data[:4] != _MAGIC:
-        raise ValueError("not a compact file of Gaussians")
+        raise Problem("not a compact file of Gaussians")
     if len(data) < _HEADER.size + _CHECKSUM.size:
-        raise ValueError("the file is truncated")
+        raise Problem("the file is truncated")
     body, (checksum,) = data[: -_CHECKSUM.size], _CHECKSUM.unpack(data[-_CHECKSUM.size :])
     _, version, blending, width, height, count, *background = _HEADER.unpack_from(body)
     if version != _VERSION:
-        raise ValueError(f"version {version} of the format is unknown")
+        raise Problem("version {version} of the format is unknown", version=version)
     if zlib.crc32(body) != checksum:
-        raise ValueError("the file is damaged or truncated")
+        raise Problem("the file is damaged or truncated")
     if blending >= len(_BLENDINGS) or not 0 < width * height <= _MOST_PIXELS:
-        raise ValueError("the header of the file is damaged")
+        raise Problem("the header of the file is damaged")
     columns = column_count(_BLENDINGS[blending])
     scales_end = _HEADER.size + 8 * columns
     scales = np.frombuffer(body[_HEADER.size : scales_end], "<f4")
     valid = len(scales) == 2 * columns and np.isfinite([*scales, *background]).all()
     if not (valid and 1 <= count <= MOST_GAUSSIANS):
-        raise ValueError("the header of the file is damaged")
+        raise Problem("the header of the file is damaged")
     levels = _levels(body[scales_end:], count, columns)
     if _BLENDINGS[blending] == "additive":
         levels[:, :2] = np.cumsum(levels[:, :2], axis=0, dtype=np.uint16)
@@ -131,7 +131,7 @@ def decode(data: bytes) -> ImageGaussians:
     with np.errstate(over="ignore"):
         rows = low + step * levels.astype(np.float32)
     if not np.isfinite(rows).all():
-        raise ValueError("the values of the file are too large")
+        raise Problem("the values of the file are too large")
     return ImageGaussians(
         width=width,
         height=height,
@@ -153,9 +153,9 @@ def _levels(payload: bytes, count: int, columns: int) -> np.ndarray:
         decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS)
         planes = decoder.decompress(payload, max_length=size + 1)
     except (lzma.LZMAError, EOFError):
-        raise ValueError("the compressed data are damaged") from None
+        raise Problem("the compressed data are damaged") from None
     if len(planes) != size:
-        raise ValueError("the number of Gaussians is wrong")
+        raise Problem("the number of Gaussians is wrong")
     pairs = np.frombuffer(planes, np.uint8).reshape(2 * columns, count).T
     return np.ascontiguousarray(pairs).view("<u2").astype(np.uint16)
 

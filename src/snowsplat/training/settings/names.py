@@ -8,6 +8,7 @@ from typing import Any
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.density import owner
 from snowsplat.util.errors import SettingError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.settings import suggestion
 
 #: The fields of `TrainConfig` whose value has settings itself.
@@ -62,11 +63,14 @@ def changed(config: TrainConfig, **settings: Any) -> TrainConfig:
     return replace(config, **direct, **parts)
 
 
-def _unknown(name: str, config: TrainConfig, known: list[str]) -> str:
+def _unknown(name: str, config: TrainConfig, known: list[str]) -> Message:
     control = type(config.density).__name__
     if other := owner(name):
-        return (
-            f"a setting of {other}, but this training uses {control}; remove it or use another "
-            "recipe"
+        return message(
+            "a setting of {other}, but this training uses {control}; remove it or use another "
+            "recipe",
+            other=other,
+            control=control,
         )
-    return f"unknown setting{suggestion(name, known) or '; remove it'}"
+    advice = suggestion(name, known) or message("remove it")
+    return message("unknown setting; {advice}", advice=advice)

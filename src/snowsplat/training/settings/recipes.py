@@ -15,6 +15,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.density import AdaptiveDensity, McmcDensity
 from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.rates import DecayRates, LearningRates
+from snowsplat.util.messages import Message, message
 from snowsplat.util.settings import Setting, checked, suggestion
 
 
@@ -166,12 +167,12 @@ def register_recipe(name: str, make: Callable[[], TrainConfig]) -> None:
     RECIPES[name] = make
 
 
-def check_recipe(name: str) -> str | None:
+def check_recipe(name: str) -> Message | None:
     """What is wrong with the name of a recipe; None: nothing."""
     if name in RECIPES:
         return None
-    advice = suggestion(name, list(RECIPES)) or f"; use one of {', '.join(RECIPES)}"
-    return f"is unknown{advice}"
+    advice = suggestion(name, list(RECIPES)) or message("use one of {names}", names=[*RECIPES])
+    return message("is unknown; {advice}", advice=advice)
 
 
 def recipe(name: str = "default", **settings: Any) -> TrainConfig:

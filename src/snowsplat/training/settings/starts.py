@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
+from snowsplat.util.messages import Message, message
 from snowsplat.util.settings import suggestion
 
 if TYPE_CHECKING:
@@ -36,13 +37,18 @@ def register_start(name: str, start: Start) -> None:
     STARTS[name] = start
 
 
-def check_starts(names: str) -> str | None:
+def check_starts(names: str) -> Message | None:
     """What is wrong with names of starts, joined by "+"; None: nothing."""
     for name in names.split("+"):
         if name == "carve":
-            return "'carve' was removed; use sweep, which is faster and finds more of the surface"
+            return message(
+                "'carve' was removed; use sweep, which is faster and finds more of the surface"
+            )
         if name not in STARTS:
-            which = "" if name == names else f" ({name!r})"
-            advice = suggestion(name, list(STARTS)) or f"; use one of {', '.join(STARTS)}"
-            return f"is unknown{which}{advice}"
+            advice = suggestion(name, list(STARTS)) or message(
+                "use one of {names}", names=[*STARTS]
+            )
+            if name == names:
+                return message("is unknown; {advice}", advice=advice)
+            return message("is unknown ({name!r}); {advice}", name=name, advice=advice)
     return None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import shown
 
 # Container formats that cameras, phones and programs write, as FFmpeg names them.
@@ -80,13 +80,13 @@ def _check_boxes(path: Path) -> None:
             for tag in () if kind in _NO_COUNTS else _COUNTS.finditer(data, start, end):
                 at = tag.end() + (8 if tag[0] in (b"stsz", b"stz2") else 4)
                 if tag[0] == b"cmov":
-                    raise ValueError("compressed mp4 header")
+                    raise Problem("compressed mp4 header")
                 if at + 4 <= end:
                     (count,) = struct.unpack_from(">I", data, at)
                     frames += 0 if tag[0] == b"elst" else count
                     edits += count if tag[0] == b"elst" else 0
                 if frames * max(1, edits // _FEW_EDITS) > max(size, _ALWAYS_ALLOWED):
-                    raise ValueError("declares more frames than it has bytes")
+                    raise Problem("declares more frames than it has bytes")
             start = end
 
 
@@ -216,7 +216,7 @@ def open_video(path: Path) -> InputContainer:
     try:
         codec = video_stream(container).codec_context
         if codec is None:  # PyAV has no decoder
-            raise ValueError("unknown codec")
+            raise Problem("unknown codec")
     except BaseException:
         container.close()
         raise
