@@ -43,9 +43,27 @@ def dataset(tmp_path_factory) -> Path:
     return write_toy_dataset(folder, "colmap-bin", 9, 176, 132, n_points=400)
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_the_script_starts(script):
-    assert "usage: " in benchmark(script, "--help")
+HELP = """
+import contextlib, io, runpy, sys
+_, folder, *scripts = sys.argv
+sys.path.insert(0, folder)
+for script in scripts:
+    sys.argv = [script, "--help"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        try:
+            runpy.run_path(f"{folder}/{script}", run_name="__main__")
+        except SystemExit as end:
+            assert not end.code, (script, end.code)
+    assert "usage: " in out.getvalue(), script
+    print(script)
+"""
+
+
+def test_every_script_starts():
+    """In one process, which imports what they share once."""
+    run = fork_server.run("-c", HELP, BENCHMARKS, *SCRIPTS)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == SCRIPTS
 
 
 @pytest.mark.nightly
