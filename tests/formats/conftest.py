@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 
-from snowsplat.formats import format_for_reading, read_gaussians
+from snowsplat.formats import read_gaussians
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.scene.geometry import look_at
@@ -91,28 +91,6 @@ def one_line() -> Callable[[Path], str]:
         return line
 
     return refused
-
-
-@pytest.fixture(scope="session")
-def survives() -> Callable[[Path], None]:
-    """``survives(path)``: reads a damaged file.
-
-    The result must be a one-line error or a plausible number of finite Gaussians.
-    """
-
-    def read(path: Path) -> None:
-        try:
-            scene = read_gaussians(path)
-        except UserError as error:
-            lines = str(error).count("\n") + 1
-        else:
-            lines = 1
-            assert len(scene) <= max(1000, 100 * path.stat().st_size)
-            if format_for_reading(path).name != "PLY":  # a PLY is read unchanged
-                assert bool(scene.usable_rows().all())
-        assert lines == 1
-
-    return read
 
 
 @pytest.fixture(scope="session")

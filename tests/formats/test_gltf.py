@@ -3,19 +3,15 @@
 import base64
 import json
 import math
-import os
 import struct
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
 
 from snowsplat.formats import read_arrays, read_gaussians, write_gaussians
 from snowsplat.scene import edit
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
-
-from . import json_damage
 
 PREFIX = "KHR_gaussian_splatting:"
 
@@ -486,15 +482,3 @@ def test_a_node_far_from_0_keeps_the_precision(tmp_path, seed):
     world = scene.means.double().numpy() + np.array([4_000_000.25, -5.5, 3_000_000.75])
     np.testing.assert_allclose(read.world_means(), world, rtol=0, atol=1e-5)
     assert np.abs(read.means).max() < 100
-
-
-@settings(
-    max_examples=int(os.environ.get("SNOWSPLAT_FUZZ", "100")),
-    derandomize="SNOWSPLAT_FUZZ" not in os.environ,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(changes=json_damage.changes)
-def test_randomly_damaged_json(tmp_path, seed, survives, changes):
-    document, binary, _ = seed
-    survives(assemble(tmp_path / "a.glb", json_damage.damaged(document, changes), binary))

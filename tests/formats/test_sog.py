@@ -2,23 +2,17 @@
 
 import io
 import json
-import os
-import struct
 import zipfile
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from snowsplat.formats import read_gaussians, sog, write_gaussians
 from snowsplat.formats.codebooks import palette_for
 from snowsplat.formats.sog_container import Bundle
 from snowsplat.scene.geometry import morton_order
-
-from . import json_damage
 
 
 def in_order(scene):
@@ -210,19 +204,6 @@ def test_an_invalid_meta_json_is_reported(tmp_path, files, one_line, name):
     one_line(bundle(tmp_path / "a.sog", with_meta(files, BROKEN[name])))
 
 
-def test_files_outside_of_the_folder_are_refused(tmp_path, files, one_line):
-    inner = tmp_path / "inner"
-    inner.mkdir()
-    for name, data in files.items():
-        (inner / name).write_bytes(data)
-    (tmp_path / "quats.webp").write_bytes(files["quats.webp"])
-
-    for name in ("../quats.webp", str(tmp_path / "quats.webp"), "..", ""):
-        changed = with_meta(files, lambda meta, name=name: meta["quats"].update(files=[name]))
-        (inner / "meta.json").write_bytes(changed["meta.json"])
-        one_line(inner / "meta.json")
-
-
 @pytest.mark.slow
 def test_decompression_bombs(tmp_path, files, one_line):
     zeros = bytes(100 << 20)
@@ -260,19 +241,6 @@ def test_the_size_of_a_folder_is_that_of_its_files(tmp_path, files):
         assert packed.bytes_with(names) == path.stat().st_size
 
 
-def test_a_member_with_a_false_size(tmp_path, files, one_line):
-    path = bundle(tmp_path / "a.sog", files, zipfile.ZIP_DEFLATED)
-    data = bytearray(path.read_bytes())
-    with zipfile.ZipFile(path) as archive:
-        offset = archive.start_dir
-    for _ in range(len(files)):  # the uncompressed sizes in the central directory
-        struct.pack_into("<I", data, offset + 24, 7)
-        name, extra, comment = struct.unpack_from("<HHH", data, offset + 28)
-        offset += 46 + name + extra + comment
-    path.write_bytes(data)
-    one_line(path)
-
-
 def test_not_a_scene(tmp_path, one_line):
     assert "contains 'x'" in one_line(bundle(tmp_path / "a.sog", {"x": b""}))
     assert "without 'meta.json'" in one_line(bundle(tmp_path / "a.sog", {"x.webp": b""}))
@@ -286,20 +254,3 @@ def test_too_many_gaussians_for_an_image(tmp_path, make_scene, monkeypatch):
     with pytest.raises(Exception, match="too many for SOG"):
         write_gaussians(tmp_path / "a.sog", make_scene(20, 0))
     assert not (tmp_path / "a.sog").exists()
-
-
-@settings(
-    max_examples=int(os.environ.get("SNOWSPLAT_FUZZ", "100")),
-    derandomize="SNOWSPLAT_FUZZ" not in os.environ,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(changes=json_damage.changes, pixels=st.binary(min_size=4, max_size=256))
-def test_randomly_damaged_json_and_pixels(tmp_path, files, survives, changes, pixels):
-    meta = json_damage.damaged(json.loads(files["meta.json"]), changes)
-    noise = np.resize(np.frombuffer(pixels, np.uint8), (8, 8, 4))
-    image_file = io.BytesIO()
-    Image.fromarray(noise).save(image_file, format="WEBP", lossless=True, exact=True)
-    name = ("quats.webp", "sh0.webp", "shN_labels.webp", "means_u.webp")[pixels[0] % 4]
-    changed = {"meta.json": json.dumps(meta).encode(), name: image_file.getvalue()}
-    survives(bundle(tmp_path / "a.sog", files | changed))

@@ -36,7 +36,13 @@ from snowsplat.data.photos.decode import read_header as read_image_header
 from snowsplat.data.points_ply import read_points, write_points
 from snowsplat.data.readers import PROGRAMS, PhotoFolder, find_poses
 from snowsplat.evaluation.lpips import Lpips
-from snowsplat.formats import FORMATS, GaussianArrays, read_gaussians, write_gaussians
+from snowsplat.formats import (
+    FORMATS,
+    GaussianArrays,
+    format_for_reading,
+    read_gaussians,
+    write_gaussians,
+)
 from snowsplat.formats.lod import INDEX, LEVELS
 from snowsplat.formats.lod_writer import LodSizes, write_lod
 from snowsplat.formats.spz import write_spz
@@ -152,7 +158,7 @@ def _scene(file: str) -> Reader:
         f"scene {file}",
         file,
         lambda folder: write_gaussians(folder / file, make_scene(30, 1)),
-        lambda folder: read_gaussians(folder / file),
+        _reads(file),
     )
 
 
@@ -328,7 +334,13 @@ def _make_origin(folder: Path) -> None:
 
 
 def _reads(file: str) -> Callable[[Path], Any]:
-    return lambda folder: read_gaussians(folder / file)
+    def read(folder: Path) -> Gaussians:
+        scene = read_gaussians(folder / file)
+        if format_for_reading(folder / file).name != "PLY":  # a PLY is read unchanged
+            assert bool(scene.usable_rows().all())
+        return scene
+
+    return read
 
 
 # Datasets

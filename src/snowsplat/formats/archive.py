@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats.compressed_ply import is_compressed_ply, read_compressed_ply
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.ply import is_ply, is_scene, read_ply
 from snowsplat.formats.sog import read_sog
-from snowsplat.formats.zip_members import Damaged, ZipMembers
+from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import parse_json, quoted
@@ -60,25 +61,20 @@ def is_archive(head: bytes) -> bool:
     return name is not None and not (name == "meta.json" or name.endswith((".webp", ".png")))
 
 
-def read_archive(path: Path | str) -> GaussianArrays:
+@reads
+def read_archive(path: Path) -> GaussianArrays:
     """Read the scene in a zip file.
 
     Raises: UserError: the file cannot be read, is damaged, or contains no scene, several scenes, or
     one of a kind that is only read on its own.
     """
-    path = Path(path)
-    try:
-        with ZipMembers(path) as members:
-            names = [name for name in members.names() if _is_own(name)]
-            if "meta.json" in names:
-                return read_sog(path)
-            if _DOCUMENT in names and any(_SPLAT.fullmatch(name) for name in names):
-                return _project(path, members, names)
-            return _single(path, members, names)
-    except Damaged as error:
-        raise UserError(
-            "{path}: {error}; copy or export it again", path=path, error=error
-        ) from None
+    with ZipMembers(path) as members:
+        names = [name for name in members.names() if _is_own(name)]
+        if "meta.json" in names:
+            return read_sog(path)
+        if _DOCUMENT in names and any(_SPLAT.fullmatch(name) for name in names):
+            return _project(path, members, names)
+        return _single(path, members, names)
 
 
 def _is_own(name: str) -> bool:
@@ -153,7 +149,7 @@ def _settings(members: ZipMembers) -> list[dict[str, Any]]:
     try:
         document = parse_json(members.read(_DOCUMENT, _MOST_INFLATION))
     except ValueError:
-        raise Damaged(f"its {_DOCUMENT} is not valid JSON") from None
+        raise Damaged("its {document} is not valid JSON", document=_DOCUMENT) from None
     splats = document.get("splats") if isinstance(document, dict) else None
     found = splats if isinstance(splats, list) else []
     return [each if isinstance(each, dict) else {} for each in found]
@@ -179,7 +175,7 @@ def _place(scene: GaussianArrays, settings: dict[str, Any]) -> GaussianArrays:
         position = np.array([float(value) for value in settings["position"]]).reshape(3)
         scale = [float(value) for value in settings["scale"]]
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise Damaged(f"its {_DOCUMENT} has no valid positions") from None
+        raise Damaged("its {document} has no valid positions", document=_DOCUMENT) from None
     length = float(np.linalg.norm([x, y, z, w]))
     finite = np.isfinite([*position, *scale, length]).all()
     if (
@@ -188,7 +184,10 @@ def _place(scene: GaussianArrays, settings: dict[str, Any]) -> GaussianArrays:
         or max(scale) > 1.0001 * min(scale)
         or not length
     ):
-        raise Damaged(f"its {_DOCUMENT} stretches or mirrors a splat; apply this in SuperSplat")
+        raise Damaged(
+            "its {document} stretches or mirrors a splat; apply this in SuperSplat",
+            document=_DOCUMENT,
+        )
     back = np.diag([-1.0, -1.0, 1.0])  # by 180° about z
     turn = rotation_from_quat(torch.tensor([w, x, y, z], dtype=torch.float64) / length).numpy()
     rotation, offset = back @ turn, back @ position

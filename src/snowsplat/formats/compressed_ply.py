@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
+from snowsplat.formats.damage import reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.ply import is_antialiased, placement_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
@@ -51,8 +52,8 @@ def is_compressed_ply(head: bytes) -> bool:
     return head.startswith(b"ply") and b"\nelement chunk " in head and b"packed_position" in head
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
-def read_compressed_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
+@reads
+def read_compressed_ply(path: Path, data: bytes | None = None) -> GaussianArrays:
     """Read a scene of any SH degree.
 
     ``data``: see `open_table`.
@@ -60,7 +61,6 @@ def read_compressed_ply(path: Path | str, data: bytes | None = None) -> Gaussian
     Raises:
         UserError: the file cannot be read, is damaged or truncated, or is another kind of PLY file.
     """
-    path = Path(path)
     vertices, chunks = open_table(path, data=data), open_table(path, "chunk", data)
     missing = [n for n in _WORDS if vertices.columns.get(n) != "u4"]
     missing += [n for n in _GEOMETRY_BOUNDS if n not in chunks.columns]

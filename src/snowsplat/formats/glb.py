@@ -19,7 +19,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from snowsplat.formats.zip_members import Damaged
+from snowsplat.formats.damage import Damaged
 from snowsplat.util.safe_json import inside, is_file, parse_json, quoted
 
 MAGIC = b"glTF"
@@ -72,7 +72,7 @@ class Document:
         """
         uri = _item(self.json, "buffers", index).get("uri")
         if uri is None and index != 0:
-            raise Damaged(f"its buffer {index} has no data")
+            raise Damaged("its buffer {index} has no data", index=index)
         if uri not in self._buffers:
             content = self._read(uri)
             self.size += len(content)
@@ -91,13 +91,17 @@ class Document:
         name = unquote(uri)
         path = None if "://" in name else inside(self._folder, name)
         if path is None:
-            raise Damaged(f"it refers to {quoted(name)}, which is outside of its folder")
+            raise Damaged("it refers to {name}, which is outside of its folder", name=quoted(name))
         if not is_file(path):
-            raise Damaged(f"its data file {quoted(name)} is missing")
+            raise Damaged("its data file {name} is missing", name=quoted(name))
         try:
             return path.read_bytes()
         except OSError as error:
-            raise Damaged(f"{quoted(name)} cannot be read ({error.strerror or error})") from None
+            raise Damaged(
+                "{name} cannot be read ({strerror})",
+                name=quoted(name),
+                strerror=error.strerror or error,
+            ) from None
 
 
 def _chunks(data: bytes) -> tuple[bytes, memoryview]:
@@ -109,7 +113,7 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview]:
         raise Damaged("not a GLB file")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise Damaged(f"GLB version {version}; supported is 2")
+        raise Damaged("GLB version {version}; supported is 2", version=version)
     if length > len(data):
         raise Damaged("the file is truncated")
     chunks, position = [], 12
@@ -197,7 +201,7 @@ def view(document: Document, index: int) -> memoryview:
     data = document.buffer(entry["buffer"])
     start, length = _non_negative(entry.get("byteOffset", 0)), _non_negative(entry["byteLength"])
     if start + length > len(data):
-        raise Damaged(f"its buffer view {index} exceeds the file")
+        raise Damaged("its buffer view {index} exceeds the file", index=index)
     return data[start : start + length]
 
 
@@ -210,7 +214,7 @@ def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
     """
     entry = _item(document.json, "accessors", index)
     if entry["type"] not in kinds or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
-        raise Damaged(f"its accessor {index} does not have the type of its attribute")
+        raise Damaged("its accessor {index} does not have the type of its attribute", index=index)
     code, divisor = _COMPONENTS[entry["componentType"]]
     dtype, width, count = np.dtype(code), _WIDTHS[entry["type"]], _non_negative(entry["count"])
     data = view(document, entry["bufferView"])
@@ -219,7 +223,7 @@ def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
     offset = _non_negative(entry.get("byteOffset", 0))
     needed = offset + (_non_negative(stride) * (count - 1) + row if count else 0)
     if stride < row or needed > len(data):
-        raise Damaged(f"its accessor {index} exceeds the file")
+        raise Damaged("its accessor {index} exceeds the file", index=index)
     values = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
     result = values.astype(np.float32)
     if entry.get("normalized", False) and divisor != 1.0:
@@ -242,7 +246,7 @@ def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarra
         inner = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in inner]
     if max(len(nodes), len(roots)) > _MOST_NODES:
-        raise Damaged(f"it has more than {_MOST_NODES} nodes")
+        raise Damaged("it has more than {most_nodes} nodes", most_nodes=_MOST_NODES)
     waiting = deque((root, np.eye(4)) for root in roots)
     visits = 0
     while waiting:

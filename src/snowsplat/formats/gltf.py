@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats import glb, packing
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.glb import Document
 from snowsplat.formats.spz import parse_spz
-from snowsplat.formats.zip_members import Damaged
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import Origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
@@ -71,21 +71,22 @@ def is_gltf(head: bytes) -> bool:
     return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{") and EXTENSION.encode() in head
 
 
-@np.errstate(all="ignore")  # unusable Gaussians are left out at the end
-def read_gltf(path: Path | str) -> GaussianArrays:
+@reads
+def read_gltf(path: Path) -> GaussianArrays:
     """Read all splats of the scene, placed by their nodes, as one set of Gaussians.
 
     Raises: UserError: the file cannot be read, is damaged, has no splats, or needs an unsupported
     feature.
     """
-    path = Path(path)
-    data = packing.read_file(path)
+    document = glb.Document(path, path.read_bytes())
+    notes: set[str] = set()
     try:
-        document = glb.Document(path, data)
         unknown = set(document.json.get("extensionsRequired", [])) - _UNDERSTOOD
         if unknown:
-            raise Damaged(f"it needs {sorted(map(str, unknown))[0][:60]}, which is not supported")
-        notes: set[str] = set()
+            raise Damaged(
+                "it needs {extension}, which is not supported",
+                extension=sorted(map(str, unknown))[0][:60],
+            )
         parts = _parts(path, document, notes)
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
             raise UserError(
@@ -104,14 +105,8 @@ def read_gltf(path: Path | str) -> GaussianArrays:
                 for part, matrix in parts
             ]
         placed = [transformed(part, matrix) for part, matrix in parts]
-    except Damaged as error:
-        raise UserError(
-            "{path}: {error}; copy or export it again", path=path, error=error
-        ) from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
-        raise UserError(
-            "{path}: its JSON is not valid glTF; copy or export it again", path=path
-        ) from None
+        raise Damaged("its JSON is not valid glTF") from None
     for note in sorted(notes):
         logger.warning("%s: %s", path, note)
     scene = GaussianArrays.cat(placed)
@@ -139,7 +134,9 @@ def _parts(
     for mesh, world_from_mesh in glb.meshes(document.json):
         seen += len(mesh["primitives"])
         if seen > _MOST_PRIMITIVES:
-            raise Damaged(f"it has more than {_MOST_PRIMITIVES} primitives")
+            raise Damaged(
+                "it has more than {most_primitives} primitives", most_primitives=_MOST_PRIMITIVES
+            )
         for primitive in mesh["primitives"]:
             extensions = primitive.get("extensions", {})
             inner = extensions.get(EXTENSION, {}).get("extensions", {}) | extensions
@@ -171,7 +168,9 @@ def _check(primitive: dict[str, Any], extension: dict[str, Any], notes: set[str]
         if "_SCALE" in primitive["attributes"]:
             raise Damaged("its splats are those of an early draft, which is not supported")
         packed = ", ".join(map(str, extension.get("extensions", {}))) or "an unknown method"
-        raise Damaged(f"its splats are compressed by {packed[:60]}, which is not supported")
+        raise Damaged(
+            "its splats are compressed by {packed}, which is not supported", packed=packed[:60]
+        )
     kernel = extension.get("kernel", "ellipse")
     if kernel != "ellipse":
         notes.add(f"splats of the unknown kernel {quoted(kernel)} are read as ellipses")
@@ -244,7 +243,9 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
         notes.add("it has no SH coefficients; the colours are those of COLOR_0")
         sh = [(from_linear(read("COLOR_0", "VEC3", "VEC4")[:, :3]) - 0.5) / SH_C0]
     elif present != names[: len(present)] or len(present) - 1 not in SH_REST_COUNTS:
-        raise Damaged(f"its {len(present)} SH coefficients do not match an SH degree")
+        raise Damaged(
+            "its {present} SH coefficients do not match an SH degree", present=len(present)
+        )
     else:
         sh = [read(name) for name in present]
     arrays = (

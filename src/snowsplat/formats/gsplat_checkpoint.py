@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats.archive import first_member
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.zip_members import Damaged, ZipMembers
+from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 
@@ -34,29 +35,26 @@ def is_checkpoint(head: bytes) -> bool:
     return name is not None and (name == _METADATA or name.endswith(f"/{_METADATA}"))
 
 
-def read_checkpoint(path: Path | str) -> GaussianArrays:
+@reads
+def read_checkpoint(path: Path) -> GaussianArrays:
     """Read the Gaussians of a checkpoint; SH coefficients beyond degree 3 are ignored.
 
     Raises: UserError: the file cannot be read, is damaged, or is another kind of checkpoint.
     """
-    path = Path(path)
-    try:
-        with ZipMembers(path) as members:
-            inner = [name for name in members.names() if name.endswith(_METADATA)]
-            if len(inner) != 1 or len(members.read(inner[0], 1)) > _METADATA_LIMIT:
-                raise Damaged("not a plausible checkpoint of PyTorch")
-        splats = _splats(path, _load(path))
-        arrays = [_array(path, splats[name]) for name in _NAMES if name in splats]
-        means, scales, quats, opacities, sh0 = arrays[:5]
-        n = len(means)
-        shN = arrays[5] if len(arrays) > 5 else np.zeros((n, 0, 3), np.float32)
-        opacities = opacities.reshape(-1)
-        shapes = [array.shape for array in (means, scales, quats, opacities, sh0)]
-        rest = shN.shape[1] if shN.ndim == 3 else -1
-        if shapes != [(n, 3), (n, 3), (n, 4), (n,), (n, 1, 3)] or shN.shape != (n, rest, 3):
-            raise Damaged("its tensors do not have the shapes of Gaussians")
-    except Damaged as error:
-        raise UserError("{path}: {error}; copy it again", path=path, error=error) from None
+    with ZipMembers(path) as members:
+        inner = [name for name in members.names() if name.endswith(_METADATA)]
+        if len(inner) != 1 or len(members.read(inner[0], 1)) > _METADATA_LIMIT:
+            raise Damaged("not a plausible checkpoint of PyTorch")
+    splats = _splats(path, _load(path))
+    arrays = [_array(path, splats[name]) for name in _NAMES if name in splats]
+    means, scales, quats, opacities, sh0 = arrays[:5]
+    n = len(means)
+    shN = arrays[5] if len(arrays) > 5 else np.zeros((n, 0, 3), np.float32)
+    opacities = opacities.reshape(-1)
+    shapes = [array.shape for array in (means, scales, quats, opacities, sh0)]
+    rest = shN.shape[1] if shN.ndim == 3 else -1
+    if shapes != [(n, 3), (n, 3), (n, 4), (n,), (n, 1, 3)] or shN.shape != (n, rest, 3):
+        raise Damaged("its tensors do not have the shapes of Gaussians")
     if rest not in [(degree + 1) ** 2 - 1 for degree in range(11)]:
         raise UserError(
             "{path}: {rest} SH coefficients do not match an SH degree", path=path, rest=rest
@@ -64,8 +62,7 @@ def read_checkpoint(path: Path | str) -> GaussianArrays:
     if rest > SH_REST_COUNTS[-1]:
         logger.warning("%s: its SH degree is reduced to 3", path)
     _name_other_ranks(path)
-    with np.errstate(all="ignore"):
-        return decoded(path, means, scales, quats, opacities, sh0, shN[:, : SH_REST_COUNTS[-1]])
+    return decoded(path, means, scales, quats, opacities, sh0, shN[:, : SH_REST_COUNTS[-1]])
 
 
 def _load(path: Path) -> Any:

@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -51,16 +52,15 @@ class _Section:
     ends: np.ndarray  # for each bucket with Gaussians, the index after its last one
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
-def read_ksplat(path: Path | str) -> GaussianArrays:
+@reads
+def read_ksplat(path: Path) -> GaussianArrays:
     """Read a scene of SH degree 0 to 3; the SH of sections of a lower degree are padded with zeros.
 
     Raises: UserError: the file cannot be read, has another version, or is damaged or truncated.
     """
-    path = Path(path)
-    data = packing.read_file(path)
+    data = path.read_bytes()
     if len(data) < _HEADER_BYTES:
-        raise UserError("{path}: too short for a .ksplat file; copy or export it again", path=path)
+        raise Damaged("too short for a .ksplat file")
     major, minor, section_count, level = struct.unpack_from("<BB2xI12xH", data)
     if major != 0 or minor < 1 or level >= len(_TYPES):
         raise UserError(
@@ -73,7 +73,7 @@ def read_ksplat(path: Path | str) -> GaussianArrays:
         )
     low, high = struct.unpack_from("<2f", data, 36)
     bounds = low or -_DEFAULT_SH_BOUND, high or _DEFAULT_SH_BOUND
-    sections = _sections(path, data, section_count, level)
+    sections = _sections(data, section_count, level)
     degree = max((section.sh_degree for section in sections), default=0)
     # The first part is empty, so that a file without sections gives an empty scene.
     parts = [GaussianArrays.empty(SH_REST_COUNTS[degree])]
@@ -82,11 +82,11 @@ def read_ksplat(path: Path | str) -> GaussianArrays:
     return decoded(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
 
 
-def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_Section]:
+def _sections(data: bytes, section_count: int, level: int) -> list[_Section]:
     """The sections; each of them is completely inside the file."""
     start = _HEADER_BYTES + section_count * _SECTION_HEADER_BYTES
     if start > len(data):
-        raise _damaged(path)
+        raise _mismatch()
     sections = []
     for i in range(section_count):
         head = _HEADER_BYTES + i * _SECTION_HEADER_BYTES
@@ -94,9 +94,9 @@ def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_
             struct.unpack_from("<4IfH2xI4x2IH", data, head)
         )
         if count > capacity or sh >= len(SH_REST_COUNTS):
-            raise _damaged(path)
+            raise _mismatch()
         if level and (bucket_bytes != 12 or full + partial > bucket_count):
-            raise _damaged(path)
+            raise _mismatch()
         position, other, harmonic = _TYPES[level]
         row = np.dtype(
             [
@@ -111,7 +111,7 @@ def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_
         rows_start = centers_start + bucket_bytes * bucket_count
         end = rows_start + row.itemsize * capacity
         if end > len(data):
-            raise _damaged(path)
+            raise _mismatch()
         centers, ends = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
         if level:
             centers = np.frombuffer(data, "<f4", 3 * bucket_count, centers_start).reshape(-1, 3)
@@ -121,7 +121,7 @@ def _sections(path: Path, data: bytes, section_count: int, level: int) -> list[_
             others = bucket_size * full + np.cumsum(sizes, dtype=np.int64)
             ends = np.concatenate([ends, others])
             if count > (ends[-1] if len(ends) else 0):
-                raise _damaged(path)
+                raise _mismatch()
         rows = np.frombuffer(data, row, count, rows_start)
         span = span or _DEFAULT_RANGE
         sections.append(_Section(rows, sh, block / 2 / span, span, centers, ends))
@@ -158,8 +158,5 @@ def _unpack(
     )
 
 
-def _damaged(path: Path) -> UserError:
-    return UserError(
-        "{path}: damaged .ksplat file: its sections do not match its size; copy or export it again",
-        path=path,
-    )
+def _mismatch() -> Damaged:
+    return Damaged("damaged .ksplat file: its sections do not match its size")

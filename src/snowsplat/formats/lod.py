@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.sog import read_stored, sog_files
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import reading
 from snowsplat.util.safe_json import inside, quoted, read_json
 
 #: The name of the index. Viewers recognise the format by it.
@@ -74,7 +74,8 @@ def is_lod(head: bytes) -> bool:
     return head.lstrip().startswith(b"{") and b'"lodLevels"' in head
 
 
-def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
+@reads
+def read_lod(path: Path, level: int = 0) -> GaussianArrays:
     """Read one level of `lod-meta.json`; level 0 is the complete scene.
 
     ``level``: leaves without this level are read at the next coarser level that they have, and if
@@ -82,7 +83,6 @@ def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
 
     Raises: UserError: a file is missing or damaged.
     """
-    path = Path(path)
     index = read_index(path)
     order = [*range(level, index.levels), *reversed(range(min(level, index.levels)))]
     runs: dict[int, list[Run]] = {}
@@ -96,18 +96,16 @@ def read_lod(path: Path | str, level: int = 0) -> GaussianArrays:
     return without_unusable(path, GaussianArrays.cat(parts))
 
 
+@reads
 def read_index(path: Path) -> LodIndex:
     """The content of `lod-meta.json`.
 
     Raises: UserError: it cannot be read, is damaged, or names a file outside of its folder.
     """
     try:
-        with reading(path):
-            meta = read_json(path)
+        meta = read_json(path)
     except ValueError as error:
-        raise UserError(
-            "{path}: {error}; copy or export it again", path=path, error=error
-        ) from None
+        raise Damaged("{error}", error=error) from None
     try:
         if meta.get("version", 1) != 1:  # the first files had no version
             raise UserError(
@@ -119,9 +117,7 @@ def read_index(path: Path) -> LodIndex:
         files = [_file(path, name) for name in names]
         always = None if environment is None else _file(path, environment)
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise UserError(
-            "{path}: does not describe levels of detail; copy or export it again", path=path
-        ) from None
+        raise Damaged("does not describe levels of detail") from None
     return LodIndex(levels, files, leaves, always)
 
 

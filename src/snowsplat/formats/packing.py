@@ -17,7 +17,6 @@ import numpy as np
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.scene.sh_constants import SH_C0
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import reading
 
 logger = logging.getLogger(__name__)
 
@@ -32,12 +31,6 @@ FLAT = float(np.log(1e-4))
 UP_BACK = (1, -1, -1)
 _RARE = 0.001  # share of Gaussians, see `Cut`
 _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no logarithm
-
-
-def read_file(path: Path) -> bytes:
-    """The content of the file. Raises: UserError: the file cannot be read."""
-    with reading(path):
-        return path.read_bytes()
 
 
 def check_count(path: Path, count: int, file_size: int) -> None:

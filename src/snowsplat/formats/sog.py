@@ -37,8 +37,9 @@ from PIL import Image
 
 from snowsplat.formats import packing
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, without_unusable
-from snowsplat.formats.sog_container import Bundle, Damaged
+from snowsplat.formats.sog_container import Bundle
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
@@ -70,20 +71,14 @@ def read_sog(path: Path | str) -> GaussianArrays:
     return without_unusable(Path(path), read_stored(path))
 
 
-@np.errstate(all="ignore")
-def read_stored(path: Path | str) -> GaussianArrays:
+@reads
+def read_stored(path: Path) -> GaussianArrays:
     """The same as `read_sog`, but with the Gaussians that are not finite, in their stored order."""
-    path = Path(path)
-    try:
-        with Bundle(path) as files:
-            layout = _layout(files.meta())
-            packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
-            arrays = _decode(files, layout)
-            meta = files.meta()
-    except Damaged as error:
-        raise UserError(
-            "{path}: {error}; copy or export it again", path=path, error=error
-        ) from None
+    with Bundle(path) as files:
+        meta = files.meta()
+        layout = _layout(meta)
+        packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
+        arrays = _decode(files, layout)
     antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
     scene = placed(*arrays, antialiased=antialiased)
     asset = meta.get("asset")
@@ -96,18 +91,14 @@ def read_stored(path: Path | str) -> GaussianArrays:
     )
 
 
+@reads
 def sog_files(path: Path) -> list[Path]:
     """The files of a scene: the zip file, or `meta.json` and the images beside it.
 
     Raises: UserError: the file cannot be read or is damaged.
     """
-    try:
-        with Bundle(path) as files:
-            return [path, *files.beside(_layout(files.meta()).files.values())]
-    except Damaged as error:
-        raise UserError(
-            "{path}: {error}; copy or export it again", path=path, error=error
-        ) from None
+    with Bundle(path) as files:
+        return [path, *files.beside(_layout(files.meta()).files.values())]
 
 
 def sog_version(path: Path) -> str:
@@ -134,7 +125,9 @@ def _layout(meta: dict[str, Any]) -> _Layout:
     try:
         version_1 = "version" not in meta or meta["version"] == 1
         if not version_1 and meta["version"] != 2:
-            raise Damaged(f"SOG version {str(meta['version'])[:20]}; supported are 1 and 2")
+            raise Damaged(
+                "SOG version {meta}; supported are 1 and 2", meta=str(meta["version"])[:20]
+            )
         means, scales, sh0, rest = meta["means"], meta["scales"], meta["sh0"], meta.get("shN")
         count = means["shape"][0] if version_1 else meta["count"]
         if not isinstance(count, int) or count < 0:
@@ -217,7 +210,9 @@ def _decode_rest(files: Bundle, layout: _Layout, labels: np.ndarray | None) -> n
     k, remainder = divmod(image.shape[1], _PALETTE_COLUMNS)  # the width determines the degree
     if remainder or k not in SH_REST_COUNTS[1:] or len(image) < used:
         raise Damaged(
-            f"its palette of {image.shape[1]}×{len(image)} pixels does not match an SH degree"
+            "its palette of {shape}×{image} pixels does not match an SH degree",
+            shape=image.shape[1],
+            image=len(image),
         )
     table = layout.rest.astype(np.float32)
     return table[image.reshape(-1, k, 4)[index, :, :3]]

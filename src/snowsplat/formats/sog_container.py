@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from snowsplat.formats.zip_members import Damaged, ZipMembers, reading_file
+from snowsplat.formats.damage import Damaged
+from snowsplat.formats.zip_members import ZipMembers, reading_file
 from snowsplat.util.safe_json import is_file, parse_json, quoted
 
 # WebP images are already compressed, so the zip compression hardly reduces them.
@@ -64,8 +65,16 @@ class Bundle:
                 if least <= width * height <= most:
                     return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            raise Damaged(f"its image {name} cannot be read ({error})") from None
-        raise Damaged(f"its image {name} has {width}×{height} pixels; expected {least}")
+            raise Damaged(
+                "its image {name} cannot be read ({error})", name=name, error=error
+            ) from None
+        raise Damaged(
+            "its image {name} has {width}×{height} pixels; expected {least}",
+            name=name,
+            width=width,
+            height=height,
+            least=least,
+        )
 
     def bytes_with(self, names: Iterable[str]) -> int:
         """Number of bytes of these members of a folder; for a zip file, the size of the file."""
@@ -79,7 +88,7 @@ class Bundle:
 
     def _beside(self, name: str) -> Path:
         if not name or Path(name).name != name:
-            raise Damaged(f"refers to an image outside of its folder ({quoted(name)})")
+            raise Damaged("refers to an image outside of its folder ({name})", name=quoted(name))
         return self._path.parent / name
 
     def _member(self, name: str) -> bytes:

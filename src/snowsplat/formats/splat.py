@@ -12,29 +12,26 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
+from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _LOG_LIMIT = 87.0  # the exponential of a larger number exceeds float32
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
-def read_splat(path: Path | str) -> GaussianArrays:
+@reads
+def read_splat(path: Path) -> GaussianArrays:
     """Read a scene of SH degree 0.
 
     Raises: UserError: the file cannot be read, or its size is not a multiple of 32.
     """
-    path = Path(path)
-    data = packing.read_file(path)
+    data = path.read_bytes()
     if len(data) % _ROW.itemsize:
-        raise UserError(
-            "{path}: not a .splat file: {data} bytes are not a multiple of {itemsize}; copy or "
-            "export it again",
-            path=path,
-            data=len(data),
-            itemsize=_ROW.itemsize,
+        raise Damaged(
+            "not a .splat file: {size} bytes are not a multiple of {row}",
+            size=len(data),
+            row=_ROW.itemsize,
         )
     rows = np.frombuffer(data, _ROW)
     return decoded(

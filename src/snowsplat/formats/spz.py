@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
+from snowsplat.formats.damage import reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.spz_container import (
     ANTIALIASED,
@@ -65,7 +66,8 @@ _SCALE_RANGE = (-10.0, 255 / 16 - 10)  # logarithms
 _SH_STEPS = (2, 4)
 
 
-def read_spz(path: Path | str) -> GaussianArrays:
+@reads
+def read_spz(path: Path) -> GaussianArrays:
     """Read a scene of version 1 to 4. Coefficients of SH degree 4 are ignored.
 
     Of a tree of levels of detail of Spark, the finest level is read.
@@ -73,10 +75,10 @@ def read_spz(path: Path | str) -> GaussianArrays:
     Raises: UserError: the file cannot be read, has another version, is damaged or truncated, or
     declares an implausible number of Gaussians.
     """
-    return parse_spz(Path(path), packing.read_file(Path(path)))
+    return parse_spz(path, path.read_bytes())
 
 
-@np.errstate(all="ignore")  # non-finite Gaussians are skipped at the end
+@reads
 def parse_spz(path: Path, data: bytes) -> GaussianArrays:
     """The scene in the content ``data`` of a file, as `read_spz`; ``path`` is for messages."""
     contents = unpack(path, data)
@@ -125,9 +127,10 @@ def _leaves(path: Path, rows: list[np.ndarray], children: np.ndarray) -> list[np
     return leaves
 
 
+@reads
 def spz_version(path: Path) -> str:
     """The version of a file that `read_spz` accepts."""
-    return str(read_header(path, packing.read_file(path)).version)
+    return str(read_header(path, path.read_bytes()).version)
 
 
 def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:

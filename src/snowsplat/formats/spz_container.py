@@ -18,6 +18,7 @@ from pathlib import Path
 
 import zstandard
 
+from snowsplat.formats.damage import Damaged
 from snowsplat.formats.packing import check_count
 from snowsplat.util.errors import UserError
 
@@ -95,7 +96,7 @@ def read_header(path: Path, data: bytes) -> Header:
             head = zlib.decompressobj(31).decompress(data, _HEAD.size)
         return _header(path, head, len(data))
     except (zlib.error, struct.error):
-        raise _damaged(path) from None
+        raise _damaged() from None
 
 
 def unpack(path: Path, data: bytes) -> Contents:
@@ -106,14 +107,14 @@ def unpack(path: Path, data: bytes) -> Contents:
     try:
         return _unpack(path, data)
     except (zlib.error, zstandard.ZstdError, struct.error):
-        raise _damaged(path) from None
+        raise _damaged() from None
 
 
 def _unpack(path: Path, data: bytes) -> Contents:
     if not data.startswith(_GZIP):
         header = _header(path, data, len(data))
         if header.version > 3:
-            return _unpack_streams(path, data, header)
+            return _unpack_streams(data, header)
         body = data[_HEAD.size :]
         size = _body_bytes(header)
     else:
@@ -124,9 +125,9 @@ def _unpack(path: Path, data: bytes) -> Contents:
         # The checksum is only verified at the end of the stream.
         body = stream.decompress(stream.unconsumed_tail, size + _EXTENSION_LIMIT)
         if header.version > 3 or not stream.eof:
-            raise _damaged(path)
+            raise _damaged()
     if len(body) < size:
-        raise _damaged(path)
+        raise _damaged()
     columns, start = [], 0
     for width in header.columns():
         columns.append(body[start : start + width * header.count])
@@ -152,18 +153,18 @@ def _header(path: Path, head: bytes, file_size: int) -> Header:
             version=header.version,
         )
     if header.sh_degree > 4 or header.fractional_bits > 31:
-        raise _damaged(path)
+        raise _damaged()
     check_count(path, header.count, file_size)
     return header
 
 
-def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
+def _unpack_streams(data: bytes, header: Header) -> Contents:
     (table,) = struct.unpack_from("<I", data, _HEAD.size)
     sizes = [width * header.count for width in header.columns()]
     streams = sum(size > 0 for size in sizes)
     start = table + 16 * streams
     if table < _HEADER_BYTES or data[_HEAD.size - 1] != streams:
-        raise _damaged(path)
+        raise _damaged()
     entry, columns = table, []
     for size in sizes:
         if not size:
@@ -171,12 +172,12 @@ def _unpack_streams(path: Path, data: bytes, header: Header) -> Contents:
             continue
         packed, unpacked = struct.unpack_from("<QQ", data, entry)
         if unpacked != size or start + packed > len(data):
-            raise _damaged(path)
+            raise _damaged()
         # A stream reader is used, because decompress() trusts the size that the stream declares.
         unpacker = zstandard.ZstdDecompressor(max_window_size=1 << 27)
         column = unpacker.stream_reader(data[start : start + packed]).read(size + 1)
         if len(column) != size:
-            raise _damaged(path)
+            raise _damaged()
         columns.append(column)
         entry, start = entry + 16, start + packed
     end = min(table, _HEADER_BYTES + _EXTENSION_LIMIT)
@@ -196,7 +197,5 @@ def pack(header: Header, columns: Sequence[bytes]) -> bytes:
     return b"".join([head, struct.pack("<I12x", _HEADER_BYTES), *sizes, *packed])
 
 
-def _damaged(path: Path) -> UserError:
-    return UserError(
-        "{path}: a damaged or incomplete .spz file; copy or export it again", path=path
-    )
+def _damaged() -> Damaged:
+    return Damaged("a damaged or incomplete .spz file")

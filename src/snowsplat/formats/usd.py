@@ -25,9 +25,9 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.archive import first_member
+from snowsplat.formats.damage import reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.gltf import LOG_SCALES, OPACITY_RANGE, transformed
-from snowsplat.formats.zip_members import Damaged
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -73,13 +73,13 @@ def _usd(path: Path) -> Iterator[tuple[Any, ...]]:
         ) from None
 
 
-def read_usd(path: Path | str) -> GaussianArrays:
+@reads
+def read_usd(path: Path) -> GaussianArrays:
     """Read all splats of the stage, placed by their prims, as one set of Gaussians.
 
     Raises: UserError: usd-core is missing; the file cannot be read, is damaged, or has no splats.
     """
-    path = Path(path)
-    packing.read_file(path)  # a clear error if that is not possible
+    path.open("rb").close()  # a clear error if that is not possible
     with _usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
         stage = Usd.Stage.Open(str(path))
         unit = UsdGeom.GetStageMetersPerUnit(stage)
@@ -91,16 +91,11 @@ def read_usd(path: Path | str) -> GaussianArrays:
             upright[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
         places = UsdGeom.XformCache()
         parts = []
-        try:
-            for prim in stage.Traverse():
-                if prim.IsA(UsdVol.ParticleField3DGaussianSplat):
-                    # USD multiplies rows by matrices from the right.
-                    matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
-                    parts.append(transformed(_splats(prim), matrix))
-        except Damaged as error:
-            raise UserError(
-                "{path}: {error}; copy or export it again", path=path, error=error
-            ) from None
+        for prim in stage.Traverse():
+            if prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+                # USD multiplies rows by matrices from the right.
+                matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
+                parts.append(transformed(_splats(prim), matrix))
     if not parts:
         raise UserError(
             "{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)", path=path

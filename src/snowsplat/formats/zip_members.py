@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from snowsplat.formats.damage import Damaged
 from snowsplat.util.safe_json import is_file, quoted
 
 # Largest directory in bytes. Python creates an object for each entry, ten times as large as it.
@@ -30,19 +31,17 @@ _ERRORS = (
 )
 
 
-class Damaged(Exception):
-    """The file is damaged. The caller adds the path to the message."""
-
-
 @contextmanager
 def reading_file(path: Path) -> Iterator[None]:
     """Context for reading a file: raises `Damaged` if it is no file, or instead of `OSError`."""
     try:
         if not is_file(path):  # reading a pipe may never end
-            raise Damaged(f"{quoted(path.name)} is missing or not a file")
+            raise Damaged("{name} is missing or not a file", name=quoted(path.name))
         yield
     except OSError as error:
-        raise Damaged(f"{path.name} cannot be read ({error.strerror or error})") from None
+        raise Damaged(
+            "{name} cannot be read ({strerror})", name=path.name, strerror=error.strerror or error
+        ) from None
 
 
 class ZipMembers:
@@ -76,12 +75,18 @@ class ZipMembers:
         try:
             info = self._zip.getinfo(name)
         except KeyError:
-            raise Damaged(f"a zip file without {quoted(name)}") from None
+            raise Damaged("a zip file without {name}", name=quoted(name)) from None
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise Damaged(f"its {quoted(name)} has an unknown compression method; unzip it")
+            raise Damaged(
+                "its {name} has an unknown compression method; unzip it", name=quoted(name)
+            )
         packed = min(info.compress_size, self._file.size)
         if info.file_size > inflation * packed + _INFLATION_FREE:
-            raise Damaged(f"its {quoted(name)} would unpack to {info.file_size} bytes")
+            raise Damaged(
+                "its {name} would unpack to {file_size} bytes",
+                name=quoted(name),
+                file_size=info.file_size,
+            )
         try:
             content = bytearray()
             with self._zip.open(info) as member:
@@ -90,7 +95,7 @@ class ZipMembers:
                     content += block
             return bytes(content)
         except _ERRORS:
-            raise Damaged(f"its {quoted(name)} is damaged") from None
+            raise Damaged("its {name} is damaged", name=quoted(name)) from None
 
 
 class _InBlocks(io.FileIO):
