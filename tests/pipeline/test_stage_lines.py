@@ -6,7 +6,7 @@ from snowsplat.pipeline.stage_lines import described
 def test_what_is_fixed_to_the_frame_follows_the_number_of_photos():
     gathered = {
         "photos": [{}] * 8,
-        "skipped": [["a.jpg", "is too blurred"]],
+        "left_out": [{"photo": "a.jpg", "stage": "photos", "reason": "is too blurred"}],
         "notes": ["bars at the top and bottom: cut off in all 8 photos"],
     }
     assert described("photos", gathered) == [
@@ -17,7 +17,7 @@ def test_what_is_fixed_to_the_frame_follows_the_number_of_photos():
 
 
 def test_records_of_earlier_versions_have_no_notes():
-    assert described("photos", {"photos": [{}] * 8, "skipped": []}) == ["8 photos"]
+    assert described("photos", {"photos": [{}] * 8, "left_out": []}) == ["8 photos"]
 
 
 def test_the_last_part_says_how_many_photos_it_leaves_out():

@@ -14,6 +14,7 @@ import pytest
 
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.pipeline.stage_lines import described
+from snowsplat.project.left_out import LeftOut
 from snowsplat.project.page_film import PageFilm
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, failure
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED
@@ -103,10 +104,10 @@ def test_errors(tmp_path):
         str(failure(Evidence(detailed, [], None, 36))),
         str(failure(Evidence(detailed, [], 0.0, 36))),
         str(_too_few(2, [])),
-        str(_too_few(0, [("/1.jpg", BLACK), ("/2.jpg", BLACK)])),
-        str(_too_few(1, [("/1.jpg", BLURRED)] * 3)),
-        str(_too_few(1, [("/1.mp4 at 1 s", SAME_VIEW)] * 3)),
-        str(_too_few(1, [("/DSC.jpg", "has only 8x8 pixels")] * 3)),
+        str(_too_few(0, [LeftOut("/1.jpg", "photos", BLACK), LeftOut("/2.jpg", "photos", BLACK)])),
+        str(_too_few(1, [LeftOut("/1.jpg", "photos", BLURRED)] * 3)),
+        str(_too_few(1, [LeftOut("/1.mp4 at 1 s", "photos", SAME_VIEW)] * 3)),
+        str(_too_few(1, [LeftOut("/DSC.jpg", "photos", "has only 8x8 pixels")] * 3)),
         f"/scene: in use by {Holder()}; wait until it ends, stop it, or use another folder",
         f"no such film is possible: {error_of(lambda: PageFilm([]))}",
         *(

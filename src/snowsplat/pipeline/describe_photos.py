@@ -9,6 +9,7 @@ from typing import Any
 
 from snowsplat.data.maps.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import measure_speed, steps_of
 from snowsplat.sfm.ingest.photos.photo_files import Header, Unusable, read_header
@@ -34,7 +35,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
     headers, left_out = _headers(sources.photos), list(sources.left_out)
     unusable = {name: header for name, header in headers.items() if isinstance(header, str)}
     usable = [header for header in headers.values() if isinstance(header, Header)]
-    left_out += unusable.items()
+    left_out += [LeftOut(name, "photos", why) for name, why in unusable.items()]
     photos = survey(sources)
     speed = measure_speed(thread_count(None))
     steps = steps_of(photos, PRESETS["normal"].photos, "normal").values()
@@ -45,7 +46,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
         "path": str(path),
         **(_of_photos(usable, sources.photos) if sources.photos else {}),
         **({"videos": _of_videos(sources.videos)} if sources.videos else {}),
-        **_first(left_out, "not_used"),
+        **_first([(each.photo, each.reason) for each in left_out], "not_used"),
         **_first([(shown(p), "has no photo") for p in sources.unused_masks], "unused_masks"),
         **({} if doubt is None else {"doubtful": doubt}),
         "camera_poses": f"none; to estimate them takes about {time}",

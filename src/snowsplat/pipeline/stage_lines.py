@@ -14,13 +14,13 @@ def described(stage: str, result: dict[str, Any]) -> list[str]:
 
 
 def _photos(gathered: dict[str, Any]) -> list[str]:
-    photos, skipped = gathered["photos"], gathered["skipped"]
+    photos, left_out = gathered["photos"], gathered["left_out"]
     masks = sum(bool(photo.get("mask")) for photo in photos)
     line = f"{len(photos)} photos" + (f" ({masks} with masks)" if masks else "")
-    if skipped:
-        line += f", {len(skipped)} skipped"
+    if left_out:
+        line += f", {len(left_out)} skipped"
     notes = gathered.get("notes", [])
-    return [line, *notes, *_listed([f"{source}: {why}" for source, why in skipped])]
+    return [line, *notes, *_listed([f"{each['photo']}: {each['reason']}" for each in left_out])]
 
 
 def _poses(sfm: dict[str, Any]) -> list[str]:

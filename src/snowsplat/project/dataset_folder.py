@@ -13,6 +13,7 @@ The layout is that of the reference implementation's convert.py.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,11 +95,15 @@ class DatasetFolder:
 
     def left_out(self) -> list[LeftOut]:
         """The photos that the stages "photos" and "poses" have left out."""
-        skipped, unregistered = (
-            dict(self.result("photos").get("skipped") or {}),
-            dict(self.result("poses").get("unregistered") or {}),
-        )
-        return [
-            *(LeftOut(str(photo), "photos", str(why)) for photo, why in skipped.items()),
-            *(LeftOut(str(photo), "poses", str(why)) for photo, why in unregistered.items()),
-        ]
+        try:
+            return left_out_of(self.result("photos"), self.result("poses"))
+        except (TypeError, AttributeError):  # a damaged record
+            return []
+
+
+def left_out_of(photos: Mapping[str, Any], poses: Mapping[str, Any]) -> list[LeftOut]:
+    """The photos that these stages have left out; their results are those of the record."""
+    return [
+        *(LeftOut(**values) for values in photos.get("left_out", [])),
+        *(LeftOut(photo, "poses", why) for photo, why in poses.get("unregistered", {}).items()),
+    ]

@@ -39,7 +39,7 @@ from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_folder, remove_temporaries
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.run_lock import LOCK, one_run
 from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
@@ -58,7 +58,7 @@ class Watcher(Protocol):
     def end(self, stage: str, outcome: Outcome) -> None:
         """Called when the stage is finished, now or in an earlier run."""
 
-    def note(self, line: str) -> None:
+    def note(self, line: Message | str) -> None:
         """Called with a line of information for the user."""
 
     def show_poses(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from snowsplat.sfm.ingest.inputs import gather
-from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photo import Photo, not_used
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import silent
@@ -44,7 +44,7 @@ def test_ready_photos_are_linked_unchanged(tmp_path):
     assert [p.name for p in made.photos] == files(root)
     assert content(tmp_path / "out" / "input") == content(root)
     assert (tmp_path / "out" / "input" / "0.jpg").samefile(root / "0.jpg")
-    assert made.skipped == []
+    assert made.left_out == []
     assert made.photos[0] == Photo(
         name="0.jpg",
         source=str(root / "0.jpg"),
@@ -164,7 +164,7 @@ def test_a_completely_masked_photo_is_skipped(tmp_path):
     (root / "masks").mkdir()
     Image.new("L", (WIDTH, HEIGHT)).save(root / "masks" / "1.png")
     made = gathered(root, tmp_path / "out")
-    assert made.skipped == [(str(root / "1.jpg"), "is completely masked out")]
+    assert made.left_out == [not_used(root / "1.jpg", "is completely masked out")]
     assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
 
 
@@ -177,7 +177,7 @@ def test_unusable_photos_are_skipped_and_named(tmp_path):
     made = gathered(root, tmp_path / "out")
     assert [p.name for p in made.photos] == ["0.jpg", "2.jpg", "3.jpg"]
     assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
-    reasons = {os.path.basename(source): reason for source, reason in made.skipped}
+    reasons = {os.path.basename(each.photo): each.reason for each in made.left_out}
     assert reasons.keys() == {"1.jpg", "text.jpg", "cap.png"}
     assert "truncated" in reasons["1.jpg"]
     assert "not an image of a known format" in reasons["text.jpg"]
@@ -233,7 +233,7 @@ def test_input_in_place_is_not_changed(tmp_path):
     before = content(root)
     made = gathered(root, dataset)
     assert [p.name for p in made.photos] == ["0.jpg", "1.jpg", "2.jpg"]
-    assert made.skipped[0][0].endswith("3.jpg")
+    assert made.left_out[0].photo.endswith("3.jpg")
     assert content(root) == before
     assert files(dataset / "distorted") == ["masks/0.jpg.png"]
 
@@ -268,9 +268,9 @@ def test_broken_links_are_named(tmp_path):
     for name in ("x.jpg", "y.jpg", "notes.txt"):
         (root / name).symlink_to(tmp_path / "missing" / name)
     made = gathered(root, tmp_path / "out")
-    ((folder, reason),) = made.skipped
-    assert folder == str(root)
-    assert "missing: x.jpg and 1 more" in reason
+    (found,) = made.left_out
+    assert found.photo == str(root)
+    assert "missing: x.jpg and 1 more" in found.reason
     for photo_file in root.glob("[0-9].jpg"):
         photo_file.unlink()
     with pytest.raises(UserError, match="has links to files that are missing: x.jpg"):
@@ -371,7 +371,7 @@ def test_fewer_photos_are_evenly_spread_by_name(tmp_path):
     some = gathered(root, tmp_path / "some", photos=4)
     assert [p.name for p in some.photos] == [names[i] for i in (0, 4, 7, 11)]
     assert files(tmp_path / "some" / "input") == sorted(p.name for p in some.photos)
-    assert some.skipped == []
+    assert some.left_out == []
     assert len(gathered(root, tmp_path / "all", photos=20).photos) == 12
     with pytest.raises(UserError, match="photos"):
         gathered(root, tmp_path / "none", photos=0)
@@ -421,6 +421,6 @@ def test_an_animation_is_named(tmp_path, ending):
     pages[0].save(root / f"a.{ending}", save_all=True, append_images=pages[1:])
     made = gathered(root, tmp_path / "out")
     assert len(made.photos) == 4
-    assert [reason for _, reason in made.skipped] == [
+    assert [each.reason for each in made.left_out] == [
         "is an animation of 4 pictures, of which one is used; save the others as photos or a video"
     ]

@@ -66,7 +66,13 @@ def facts(**sfm: Any) -> dict[str, Any]:
             "photos": [
                 {"name": name, "sequence": "walk.mp4" if name[0] == "0" else None} for name in NAMES
             ],
-            "skipped": [["/photos/bad <script>.jpg", "cannot be decoded"]],
+            "left_out": [
+                {
+                    "photo": "/photos/bad <script>.jpg",
+                    "stage": "photos",
+                    "reason": "cannot be decoded",
+                }
+            ],
         },
         "sfm": {
             "registered": NAMES,

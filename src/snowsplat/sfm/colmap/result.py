@@ -77,8 +77,8 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
     Raises: UserError: there is no model, or the first one is damaged, has none of ``photos``, or
     has photos outside of ``input/``.
     """
-    folder = DatasetFolder(dataset)
-    sparse = folder.distorted_models
+    files = DatasetFolder(dataset)
+    sparse = files.distorted_models
     numbered = sorted(
         (p for p in sparse.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name)
     )
@@ -93,12 +93,12 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
     names = names_in(models[0])
     for name in names:
         # `undistort` uses these names as paths.
-        if inside(folder.photos, name) is None:
+        if inside(files.photos, name) is None:
             raise _cannot_skip(
-                f"the model in {numbered[0]} has a photo {quoted(name)} outside of {folder.photos}"
+                f"the model in {numbered[0]} has a photo {quoted(name)} outside of {files.photos}"
             )
     if not names & {photo.name for photo in photos}:
-        raise _cannot_skip(f"the model in {numbered[0]} has none of the photos in {folder.photos}")
+        raise _cannot_skip(f"the model in {numbered[0]} has none of the photos in {files.photos}")
     unregistered = {
         p.name: "it is not in the existing model" for p in photos if p.name not in names
     }

@@ -12,11 +12,12 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from snowsplat.data.maps.mask_look import doubt_about_masks
 from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.ingest.content.panorama import STITCHED, is_twice_as_wide, spherical_video
 from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.photo import Photo
@@ -38,15 +39,16 @@ from snowsplat.util.natural_order import natural_key
 
 logger = logging.getLogger(__name__)
 
+_NAMED = 3  # photos that an error names
+
 
 @dataclass(frozen=True)
 class Gathered:
-    """The usable photos and frames, in natural order of names, and the skipped ones."""
+    """The usable photos and frames, in natural order of names, and the others."""
 
     photos: list[Photo]
-    skipped: list[tuple[str, str]]  # file, or file and time of a frame; reason
-    # Lines for the user about what was cropped and masked. Earlier versions did neither.
-    notes: list[str] = field(default_factory=list)
+    left_out: list[LeftOut]
+    notes: list[str]  # lines for the user about what was cropped and masked
 
 
 def gather(
@@ -76,10 +78,10 @@ def gather(
     folder = DatasetFolder(dataset).photos
     for note in sources.notes:
         logger.warning("%s", note)
-    skipped = list(sources.left_out)
+    left_out = list(sources.left_out)
     in_place = sources.contain(folder)
     planned = plan_photos(
-        sources.photos, options.size, skipped, options.panoramas, options.as_stored
+        sources.photos, options.size, left_out, options.panoramas, options.as_stored
     )
     if options.photos is not None:
         planned = evenly_spread(planned, options.photos)
@@ -91,10 +93,10 @@ def gather(
     notes: list[str] = []
     _check_disk_space(dataset, planned, clips, options)
     try:
-        photos, looks = write_photos(planned, dataset, options.size, in_place, skipped, report)
+        photos, looks = write_photos(planned, dataset, options.size, in_place, left_out, report)
         photos = _with_panoramas(photos)
         for (source, clip), panorama in zip(clips, around, strict=True):
-            photos += _take_frames(source, clip, folder, options, panorama, skipped, notes, report)
+            photos += _take_frames(source, clip, folder, options, panorama, left_out, notes, report)
         photos.sort(key=lambda photo: natural_key(photo.name))
         photos, found = set_fixed_parts_aside(photos, dataset, in_place)
         notes += found
@@ -114,8 +116,8 @@ def gather(
     if doubt := doubt_about_masks(looks):
         logger.warning("warning: %s", doubt)
     if len(photos) < MIN_PHOTOS:
-        raise _too_few(len(photos), skipped)
-    return Gathered(photos, skipped, notes)
+        raise _too_few(len(photos), left_out)
+    return Gathered(photos, left_out, notes)
 
 
 def _with_panoramas(photos: list[Photo]) -> list[Photo]:
@@ -176,7 +178,7 @@ def _take_frames(
     folder: Path,
     options: GatherOptions,
     panorama: bool,
-    skipped: list[tuple[str, str]],
+    left_out: list[LeftOut],
     notes: list[str],
     report: Report,
 ) -> list[Photo]:
@@ -186,7 +188,10 @@ def _take_frames(
     frames = extract_frames(clip, frame_folder, max_frames, options.size, report, panorama)
     label = source.path.name if not source.name else source.name
     notes += [f"{label}: {line}" for line in frames.notes]
-    skipped += [(f"{label} at {seconds:.1f} s", reason) for seconds, reason in frames.skipped]
+    left_out += [
+        LeftOut(f"{label} at {seconds:.1f} s", "photos", reason)
+        for seconds, reason in frames.skipped
+    ]
     return [
         Photo(
             name=str(PurePosixPath(source.name) / frame.name),
@@ -237,24 +242,25 @@ def _check_disk_space(
         )
 
 
-def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
-    """The error if too few images are usable; it explains the most frequent reason for skipping."""
-    reasons = Counter(reason for _, reason in skipped)
+def _too_few(usable: int, left_out: Sequence[LeftOut]) -> UserError:
+    """The error if too few images are usable; it explains the most frequent reason."""
+    reasons = Counter(each.reason for each in left_out)
     reason, often = reasons.most_common(1)[0] if reasons else ("", 0)
-    everything = usable == 0 and often == len(skipped)
-    who = f"all {often} images" if everything else f"{often} of {usable + len(skipped)} images"
-    if often < 2 or often < len(skipped) / 2:
-        left_out = "".join(f"; {source} {why}" for source, why in skipped[:3])
-        left_out += f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
+    everything = usable == 0 and often == len(left_out)
+    who = f"all {often} images" if everything else f"{often} of {usable + len(left_out)} images"
+    if often < 2 or often < len(left_out) / 2:
+        reasons_of_some = "".join(f"; {each.photo} {each.reason}" for each in left_out[:_NAMED])
+        if len(left_out) > _NAMED:
+            reasons_of_some += f"; and {len(left_out) - _NAMED} more"
         return UserError(
             "photos: {count}; use at least {min_photos}, preferably 20 or more, from different "
             "places around the scene{left_out}",
             count=_count(usable),
             min_photos=MIN_PHOTOS,
-            left_out=left_out,
+            left_out=reasons_of_some,
         )
     if reason == SAME_VIEW:
-        video = skipped[0][0].partition(" at ")[0]
+        video = left_out[0].photo.partition(" at ")[0]
         return UserError(
             "{video}: the camera does not move ({who} show the same view), but depth needs "
             "motion; film while walking around the scene",
@@ -280,7 +286,7 @@ def _too_few(usable: int, skipped: Sequence[tuple[str, str]]) -> UserError:
             "in good light and in focus",
             who=who,
         )
-    first = next(source for source, why in skipped if why == reason)
+    first = next(each.photo for each in left_out if each.reason == reason)
     return UserError(
         "photos: {count}; {who} cannot be used, e.g. {first}, which {reason}; use at least "
         "{min_photos}, preferably 20 or more",

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+
+from snowsplat.project.left_out import LeftOut
+from snowsplat.util.files import shown
 
 Direction = tuple[float, float, float]
 
@@ -41,3 +45,8 @@ class Photo:
     panorama: bool = False  # equirectangular, of all directions
     turned: int = 1  # EXIF orientation if the pixels in input/ are not upright
     circle: float | None = None  # radius in pixels, if the picture is a disc, as of a fisheye lens
+
+
+def not_used(path: Path, reason: str) -> LeftOut:
+    """A photo, video or folder that is not used. ``reason`` continues its name."""
+    return LeftOut(shown(path), "photos", reason)

@@ -18,7 +18,7 @@ from snowsplat.data.colmap import posed_camera, read_model, read_points
 from snowsplat.data.frame.placement import placement_of
 from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.evaluation.verdict import Verdict
-from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.dataset_folder import DatasetFolder, left_out_of
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.report.more_photos import Advice, advice
@@ -94,7 +94,7 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         "strip": _strip(dataset, names),
         "lenses": [_lens(camera) for camera in sfm["cameras"]],
         "sizes": [f"{width} × {height}" for width, height, *_ in undistorted["sizes"]],
-        "unused": [*sfm["unregistered"].items(), *gathered["skipped"]],
+        "unused": sorted(left_out_of(gathered, sfm), key=lambda each: each.stage != "poses"),
         "listed": _MAX_UNUSED,
         "stages": _STAGES,
         "longest": max([*facts["seconds"].values(), 1e-9]),

@@ -15,6 +15,7 @@ from snowsplat.sfm.ingest.content.panorama import (
     spherical_video,
 )
 from snowsplat.sfm.ingest.inputs import gather
+from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
@@ -158,7 +159,7 @@ def test_panoramas_are_recognised(tmp_path, xmp):
         (f"{i}.jpg", True) for i in range(4)
     ]
     assert len({photo.group for photo in made.photos}) == 1
-    assert not made.skipped
+    assert not made.left_out
 
 
 def test_missing_rows_are_black_and_masked(tmp_path):
@@ -207,7 +208,7 @@ def test_photos_are_panoramas_if_the_user_says_so(tmp_path):
     photo(5).save(source / "flat.png")
     made = gathered(source, tmp_path / "out", panoramas=True)
     assert [photo.panorama for photo in made.photos] == [True] * 3
-    assert made.skipped == [(str(source / "flat.png"), NOT_TWICE_AS_WIDE)]
+    assert made.left_out == [not_used(source / "flat.png", NOT_TWICE_AS_WIDE)]
 
 
 def test_stitched_panoramas_are_refused_by_name(tmp_path):

@@ -13,7 +13,7 @@ from ...pictures import photo, write_photos
 
 def copies(root):
     names = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*.*"))]
-    return {copy.name: copy.used for copy in find_copies(root, names)}
+    return find_copies(root, names)
 
 
 def test_equal_files_have_any_names(tmp_path):

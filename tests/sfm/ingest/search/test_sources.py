@@ -42,7 +42,7 @@ def test_symbolic_links_and_cycles(tmp_path):
     found = find_sources([root])
     expected = ["0.jpg", "1.jpg", "2.jpg", "linked/0.jpg", "linked/1.jpg", "linked/2.jpg"]
     assert [s.name for s in found.files] == expected
-    assert found.left_out == [
+    assert [(each.photo, each.reason) for each in found.left_out] == [
         (str(root), "has links to files that are missing: broken.jpg; copy the files here"),
         (str(root / "one more.jpg"), "is the same picture as 0.jpg"),
     ]
@@ -63,7 +63,7 @@ def test_videos_beside_photos_are_skipped_and_named(tmp_path):
     write_video(root / "9.MOV", pan(3))
     found = find_sources([root])
     assert [s.name for s in found.files] == ["0.jpg", "1.jpg", "2.jpg"]
-    assert found.left_out[0][0].endswith("9.MOV")
+    assert found.left_out[0].photo.endswith("9.MOV")
     for name in ("0.jpg", "1.jpg", "2.jpg"):
         os.remove(root / name)
     assert names(root) == [""]
@@ -109,7 +109,7 @@ def test_masks_maps_thumbnails_and_copies_are_no_photos(tmp_path):
         "1.jpg": None,
         "2.jpg": "2_mask.png",
     }
-    assert {name.removeprefix(f"{root}/") for name, _ in found.left_out} == {
+    assert {each.photo.removeprefix(f"{root}/") for each in found.left_out} == {
         *("depth", "thumbnails", "confidence_maps", "0_depth.png", "1 (1).jpg")
     }
     assert found.unused_masks == [root / "7_mask.png"]

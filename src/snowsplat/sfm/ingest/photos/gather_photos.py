@@ -16,6 +16,7 @@ from PIL import Image
 
 from snowsplat.data.maps.mask_look import MaskLook, look_of
 from snowsplat.project.dataset_folder import DatasetFolder
+from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.ingest.content.panorama import (
     NOT_TWICE_AS_WIDE,
     Panorama,
@@ -23,7 +24,7 @@ from snowsplat.sfm.ingest.content.panorama import (
     shows_all_around,
 )
 from snowsplat.sfm.ingest.content.sharpness import CONTENT_SIDE, grey_copy, why_unusable
-from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photo import Photo, not_used
 from snowsplat.sfm.ingest.photos.mask_files import read_mask, write_mask
 from snowsplat.sfm.ingest.photos.photo_files import (
     Header,
@@ -53,14 +54,14 @@ class Planned:
 def plan_photos(
     sources: Sequence[Source],
     longest: int | None,
-    skipped: list[tuple[str, str]],
+    left_out: list[LeftOut],
     panoramas: bool = False,
     as_stored: bool = False,
 ) -> list[Planned]:
     """Choose the name of each photo in ``input/``. Photos are sorted by this name.
 
     If two photos would have the same name, the one whose name need not change keeps it. Photos that
-    cannot be used are appended to ``skipped``, with the reason.
+    cannot be used are appended to ``left_out``.
 
     Args:
         panoramas: all photos are 360° panoramas, even if their metadata do not say so.
@@ -75,13 +76,12 @@ def plan_photos(
             if panoramas:
                 header = _as_panorama(header)
         except Unusable as error:
-            skipped.append((shown(source.path), str(error)))
+            left_out.append(not_used(source.path, str(error)))
         else:
             if header.animated > 1:
                 reason = f"is an animation of {header.animated} pictures, of which one is used; "
-                skipped.append(
-                    (shown(source.path), reason + "save the others as photos or a video")
-                )
+                reason += "save the others as photos or a video"
+                left_out.append(not_used(source.path, reason))
             name = header.file_name(source.name, longest)
             read += [(_page_name(name, page), source, header, page) for page in header.pages]
     read.sort(key=lambda entry: (entry[0] != entry[1].name, entry[0]))
@@ -115,14 +115,13 @@ def write_photos(
     dataset: Path,
     longest: int | None,
     in_place: bool,
-    skipped: list[tuple[str, str]],
+    left_out: list[LeftOut],
     report: Report,
 ) -> tuple[list[Photo], list[MaskLook]]:
     """Write photos to ``input/``, and their masks to ``distorted/masks``, in up to four threads.
 
     Each thread has one photo in memory. The photos have the order of ``planned``, and so have the
-    looks of the masks of some of them. Photos that cannot be used are appended to ``skipped``, with
-    the reason.
+    looks of the masks of some of them. Photos that cannot be used are appended to ``left_out``.
 
     Args:
         longest: largest allowed longest side in pixels; None: any.
@@ -142,7 +141,7 @@ def write_photos(
             zip(planned, pool.map(work, planned), strict=True), 1
         ):
             if isinstance(outcome, str):
-                skipped.append((shown(plan.source.path), outcome))
+                left_out.append(not_used(plan.source.path, outcome))
             else:
                 photos.append(outcome[0])
                 looks += [look for look in outcome[1:] if look is not None]

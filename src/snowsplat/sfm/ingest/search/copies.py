@@ -43,14 +43,6 @@ _SAMPLE = 5
 
 
 @dataclass(frozen=True)
-class Copy:
-    """A photo that is left out, and the photo of the same picture that is used."""
-
-    name: str
-    used: str
-
-
-@dataclass(frozen=True)
 class _Kind:
     """What the names of files have in common that were copied in one way."""
 
@@ -59,8 +51,8 @@ class _Kind:
     added: str  # to the name
 
 
-def find_copies(root: Path, names: Sequence[str]) -> list[Copy]:
-    """The photos that can be left out, in the order of ``names``.
+def find_copies(root: Path, names: Sequence[str]) -> dict[str, str]:
+    """The photos that can be left out, in the order of ``names``, and those that are used instead.
 
     Of the photos of one picture, that with a transparent background is used, else the largest one.
 
@@ -95,7 +87,7 @@ def find_copies(root: Path, names: Sequence[str]) -> list[Copy]:
     used = {
         name: best for group in same.groups() for best in [_best(root, group)] for name in group
     }
-    return [Copy(name, used[name]) for name in names if used.get(name, name) != name]
+    return {name: used[name] for name in names if used.get(name, name) != name}
 
 
 class _Groups:

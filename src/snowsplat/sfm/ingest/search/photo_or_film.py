@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from snowsplat.project.left_out import LeftOut
+from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
 from snowsplat.sfm.ingest.video.clip import film_size, why_no_video
 
@@ -18,11 +20,11 @@ MIN_PHOTOS = 3
 
 @dataclass
 class Chosen:
-    """Files relative to their folder; and path and reason of each of the others."""
+    """Files relative to their folder, and the others."""
 
     photos: list[str]
     videos: list[str]
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
 
 
 def photos_or_films(root: Path, photos: Sequence[str], videos: Sequence[str]) -> Chosen:
@@ -44,17 +46,16 @@ def photos_or_films(root: Path, photos: Sequence[str], videos: Sequence[str]) ->
         others += 1
         if others == MIN_PHOTOS:
             reason = "is a video in a folder of photos; add it as an input to use its frames"
-            return Chosen(list(photos), [], [(video, reason) for video in videos])
+            return Chosen(list(photos), [], [not_used(root / video, reason) for video in videos])
     unreadable = {video: why for video in videos if (why := why_no_video(root / video))}
     readable = [video for video in videos if video not in unreadable]
+    left_out = [not_used(root / video, why) for video, why in unreadable.items()]
     if not readable:
         # Without photos, reading the videos raises the error that says what is wrong.
-        return (
-            Chosen(list(photos), [], list(unreadable.items())) if photos else Chosen([], [*videos])
-        )
+        return Chosen(list(photos), [], left_out) if photos else Chosen([], [*videos])
     few = "is beside a video, and too few for a scene; the video is used"
-    unused = [(photo, thumbnails.get(photo, few)) for photo in photos]
-    return Chosen([], readable, [*unused, *unreadable.items()])
+    unused = [not_used(root / photo, thumbnails.get(photo, few)) for photo in photos]
+    return Chosen([], readable, [*unused, *left_out])
 
 
 def _stem(name: str) -> str:

@@ -13,7 +13,9 @@ from snowsplat.data.files.listing import files_below, folder_kind, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
 from snowsplat.data.readers import photo_folder, poses_in
+from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import is_output
+from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
@@ -70,7 +72,7 @@ class Sources:
     Attributes:
         inputs: the files and folders that were searched.
         files: in the order of the inputs; files of a folder are in natural order.
-        left_out: path and reason of each photo, video or folder that is not used.
+        left_out: the photos, videos and folders that are not used.
         unused_masks: masks without a photo.
         notes: lines for the user.
         posed: the folder with camera poses, if it is the only input.
@@ -78,7 +80,7 @@ class Sources:
 
     inputs: tuple[Path, ...]
     files: list[Source]
-    left_out: list[tuple[str, str]]
+    left_out: list[LeftOut]
     unused_masks: list[Path]
     notes: list[str] = field(default_factory=list)
     posed: Path | None = None
@@ -118,7 +120,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     if not inputs:
         raise UserError("inputs: none given; add a folder of photos, photos or a video")
     files: list[Source] = []
-    left_out: list[tuple[str, str]] = []
+    left_out: list[LeftOut] = []
     unused: list[Path] = []
     notes: list[str] = []
     posed: Path | None = None
@@ -128,7 +130,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     def add(source: Source) -> None:
         real = source.path.resolve()
         if real in seen:
-            left_out.append((shown(source.path), f"is the same file as {shown(seen[real])}"))
+            left_out.append(not_used(source.path, f"is the same file as {shown(seen[real])}"))
         else:
             seen[real] = source.path
             files.append(source)
@@ -162,8 +164,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         found = _search(photos_in)
         chosen = photos_or_films(photos_in, found.photos, found.videos)
         prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
-        left_out += found.left_out
-        left_out += [(shown(photos_in / file), reason) for file, reason in chosen.left_out]
+        left_out += found.left_out + chosen.left_out
         for relative in chosen.photos:
             name = str(PurePosixPath(prefix) / shown(relative))
             add(Source(photos_in / relative, "photo", name, found.masks.of.get(relative)))
@@ -184,7 +185,7 @@ class _Folder:
     photos: list[str] = field(default_factory=list)
     videos: list[str] = field(default_factory=list)
     masks: FoundMasks = field(default_factory=FoundMasks)
-    left_out: list[tuple[str, str]] = field(default_factory=list)  # file or folder; reason
+    left_out: list[LeftOut] = field(default_factory=list)
 
 
 def _search(root: Path) -> _Folder:
@@ -193,13 +194,13 @@ def _search(root: Path) -> _Folder:
 
     def enter(folder: Path, names: list[str]) -> Iterator[str]:
         for name in names:
-            reason = _why_left_out(name, names)
+            reason = _why_not_searched(name, names)
             if is_output(folder / name) or folder_kind(name) == "masks":
                 continue
             if reason is None:
                 yield name
             else:
-                found.left_out.append((shown(folder / name), reason))
+                found.left_out.append(not_used(folder / name, reason))
 
     broken: list[str] = []
     files = files_below(root, enter, broken)
@@ -208,17 +209,16 @@ def _search(root: Path) -> _Folder:
         files = files_below(root, _masks_and_outputs)
     photos = [file for file in files if _is_photo_name(file)]
     if unread := _unread_photos(files, photos):
-        found.left_out.append((shown(root), unread))
+        found.left_out.append(not_used(root, unread))
     if links := _broken_links(broken):
-        found.left_out.append((shown(root), links))
+        found.left_out.append(not_used(root, links))
     found.videos = [file for file in files if _is_video_name(file)]
-    no_views = {
-        copy.name: f"is the same picture as {copy.used}" for copy in find_copies(root, photos)
-    }
+    copies = find_copies(root, photos)
+    no_views = {name: f"is the same picture as {used}" for name, used in copies.items()}
     no_views |= {
         map_: f"is a {kind} of another photo" for map_, kind in _maps_beside(photos).items()
     }
-    found.left_out += [(shown(root / name), reason) for name, reason in no_views.items()]
+    found.left_out += [not_used(root / name, reason) for name, reason in no_views.items()]
     photos = [photo for photo in photos if photo not in no_views]
     found.masks = find_masks(root, photos)
     found.photos = [photo for photo in photos if photo not in found.masks.beside]
@@ -262,7 +262,7 @@ def _broken_links(broken: Sequence[str]) -> str | None:
     return f"has links to files that are missing: {shown(links[0])}{others}; copy the files here"
 
 
-def _why_left_out(name: str, siblings: Sequence[str]) -> str | None:
+def _why_not_searched(name: str, siblings: Sequence[str]) -> str | None:
     """Why a folder is not searched; None if it is."""
     kind, original = folder_kind(name), original_of(name, siblings, divided=False)
     if kind == "maps":
