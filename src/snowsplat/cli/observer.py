@@ -12,7 +12,7 @@ from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     from snowsplat.pipeline.observer import Page
@@ -40,11 +40,11 @@ class TerminalObserver(Observer):
         self._stages.hide()
         self.steps_end()
 
-    def note(self, line: str) -> None:
+    def note(self, line: Message | str) -> None:
         if self._steps is not None:
-            self._steps.say(line)
+            self._steps.say(str(line))
         else:
-            self._stages.say(line)
+            self._stages.say(str(line))
 
     def begin(self, stage: str) -> Report:
         return self._stages.begin(stage)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from snowsplat.pipeline.run.train_result import TrainResult
     from snowsplat.sfm.report.scene_map import PlacedPhoto
     from snowsplat.training.core.progress import Progress
+    from snowsplat.util.messages import Message
     from snowsplat.util.stages import Outcome
 
 
@@ -34,7 +35,7 @@ class Observer:
     training also reports its steps.
     """
 
-    def note(self, line: str) -> None:
+    def note(self, line: Message | str) -> None:
         """A line of information for the user."""
 
     def begin(self, stage: str) -> Report:

@@ -57,7 +57,7 @@ from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import write_text
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.run_lock import locked
 from snowsplat.util.safe_json import printable
 from snowsplat.util.stages import Outcome
@@ -91,8 +91,8 @@ class _Recorder(Observer):
                 self._scene.write_state(self.state, self._task)
             self._written = time.monotonic()
 
-    def note(self, line: str) -> None:
-        self.state["notes"].append(printable(line))
+    def note(self, line: Message | str) -> None:
+        self.state["notes"].append(printable(str(line)))
         self.write()
 
     def begin(self, stage: str) -> Report:
