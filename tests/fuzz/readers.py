@@ -49,10 +49,11 @@ from snowsplat.formats.spz import write_spz
 from snowsplat.formats.spz_container import unpack
 from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.run.training_files import write_beginning, write_scene
+from snowsplat.project.left_out import LeftOut
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
-from snowsplat.sfm import dataset_folder
+from snowsplat.sfm import make_dataset
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photos import mask_files, photo_files
@@ -613,18 +614,22 @@ _PHOTO = Photo("a.jpg", "a.jpg", 80, 60, "g", None, 70.5, (1.0, 2.0, 3.0), False
 
 
 def _make_stages(folder: Path) -> None:
-    stages = Stages(folder / "sfm.json", dataset_folder.STAGES)
+    stages = Stages(folder / "sfm.json", make_dataset.STAGES)
     stages.about = {"inputs": ["x"]}
-    gathered = asdict(Gathered([_PHOTO], [("b.jpg", "is black")]))
+    gathered = asdict(Gathered([_PHOTO], [LeftOut("b.jpg", "photos", "is black")], []))
     stages.run("photos", {"size": None}, [folder], lambda: gathered)
 
 
 def _read_stages(folder: Path) -> Any:
-    stages = Stages(folder / "sfm.json", dataset_folder.STAGES)
+    stages = Stages(folder / "sfm.json", make_dataset.STAGES)
     done = stages.run(
-        "photos", {"size": None}, [folder], lambda: asdict(Gathered([_PHOTO], [])), lambda _: None
+        "photos",
+        {"size": None},
+        [folder],
+        lambda: asdict(Gathered([_PHOTO], [], [])),
+        lambda _: None,
     )
-    return dataset_folder._photos(folder, done.result)
+    return make_dataset._photos(folder, done.result)
 
 
 def _make_lpips(folder: Path) -> None:

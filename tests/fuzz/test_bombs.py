@@ -28,7 +28,7 @@ from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.spz_container import Header, pack
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.camera_json import read_cameras
-from snowsplat.sfm import dataset_folder
+from snowsplat.sfm import make_dataset
 from snowsplat.sfm.colmap.process import check_model
 from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest.photos import photo_files
@@ -512,7 +512,7 @@ def test_json_files(tmp_path, rejected, text):
     path.write_text(text)
     (out / "config.json").write_text(text)
     rejected(lambda: read_cameras(path))
-    rejected(lambda: Stages(path, dataset_folder.STAGES))
+    rejected(lambda: Stages(path, make_dataset.STAGES))
     rejected(lambda: load_dataset(path))
     rejected(lambda: TrainingFolder(out).settings())
     empty = guarded(lambda: History.read(path, 9), tmp_path, path.stat().st_size)

@@ -3,8 +3,7 @@
 import pytest
 
 from snowsplat.pipeline.make_plan import MakePlan, choose_plan, described
-from snowsplat.sfm.cost import Speed, steps_of
-from snowsplat.sfm.survey import Photos
+from snowsplat.sfm.cost import Photos, Speed, steps_of
 
 FAST = Speed(0.1, 16)
 HERE = Speed(1.0, 2)

@@ -5,8 +5,7 @@ import itertools
 import pytest
 
 from snowsplat.sfm import time_left
-from snowsplat.sfm.cost import Step, share_of_poses, steps_of
-from snowsplat.sfm.survey import Photos
+from snowsplat.sfm.cost import Photos, Step, share_of_poses, steps_of
 from snowsplat.sfm.time_left import Later, SfmTimeLeft, TimeLeft
 
 STEPS = {"features": Step(60.0), "verified": Step(30.0), "poses": Step(100.0, 1)}

@@ -11,12 +11,11 @@ from snowsplat.data.maps.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.colmap.options import thread_count
-from snowsplat.sfm.cost import measure_speed, steps_of
+from snowsplat.sfm.cost import measure_speed, steps_of, survey
 from snowsplat.sfm.ingest.photos.photo_files import Header, Unusable, read_header
 from snowsplat.sfm.ingest.search.archive import files_in
 from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sources
 from snowsplat.sfm.ingest.video.clip import max_frame_count, read_clip
-from snowsplat.sfm.survey import survey
 from snowsplat.util.duration import duration
 from snowsplat.util.files import shown
 

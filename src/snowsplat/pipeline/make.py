@@ -39,11 +39,10 @@ from snowsplat.project.training_folder import (
     DatasetSettings,
     TrainingFolder,
 )
-from snowsplat.sfm.cost import measure_speed
+from snowsplat.sfm.cost import measure_speed, survey
 from snowsplat.sfm.ingest.search.sources import Sources, find_sources
 from snowsplat.sfm.make_dataset import make_dataset
 from snowsplat.sfm.options import DatasetOptions, GatherOptions, SfmOptions
-from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later
 from snowsplat.training.core import checkpoint
 from snowsplat.training.settings.recipes import recipe

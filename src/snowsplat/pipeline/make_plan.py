@@ -24,8 +24,7 @@ from dataclasses import dataclass, replace
 
 from snowsplat.pipeline.quality import PRESETS, Quality
 from snowsplat.sfm.colmap.options import EFFORTS
-from snowsplat.sfm.cost import Speed, steps_of
-from snowsplat.sfm.survey import Photos
+from snowsplat.sfm.cost import Photos, Speed, steps_of
 from snowsplat.util.duration import duration
 
 #: The share of the time that everything before the training may take.

@@ -22,6 +22,7 @@ from snowsplat.data.frame.placement import PLACEMENT
 from snowsplat.project.dataset_folder import IMAGE_FOLDERS, RECORD, REPORT, DatasetFolder
 from snowsplat.sfm.colmap import describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
+from snowsplat.sfm.cost import survey
 from snowsplat.sfm.ingest.inputs import Gathered, gather
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.search.sources import Sources, find_sources
@@ -34,7 +35,6 @@ from snowsplat.sfm.report.coverage import measure_coverage
 from snowsplat.sfm.report.dataset_report import write_report
 from snowsplat.sfm.report.photo_problems import problems
 from snowsplat.sfm.report.scene_map import PlacedPhoto
-from snowsplat.sfm.survey import survey
 from snowsplat.sfm.time_left import Later, SfmTimeLeft
 from snowsplat.sfm.undistort import undistort
 from snowsplat.util.errors import UserError

@@ -29,9 +29,9 @@ from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.cost import Step, expected_pairs, share_of_poses, steps_of, steps_of_pairs
 
 if TYPE_CHECKING:
+    from snowsplat.sfm.cost import Photos
     from snowsplat.sfm.options import EffortName
     from snowsplat.sfm.progress import Report
-    from snowsplat.sfm.survey import Photos
 
 #: The initial value of the slowness of a step counts as much as this share of its work.
 _PRIOR = 0.1

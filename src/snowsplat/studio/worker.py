@@ -44,12 +44,11 @@ from snowsplat.pipeline.stage_lines import described
 from snowsplat.project.edit_record import shown_file
 from snowsplat.project.project import Project
 from snowsplat.sfm.colmap.options import thread_count
-from snowsplat.sfm.cost import Step, measure_speed, steps_of
+from snowsplat.sfm.cost import Step, measure_speed, steps_of, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.report.dataset_report import draw_from_above
 from snowsplat.sfm.report.scene_map import PlacedPhoto
-from snowsplat.sfm.survey import survey
 from snowsplat.studio import changes
 from snowsplat.studio.changes import existing_reports, film_plan, finished
 from snowsplat.studio.library import TASKS, Scene, version_of

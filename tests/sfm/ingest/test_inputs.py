@@ -325,9 +325,9 @@ def test_too_few_photos(tmp_path):
     ("options", "message"),
     [
         ({"fps": 2.0, "frames": 60}, "fps: cannot be combined with frames"),
-        ({"fps": 0.0}, "fps: 0 is not a positive number"),
-        ({"fps": float("nan")}, "fps: nan is not a positive number"),
-        ({"frames": 2}, "frames: 2 is too few"),
+        ({"fps": 0.0}, "fps: 0.0 is too small"),
+        ({"fps": float("nan")}, "fps: nan is not finite"),
+        ({"frames": 2}, "frames: 2 is too small"),
         ({"size": 50}, "size: 50 is too small"),
     ],
 )

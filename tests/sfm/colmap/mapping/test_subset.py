@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from snowsplat.sfm.colmap.mapping.subset import spread_subset
-from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph
+from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
 
 COUNT = 40
 

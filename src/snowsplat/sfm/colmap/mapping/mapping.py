@@ -23,8 +23,7 @@ from snowsplat.sfm.colmap.features.alignment import align_features
 from snowsplat.sfm.colmap.features.extraction import SEED
 from snowsplat.sfm.colmap.lenses.lens import robust_adjustment
 from snowsplat.sfm.colmap.mapping.incremental import IncrementalMapper
-from snowsplat.sfm.colmap.mapping.subset import spread_subset
-from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph
+from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
 from snowsplat.sfm.colmap.options import photos_with_adjustment
 from snowsplat.sfm.options import Mapper
 from snowsplat.sfm.progress import Report

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from snowsplat.sfm.ingest.video.clip import top_boxes
+
 # Reasons why a photo is unusable.
 STITCHED = "is a stitched panorama, not of all directions"
 NOT_TWICE_AS_WIDE = "is not twice as wide as high, as a 360° panorama is"
@@ -149,19 +151,9 @@ def _version_2(header: bytes, at: int) -> str | None:
 
 def _header(path: Path) -> bytes:
     """The box moov of an mp4 file; empty if there is none."""
-    size = path.stat().st_size
-    with open(path, "rb") as file:
-        start = 0
-        while start + 16 <= size:
-            file.seek(start)
-            head = file.read(16)
-            length = int.from_bytes(head[:4], "big")
-            if length == 1:
-                length = int.from_bytes(head[8:], "big")
-            if head[4:8] == b"moov" and length <= _LONGEST_HEADER:
+    for kind, start, end in top_boxes(path):
+        if kind == b"moov" and end - start <= _LONGEST_HEADER:
+            with open(path, "rb") as file:
                 file.seek(start)
-                return file.read(length)
-            if length < 8 or not head[4:8].isalpha():
-                return b""
-            start += length
+                return file.read(end - start)
     return b""

@@ -56,6 +56,26 @@ class Clip:
     aspect: float = 1.0  # width / height of a stored pixel; differs from 1 for some camcorders
 
 
+def top_boxes(path: Path) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, begin and end of each box of an mp4 file that is in no other box.
+
+    Ends at the first bytes that are no box: at the beginning if it is not an mp4 file.
+    """
+    size, start = path.stat().st_size, 0
+    with open(path, "rb") as file:
+        while start + _BOX_HEADER <= size:
+            file.seek(start)
+            head = file.read(2 * _BOX_HEADER)
+            length, kind = struct.unpack_from(">I4s", head)
+            if length == 1 and len(head) == 2 * _BOX_HEADER:
+                (length,) = struct.unpack_from(">Q", head, _BOX_HEADER)
+            end = min(size, start + length) if length else size
+            if end < start + _BOX_HEADER or not _KIND.fullmatch(kind):
+                return
+            yield kind, start, end
+            start = end
+
+
 def _check_boxes(path: Path) -> None:
     """Check that an mp4 file does not declare more frames than it can contain.
 
@@ -65,18 +85,11 @@ def _check_boxes(path: Path) -> None:
     Raises: ValueError: the file declares more frames than it has bytes.
     """
     size = path.stat().st_size
-    if size < _BOX_HEADER:
+    if not size:
         return
     frames = edits = 0
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        start = 0
-        while start + _BOX_HEADER <= size:
-            length, kind = struct.unpack_from(">I4s", data, start)
-            if length == 1 and start + 2 * _BOX_HEADER <= size:
-                (length,) = struct.unpack_from(">Q", data, start + _BOX_HEADER)
-            end = min(size, start + length) if length else size
-            if end < start + _BOX_HEADER or not _KIND.fullmatch(kind):
-                return  # not an mp4 file, or trailing bytes
+        for kind, start, end in top_boxes(path):
             for tag in () if kind in _NO_COUNTS else _COUNTS.finditer(data, start, end):
                 at = tag.end() + (8 if tag[0] in (b"stsz", b"stz2") else 4)
                 if tag[0] == b"cmov":
@@ -87,7 +100,6 @@ def _check_boxes(path: Path) -> None:
                     edits += count if tag[0] == b"elst" else 0
                 if frames * max(1, edits // _FEW_EDITS) > max(size, _ALWAYS_ALLOWED):
                     raise Problem("declares more frames than it has bytes")
-            start = end
 
 
 #: Why a recording of sound, perhaps with a cover picture, is no video.
