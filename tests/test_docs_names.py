@@ -18,6 +18,7 @@ import pytest
 import snowsplat
 from snowsplat import extras
 from snowsplat.cli import main as cli
+from snowsplat.formats.registry import FORMATS
 
 from .walk_throughs import FOLDER, walk_throughs
 
@@ -280,3 +281,10 @@ def test_a_name_that_does_not_exist_is_found(text, problem):
 def test_what_exists_is_no_problem():
     text = "`ops/native.py` (`launch`), `ops.project(gaussians, view)`, `train --eval`, `formats/`"
     assert problems(f"{text}\n\n```sh\nsnowsplat make walk.mp4 --minutes 5\n```") == []
+
+
+def test_the_number_of_scene_formats_is_told():
+    readable = {fmt.name.removesuffix(" in JSON") for fmt in FORMATS if fmt.read is not None}
+    numbers = {10: "ten", 11: "eleven", 12: "twelve", 13: "thirteen"}
+    page = " ".join((ROOT / "docs" / "index.md").read_text(encoding="utf-8").split())
+    assert f"[{numbers[len(readable)]} file formats]" in page
