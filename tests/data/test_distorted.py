@@ -15,7 +15,7 @@ from PIL import Image
 from snowsplat.data import ImageLoader, load_dataset
 from snowsplat.data.colmap import ColmapImage, read_model, write_model
 from snowsplat.data.judge.verdict import judge
-from snowsplat.data.lens.models import COLMAP_LENSES, lens_of
+from snowsplat.data.lens.models import COLMAP_MODELS, lens_of
 from snowsplat.data.maps.depth_file import to_z
 from snowsplat.data.photos.decode import load_image, load_thumbnail
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
@@ -78,7 +78,7 @@ def check(view, lens, loaded, error=4.0):
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("model", [lens.model for lens in COLMAP_LENSES])
+@pytest.mark.parametrize("model", [model.name for model in COLMAP_MODELS])
 def test_each_model_becomes_pinhole_views(tmp_path, model, text):
     params = params_of(model)
     dataset = load_dataset(write(tmp_path, model, params, 2, text=text), hold_out=None)

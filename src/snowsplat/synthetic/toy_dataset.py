@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data.colmap import ColmapImage, write_model
-from snowsplat.data.lens.perspective import Pinhole
+from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation
 
@@ -173,7 +173,7 @@ def _write_colmap(
         images.append(ColmapImage(name, 1, (*quat.tolist(), *camera.cam_from_world[:, 3].tolist())))
     first = cameras[0]
     intrinsics = (first.fx, first.fy, first.cx, first.cy)
-    shared = {1: Pinhole(first.width, first.height, intrinsics)}
+    shared = {1: lens_of("PINHOLE", first.width, first.height, intrinsics)}
     write_model(folder / "sparse" / "0", shared, images, xyz, rgb, tracks, text=text)
 
 

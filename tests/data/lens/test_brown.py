@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from snowsplat.data.lens.brown import as_colmap
 from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import pinhole_view
 
@@ -41,7 +42,7 @@ def test_a_photo_is_undistorted():
 
 @pytest.mark.parametrize("k4", [0.0, 0.02, -0.04])
 def test_r8_is_nearly_a_model_of_colmap(k4):
-    made, error = lens(k4).as_colmap()
+    made, error = as_colmap(lens(k4))
     assert made.model == "FULL_OPENCV"
     assert error < 0.02
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 20), np.linspace(-0.45, 0.45, 20))
@@ -50,6 +51,6 @@ def test_r8_is_nearly_a_model_of_colmap(k4):
 
 
 def test_the_error_without_the_skew_is_told():
-    assert lens(skew=0.01).as_colmap()[1] == pytest.approx(0.01 * 900 * 490 / 905, rel=0.1)
+    assert as_colmap(lens(skew=0.01))[1] == pytest.approx(0.01 * 900 * 490 / 905, rel=0.1)
     pinhole = lens_of("PINHOLE", 1280, 960, INTRINSICS)
-    assert pinhole.as_colmap() == (pinhole, 0.0)
+    assert as_colmap(pinhole) == (pinhole, 0.0)

@@ -9,7 +9,7 @@ import pytest
 from snowsplat.data.lens.circle import image_circle
 from snowsplat.data.lens.coverage import covered_pixels
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.models import COLMAP_LENSES, lens_of
+from snowsplat.data.lens.models import COLMAP_MODELS, lens_of
 from snowsplat.data.lens.resample import nearest, resample
 from snowsplat.data.lens.views import lens_views, look
 
@@ -58,12 +58,12 @@ def test_all_models_of_colmap_are_known_with_their_numbers():
     }
     theirs = {number: name for number, name in theirs.items() if number >= 0}
     theirs[0] = "SIMPLE_PINHOLE"
-    assert [theirs[number] for number in sorted(theirs)] == [lens.model for lens in COLMAP_LENSES]
-    for lens in COLMAP_LENSES:
-        assert len(colmap_camera(lens.model).params) == len(lens.parameters)
+    assert [theirs[number] for number in sorted(theirs)] == [model.name for model in COLMAP_MODELS]
+    for model in COLMAP_MODELS:
+        assert len(colmap_camera(model.name).params) == len(model.parameters)
 
 
-@pytest.mark.parametrize("model", [lens.model for lens in COLMAP_LENSES])
+@pytest.mark.parametrize("model", [model.name for model in COLMAP_MODELS])
 def test_projections_are_those_of_colmap(model):
     camera = colmap_camera(model)
     rays = np.random.default_rng(0).normal(size=(2000, 3))
@@ -215,11 +215,11 @@ def test_impossible_coefficients_are_errors_not_large_images(lens):
 def test_random_coefficients_make_views_of_bounded_size_or_a_value_error():
     random = np.random.default_rng(5)
     for _ in range(60):
-        model = COLMAP_LENSES[random.integers(len(COLMAP_LENSES))]
+        model = COLMAP_MODELS[random.integers(len(COLMAP_MODELS))]
         count = len(model.parameters)
         params = random.normal(size=count) * 10.0 ** random.uniform(-4, 4, count)
         params[:4] = np.abs(params[:4]) if random.random() < 0.8 else params[:4]
-        lens = model(*random.integers(1, 500, 2).tolist(), tuple(params.tolist()))
+        lens = lens_of(model.name, *random.integers(1, 500, 2).tolist(), tuple(params.tolist()))
         try:
             views = lens_views(lens)
         except ValueError:

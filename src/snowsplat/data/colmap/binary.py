@@ -22,12 +22,12 @@ from snowsplat.data.colmap.types import (
     track_rows,
 )
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.models import COLMAP_LENSES
+from snowsplat.data.lens.models import COLMAP_MODELS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading
 
 _COUNT = struct.Struct("<Q")
-# Id, index into COLMAP_LENSES, width, height. The parameters (doubles) follow.
+# Id, index into COLMAP_MODELS, width, height. The parameters (doubles) follow.
 _CAMERA_HEAD = struct.Struct("<IiQQ")
 _SMALLEST_CAMERA = _CAMERA_HEAD.size + 2 * 8
 # Id, quaternion (w, x, y, z), translation, camera id. The name, ended by a zero byte, and the
@@ -106,14 +106,14 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     cameras = {}
     for _ in range(cursor.count):
         camera_id, number, width, height = cursor.take(_CAMERA_HEAD)
-        if not 0 <= number < len(COLMAP_LENSES):
+        if not 0 <= number < len(COLMAP_MODELS):
             raise UserError(
                 "{path}: unknown camera model {number}; undistort the images with the program "
                 "that made it, or copy the file again if it is damaged",
                 path=path,
                 number=number,
             )
-        model = COLMAP_LENSES[number]
+        model = COLMAP_MODELS[number]
         params = cursor.take(struct.Struct(f"<{len(model.parameters)}d"))
         cameras[camera_id] = checked_camera(path, model, width, height, params)
     cursor.finish()
@@ -229,7 +229,7 @@ def write_model(
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin; see `model.write_model` for the arguments."""
     camera_records = [
-        _CAMERA_HEAD.pack(key, COLMAP_LENSES.index(type(camera)), camera.width, camera.height)
+        _CAMERA_HEAD.pack(key, COLMAP_MODELS.index(camera.kind), camera.width, camera.height)
         + struct.pack(f"<{len(camera.params)}d", *camera.params)
         for key, camera in cameras.items()
     ]

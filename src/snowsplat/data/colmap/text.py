@@ -21,7 +21,7 @@ from snowsplat.data.colmap.types import (
     track_rows,
 )
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.models import COLMAP_LENSES
+from snowsplat.data.lens.models import COLMAP_MODELS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading, shown
 
@@ -81,7 +81,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     Raises:
         UserError: the file is unreadable or damaged.
     """
-    models = {lens.model: lens for lens in COLMAP_LENSES}
+    models = {model.name: model for model in COLMAP_MODELS}
     cameras = {}
     for line in filter(None, _lines(path)):
         words = line.split(maxsplit=_MAX_CAMERA_WORDS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.lens import Lens, Model
 from snowsplat.util.errors import UserError
 
 # Width or height of a camera in pixels. A larger value means a damaged file.
@@ -78,9 +78,9 @@ def check_count(path: Path, kind: str, count: int) -> None:
 
 
 def checked_camera(
-    path: Path, model: type[Lens], width: int, height: int, params: tuple[float, ...]
+    path: Path, model: Model, width: int, height: int, params: tuple[float, ...]
 ) -> Lens:
     """A camera whose image size is plausible; otherwise raise `UserError`."""
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
         raise damaged_model(path, f"a camera has the size {width}x{height}")
-    return model(width, height, params)
+    return Lens(model, width, height, params)

@@ -1,4 +1,4 @@
-"""Brown's model as Metashape and RealityScan have it, and the nearest lens of COLMAP."""
+"""`as_colmap`: a lens of the model "BROWN" in the nearest model of COLMAP, for files of COLMAP."""
 
 from __future__ import annotations
 
@@ -6,41 +6,34 @@ import math
 
 import numpy as np
 
-from snowsplat.data.lens.lens import Image, Lens, tangential
-from snowsplat.data.lens.perspective import FullOpenCV, Perspective
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.models import lens_of
 
 _SAMPLES = 400  # radii at which a lens is fitted
 _GRID = 33  # pixels of the photo along each side, at which the error is measured
 
 
-class Brown(Perspective, model="BROWN", parameters="fx fy cx cy k1 k2 k3 k4 p1 p2 skew"):
-    """With r⁸, and the skew divided by fx; COLMAP has neither."""
+def as_colmap(lens: Lens) -> tuple[Lens, float]:
+    """The lens in a model of COLMAP, and the largest difference in the photo, in pixels.
 
-    in_transforms = True
-
-    def distort(self, u: np.ndarray, v: np.ndarray, r2: np.ndarray) -> Image:
-        k1, k2, k3, k4, p1, p2, skew = self.coefficients
-        factor = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-        du, dv = tangential(u, v, r2, p1, p2)
-        u, v = u * factor + du, v * factor + dv
-        return u + skew * v, v
-
-    def as_colmap(self) -> tuple[Lens, float]:
-        """The radial part is fitted by the ratio of two polynomials of FULL_OPENCV; the skew is
-        left out."""
-        fx, fy, cx, cy, *radial, p1, p2, _ = self.params
-        (k1, k2, k3), divisor = _ratio(self, radial)
-        params = (fx, fy, cx, cy, k1, k2, p1, p2, k3, *divisor)
-        made = FullOpenCV(self.width, self.height, params)
-        x, y = np.meshgrid(np.linspace(0, self.width, _GRID), np.linspace(0, self.height, _GRID))
-        rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1)
-        at, there = self.project(rays), made.project(rays)
-        inside = ((at >= 0) & (at <= (self.width, self.height))).all(-1)
-        error = np.linalg.norm(there - at, axis=-1)[inside]
-        return made, float(error.max(initial=0.0)) if np.isfinite(error).all() else math.inf
+    COLMAP has neither r⁸ nor skew. The radial part is fitted by the ratio of two polynomials of
+    FULL_OPENCV; the skew is left out. Other models are returned as they are.
+    """
+    if lens.model != "BROWN":
+        return lens, 0.0
+    fx, fy, cx, cy, *radial, p1, p2, _ = lens.params
+    (k1, k2, k3), divisor = _ratio(lens, radial)
+    params = (fx, fy, cx, cy, k1, k2, p1, p2, k3, *divisor)
+    made = lens_of("FULL_OPENCV", lens.width, lens.height, params)
+    x, y = np.meshgrid(np.linspace(0, lens.width, _GRID), np.linspace(0, lens.height, _GRID))
+    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], -1)
+    at, there = lens.project(rays), made.project(rays)
+    inside = ((at >= 0) & (at <= (lens.width, lens.height))).all(-1)
+    error = np.linalg.norm(there - at, axis=-1)[inside]
+    return made, float(error.max(initial=0.0)) if np.isfinite(error).all() else math.inf
 
 
-def _ratio(lens: Brown, radial: list[float]) -> tuple[list[float], list[float]]:
+def _ratio(lens: Lens, radial: list[float]) -> tuple[list[float], list[float]]:
     """Coefficients of r², r⁴ and r⁶ of a numerator and of a divisor that act as r² … r⁸. Least
     squares of N(r) − g(r) D(r), which is linear, over the radii that the photo shows."""
     fx, fy, cx, cy = lens.params[:4]

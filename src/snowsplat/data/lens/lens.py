@@ -1,91 +1,94 @@
 """`Lens`: from directions in the frame of a camera to pixels of its photo, and back.
 
-https://colmap.github.io/cameras.html describes the models; `models` lists a class for each of them.
-A model whose equation is a polynomial may fold: beyond some angle the pixels return to the centre.
-`views` finds this angle.
+`models` has the table of all models. A model whose equation is a polynomial may fold: beyond some
+angle the pixels return to the centre. `views` finds this angle.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-TINY = 1e-12
+_TINY = 1e-12
 _NEWTON_STEPS = 30
 
 #: x and y of positions in an image with the focal length 1 and the principal point at (0, 0).
 Image = tuple[np.ndarray, np.ndarray]
+#: Of a lens and the x, y, z of directions: where these are in the image; not finite where the model
+#: has no position.
+Equation = Callable[["Lens", np.ndarray, np.ndarray, np.ndarray], Image]
 
 
 @dataclass(frozen=True)
-class Lens(ABC):
-    """The intrinsics of a photo. A subclass is a camera model.
+class Model:
+    """A camera model.
 
     Attributes:
-        width, height: in pixels, of the photos that ``params`` are for.
-        params: the values of ``parameters``; focal lengths and principal point in pixels.
-        model: the name of the model in COLMAP; in capitals, also if COLMAP does not have it.
+        name: in COLMAP; in capitals, also if COLMAP does not have the model.
         parameters: their names, in the order of COLMAP. Models with "f" instead of "fx" and "fy"
             have one focal length. Coefficients are called as in OpenCV.
-        other_names: of the model in transforms.json.
-        in_transforms: transforms.json may have the model.
+        equation: see `Equation`.
+        in_transforms: the names of the model in transforms.json; none if it is not read there.
         angular: a fisheye: the angle to the optical axis is distorted, and not its tangent.
         straight: without coefficients, it is a pinhole camera.
         panoramic: shows all directions; the left border of a photo continues at its right border.
     """
 
+    name: str
+    parameters: tuple[str, ...]
+    equation: Equation
+    in_transforms: tuple[str, ...] = ()
+    angular: bool = False
+    straight: bool = False
+    panoramic: bool = False
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The intrinsics of a photo: a camera model and its parameters.
+
+    Attributes:
+        kind: the camera model.
+        width, height: in pixels, of the photos that ``params`` are for.
+        params: the values of ``kind.parameters``; focal lengths and principal point in pixels.
+    """
+
+    kind: Model
     width: int
     height: int
     params: tuple[float, ...]
 
-    model: ClassVar[str]
-    parameters: ClassVar[tuple[str, ...]]
-    other_names: ClassVar[tuple[str, ...]] = ()
-    in_transforms: ClassVar[bool] = False
-    angular: ClassVar[bool] = False
-    straight: ClassVar[bool] = False
-    panoramic: ClassVar[bool] = False
-
-    def __init_subclass__(
-        cls, model: str = "", parameters: str = "", other_names: str = ""
-    ) -> None:
-        """A model is declared by the arguments of its class, with spaces between names."""
-        if model:
-            cls.model, cls.parameters = model, tuple(parameters.split())
-            cls.other_names = tuple(other_names.split())
-
-    @abstractmethod
-    def image_of(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
-        """Where directions are in the image; not finite where the model has no position."""
-
-    def as_colmap(self) -> tuple[Lens, float]:
-        """This lens in a model of COLMAP, and the largest difference in the photo, in pixels."""
-        return self, 0.0
+    @property
+    def model(self) -> str:
+        """The name of the camera model."""
+        return self.kind.name
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy in pixels."""
-        p = self.params
-        return (p[0], p[0], p[1], p[2]) if self.parameters[0] == "f" else (p[0], p[1], p[2], p[3])
+        """fx, fy, cx, cy in pixels; of a panorama, in pixels per radian at its centre."""
+        p, width, height = self.params, self.width, self.height
+        if self.kind.panoramic:
+            return width / (2 * math.pi), height / math.pi, width / 2, height / 2
+        return (
+            (p[0], p[0], p[1], p[2]) if self.kind.parameters[0] == "f" else (p[0], p[1], p[2], p[3])
+        )
 
     @property
     def coefficients(self) -> tuple[float, ...]:
         """The parameters that follow focal lengths and principal point."""
-        return self.params[3 if self.parameters[0] == "f" else 4 :]
+        return () if self.kind.panoramic else self.params[self.kind.parameters.index("cy") + 1 :]
 
     @property
     def is_pinhole(self) -> bool:
         """Whether there is no distortion. A fisheye without coefficients is no pinhole."""
-        return self.straight and not any(self.coefficients)
+        return self.kind.straight and not any(self.coefficients)
 
     def values_of(self, *names: str) -> list[float]:
         """The values of parameters; 0 for those that the model does not have."""
-        values = dict(zip(self.parameters, self.params, strict=True))
+        values = dict(zip(self.kind.parameters, self.params, strict=True))
         return [values.get(name, 0.0) for name in names]
 
     def project(self, rays: np.ndarray) -> np.ndarray:
@@ -99,7 +102,7 @@ class Lens(ABC):
             rays = rays.astype(np.float64)
         fx, fy, cx, cy = self.intrinsics
         with np.errstate(all="ignore"):
-            u, v = self.image_of(rays[..., 0], rays[..., 1], rays[..., 2])
+            u, v = self.kind.equation(self, rays[..., 0], rays[..., 1], rays[..., 2])
             u, v = fx * u + cx, fy * v + cy
         pixels = np.stack([u, v], -1)
         pixels[~(np.isfinite(u) & np.isfinite(v))] = np.nan
@@ -111,8 +114,8 @@ class Lens(ABC):
         By Newton's method, from the direction of a lens without coefficients.
         """
         start = self._central(pixels)
-        if self.angular:
-            angle = np.maximum(np.linalg.norm(start, axis=1, keepdims=True), TINY)
+        if self.kind.angular:
+            angle = np.maximum(np.linalg.norm(start, axis=1, keepdims=True), _TINY)
             start = start * np.tan(np.minimum(angle, 1.55)) / angle
         return self._newton(
             pixels,
@@ -128,8 +131,11 @@ class Lens(ABC):
         coefficients.
         """
         angles = self._central(pixels)
-        if not self.angular:
-            tangent = np.maximum(np.linalg.norm(angles, axis=1, keepdims=True), TINY)
+        if self.kind.panoramic:  # longitude and latitude
+            (x, y), (level, down) = np.sin(angles).T, np.cos(angles).T
+            return np.column_stack([down * x, y, down * level])
+        if not self.kind.angular:
+            tangent = np.maximum(np.linalg.norm(angles, axis=1, keepdims=True), _TINY)
             angles = angles * np.arctan(tangent) / tangent
         return _turned_axis(self._newton(pixels, angles, _turned_axis, step_of=lambda _: 1e-6))
 
@@ -168,11 +174,6 @@ class Lens(ABC):
                 if not (wrong > 1e-6).any():
                     break
         return np.where((wrong < 1e-3)[:, None], found, np.nan)
-
-
-def tangential(u: np.ndarray, v: np.ndarray, r2: np.ndarray, p1: float, p2: float) -> Image:
-    """The tangential distortion of OpenCV: what is added to u and v, with r² = u² + v²."""
-    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
 
 
 def _turned_axis(angles: np.ndarray) -> np.ndarray:

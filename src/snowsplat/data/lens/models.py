@@ -1,38 +1,169 @@
-"""The table of all camera models, and `lens_of`, which finds one by its name."""
+"""The table of all camera models with their equations, and `lens_of`, which finds one by its name.
+
+https://colmap.github.io/cameras.html describes the models. u and v are positions in an image with
+the focal length 1; r² = u² + v².
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
-from snowsplat.data.lens import fisheye, perspective
-from snowsplat.data.lens.brown import Brown
-from snowsplat.data.lens.lens import Lens
+import numpy as np
+
+from snowsplat.data.lens.lens import Equation, Image, Lens, Model
+
+_TINY = 1e-12
+
+
+def _tangents(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """u, v and r² of a pinhole camera."""
+    depth = np.where(z > 0, z, np.nan)
+    u, v = x / depth, y / depth
+    return u, v, u * u + v * v
+
+
+def _angles(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """u, v and r² of an equidistant fisheye: r is the angle to the axis."""
+    sine = np.hypot(x, y)
+    scale = np.where(sine > _TINY, np.arctan2(sine, z) / np.maximum(sine, _TINY), 1 / np.abs(z))
+    u, v = x * scale, y * scale
+    return u, v, u * u + v * v
+
+
+def _tangential(u: np.ndarray, v: np.ndarray, r2: np.ndarray, p1: float, p2: float) -> Image:
+    """What the tangential distortion of OpenCV adds to u and v."""
+    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def opencv(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """The rational model of OpenCV, or a model with some of its coefficients."""
+    u, v, r2 = _tangents(x, y, z)
+    k1, k2, k3, k4, k5, k6 = lens.values_of("k1", "k2", "k3", "k4", "k5", "k6")
+    factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if k4 or k5 or k6:
+        divisor = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        factor = factor / np.where(divisor > 0, divisor, np.nan)
+    du, dv = _tangential(u, v, r2, *lens.values_of("p1", "p2"))
+    return u * factor + du, v * factor + dv
+
+
+def brown(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """Brown's model with r⁸, and with the skew divided by fx: Metashape, RealityScan."""
+    u, v, r2 = _tangents(x, y, z)
+    k1, k2, k3, k4, p1, p2, skew = lens.coefficients
+    factor = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    du, dv = _tangential(u, v, r2, p1, p2)
+    u, v = u * factor + du, v * factor + dv
+    return u + skew * v, v
+
+
+def field_of_view(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """Devernay and Faugeras 2001."""
+    u, v, r2 = _tangents(x, y, z)
+    (omega,) = lens.coefficients
+    if abs(omega) < 1e-6:
+        return u, v
+    r = np.maximum(np.sqrt(r2), 1e-9)
+    factor = np.arctan(2 * r * math.tan(omega / 2)) / (r * omega)
+    return u * factor, v * factor
+
+
+def division(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """Fitzgibbon 2001."""
+    (k,) = lens.coefficients
+    depth = (z + np.sqrt(z * z - 4 * k * (x * x + y * y))) / 2
+    depth = np.where(depth > 0, depth, np.nan)
+    return x / depth, y / depth
+
+
+def enhanced_unified(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """Khomutenko et al. 2016."""
+    alpha, beta = lens.coefficients
+    distance = np.sqrt(beta * (x * x + y * y) + z * z)
+    depth = alpha * distance + (1 - alpha) * z
+    limit = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+    depth = np.where((z > -limit * distance) & (depth > 0), depth, np.nan)
+    return x / depth, y / depth
+
+
+def fisheye(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """θ (1 + k₁ θ² + k₂ θ⁴ + …), with at most six coefficients; Kannala and Brandt 2006."""
+    u, v, r2 = _angles(x, y, z)
+    factor = np.zeros_like(r2)
+    for coefficient in reversed(lens.coefficients[:6]):
+        factor = r2 * (coefficient + factor)
+    return u + u * factor, v + v * factor
+
+
+def thin_prism_fisheye(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """Weng et al. 1992, on the angle."""
+    u, v, r2 = _angles(x, y, z)
+    k1, k2, p1, p2, k3, k4, s1, s2 = lens.coefficients
+    radial = r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    du, dv = _tangential(u, v, r2, p1, p2)
+    return u + u * radial + du + s1 * r2, v + v * radial + dv + s2 * r2
+
+
+def aria_fisheye(lens: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """Project Aria's Fisheye624: `fisheye`, then tangential and thin prism distortion."""
+    u, v = fisheye(lens, x, y, z)
+    p0, p1, s0, s1, s2, s3 = lens.coefficients[6:]
+    r2 = u * u + v * v
+    du, dv = _tangential(u, v, r2, p1, p0)
+    return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
+
+
+def longitude_and_latitude(_: Lens, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Image:
+    """A panorama of all directions."""
+    return np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
+
+
+_F, _FXY = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
+_OPENCV = (*_FXY, "k1", "k2", "p1", "p2")
+_RATIONAL = (*_OPENCV, "k3", "k4", "k5", "k6")
+_BROWN = (*_FXY, "k1", "k2", "k3", "k4", "p1", "p2", "skew")
+_THIN_PRISM = (*_OPENCV, "k3", "k4", "s1", "s2")
+_ARIA = (*_FXY, "k1", "k2", "k3", "k4", "k5", "k6", "p0", "p1", "s0", "s1", "s2", "s3")
+
+
+def _fisheye(
+    name: str, parameters: tuple[str, ...], equation: Equation = fisheye, *others: str
+) -> Model:
+    return Model(name, parameters, equation, (name, *others), angular=True)
+
+
+def _opencv(
+    name: str, parameters: tuple[str, ...], equation: Equation = opencv, *others: str
+) -> Model:
+    return Model(name, parameters, equation, (name, *others), straight=True)
+
 
 #: The models of COLMAP; the index is the number of a model in its binary files.
-COLMAP_LENSES: tuple[type[Lens], ...] = (
-    perspective.SimplePinhole,
-    perspective.Pinhole,
-    perspective.SimpleRadial,
-    perspective.Radial,
-    perspective.OpenCV,
-    fisheye.OpenCVFisheye,
-    perspective.FullOpenCV,
-    perspective.FieldOfView,
-    fisheye.SimpleRadialFisheye,
-    fisheye.RadialFisheye,
-    fisheye.ThinPrismFisheye,
-    fisheye.AriaFisheye,
-    perspective.SimpleDivision,
-    perspective.Division,
-    fisheye.SimpleFisheye,
-    fisheye.Fisheye,
-    perspective.EnhancedUnified,
-    fisheye.Equirectangular,
+COLMAP_MODELS = (
+    _opencv("SIMPLE_PINHOLE", _F),
+    _opencv("PINHOLE", _FXY, opencv, "PERSPECTIVE"),
+    _opencv("SIMPLE_RADIAL", (*_F, "k1")),
+    _opencv("RADIAL", (*_F, "k1", "k2")),
+    _opencv("OPENCV", _OPENCV),
+    _fisheye("OPENCV_FISHEYE", (*_FXY, "k1", "k2", "k3", "k4")),
+    _opencv("FULL_OPENCV", _RATIONAL),
+    Model("FOV", (*_FXY, "omega"), field_of_view),
+    _fisheye("SIMPLE_RADIAL_FISHEYE", (*_F, "k1")),
+    _fisheye("RADIAL_FISHEYE", (*_F, "k1", "k2")),
+    _fisheye("THIN_PRISM_FISHEYE", _THIN_PRISM, thin_prism_fisheye),
+    _fisheye("RAD_TAN_THIN_PRISM_FISHEYE", _ARIA, aria_fisheye, "FISHEYE624"),
+    Model("SIMPLE_DIVISION", (*_F, "k"), division, straight=True),
+    Model("DIVISION", (*_FXY, "k"), division, straight=True),
+    _fisheye("SIMPLE_FISHEYE", _F),
+    _fisheye("FISHEYE", _FXY),
+    Model("EUCM", (*_FXY, "alpha", "beta"), enhanced_unified),
+    Model("EQUIRECTANGULAR", ("width", "height"), longitude_and_latitude, panoramic=True),
 )
-#: All models.
-LENSES: tuple[type[Lens], ...] = (*COLMAP_LENSES, Brown)
+#: All models by name.
+MODELS = {model.name: model for model in (*COLMAP_MODELS, _opencv("BROWN", _BROWN, brown))}
 
 
 def lens_of(model: str, width: int, height: int, params: Iterable[float]) -> Lens:
-    """The lens of a model in `LENSES`; ``params`` are in the order of `Lens.parameters`."""
-    return next(lens for lens in LENSES if lens.model == model)(width, height, tuple(params))
+    """The lens of a model in `MODELS`; ``params`` are in the order of `Model.parameters`."""
+    return Lens(MODELS[model], width, height, tuple(params))

@@ -3,7 +3,7 @@
 One view of the same focal length is enough for most lenses. A lens with a field of view of more
 than 120°, and a panorama, become several views, which overlap and look in different directions:
 
-    for view in lens_views(Fisheye(4000, 4000, (1270, 1270, 2000, 2000))):
+    for view in lens_views(lens_of("FISHEYE", 4000, 4000, (1270, 1270, 2000, 2000))):
         view.name, view.rotation                # "front", "left" …; view_from_lens
         pixels = undistort_image(photo, view)   # see `resample`
 """
@@ -75,7 +75,7 @@ class LensView:
     @property
     def wraps(self) -> bool:
         """Whether the left border of the photo continues at its right border."""
-        return self.lens.panoramic
+        return self.lens.kind.panoramic
 
     def positions(self, width: int, height: int) -> Iterator[tuple[slice, Positions]]:
         """Rows of this view at the size ``width`` × ``height``, and the positions of their pixels
@@ -191,9 +191,9 @@ def is_wide(lens: Lens) -> bool:
 
     Also a lens of another model whose field of view is more than 120°.
     """
-    if lens.panoramic or not all(map(math.isfinite, lens.params)):
+    if lens.kind.panoramic or not all(map(math.isfinite, lens.params)):
         return False
-    return lens.angular or 2 * float(_field(lens, None).reach.max()) > _WIDEST
+    return lens.kind.angular or 2 * float(_field(lens, None).reach.max()) > _WIDEST
 
 
 @lru_cache(256)
@@ -252,7 +252,7 @@ def _directions(angle: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 @lru_cache(256)
 def _field(lens: Lens, circle: float | None) -> _Field:
-    if lens.panoramic:
+    if lens.kind.panoramic:
         return _Field(math.pi, np.full(_DIRECTIONS, math.pi))
     angle = np.linspace(0, math.pi, _ANGLES + 1)
     turn = np.arange(_DIRECTIONS) * (2 * math.pi / _DIRECTIONS)

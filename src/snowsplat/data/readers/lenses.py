@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from snowsplat.data.lens.brown import Brown
-from snowsplat.data.lens.fisheye import Equirectangular, OpenCVFisheye, ThinPrismFisheye
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.perspective import FullOpenCV, OpenCV, Pinhole
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.readers import parse
 
 #: fx, fy, cx, cy in pixels.
@@ -41,13 +39,13 @@ def perspective(
     k1, k2, k3, k4 = [*radial, 0.0, 0.0, 0.0, 0.0][:4]
     p1, p2 = tangential
     if not any((k1, k2, k3, k4, p1, p2, skew)):
-        return Pinhole(*size, intrinsics)
+        return lens_of("PINHOLE", *size, intrinsics)
     if k4 or skew:
         coefficients = (k1, k2, k3, k4, p1, p2, skew / intrinsics[0])
-        return Brown(*size, (*intrinsics, *coefficients))
+        return lens_of("BROWN", *size, (*intrinsics, *coefficients))
     if k3:
-        return FullOpenCV(*size, (*intrinsics, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
-    return OpenCV(*size, (*intrinsics, k1, k2, p1, p2))
+        return lens_of("FULL_OPENCV", *size, (*intrinsics, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    return lens_of("OPENCV", *size, (*intrinsics, k1, k2, p1, p2))
 
 
 def fisheye(
@@ -64,14 +62,14 @@ def fisheye(
     p1, p2 = tangential
     if p1 or p2:
         params = (*intrinsics, k1, k2, p1, p2, k3, k4, 0.0, 0.0)
-        return ThinPrismFisheye(*size, params)
-    return OpenCVFisheye(*size, (*intrinsics, k1, k2, k3, k4))
+        return lens_of("THIN_PRISM_FISHEYE", *size, params)
+    return lens_of("OPENCV_FISHEYE", *size, (*intrinsics, k1, k2, k3, k4))
 
 
 def equirectangular(where: object, width: float, height: float) -> Lens:
     """A panorama of the whole sphere."""
     size = parse.size_of(where, width, height)
-    return Equirectangular(*size, (float(size[0]), float(size[1])))
+    return lens_of("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])))
 
 
 def centred_intrinsics(width: float, height: float, focal: float) -> Intrinsics:

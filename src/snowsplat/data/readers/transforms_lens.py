@@ -10,19 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from snowsplat.data.lens.fisheye import AriaFisheye
+from snowsplat.data.lens import models
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.models import LENSES
-from snowsplat.data.lens.perspective import FullOpenCV
 from snowsplat.data.readers.lenses import Intrinsics, equirectangular, fisheye, perspective
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import quoted
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: The models that are read, by their names here.
-_MODELS = {
-    name: lens for lens in LENSES if lens.in_transforms for name in (lens.model, *lens.other_names)
-}
+_MODELS = {name: model for model in models.MODELS.values() for name in model.in_transforms}
 _ARIA_COEFFICIENTS = 12
 
 
@@ -51,9 +47,9 @@ def lens_of(
     if any(key.startswith("ftheta_p") for key in values):
         model = "F-Theta"
     kind = _MODELS.get(model)
-    if kind is AriaFisheye:
+    if kind is not None and kind.equation is models.aria_fisheye:
         numbers = _distortion_params(where, values, _ARIA_COEFFICIENTS)
-        return AriaFisheye(width, height, (*intrinsics, *numbers))
+        return Lens(kind, width, height, (*intrinsics, *numbers))
     if kind is None:
         raise UserError(
             "{where}: the camera model {model} is not known; undistort the photos with the "
@@ -71,9 +67,9 @@ def lens_of(
     radial = (k1, k2, k3, k4)
     if kind.angular or values.get("is_fisheye") or values.get("fisheye"):
         return fisheye(where, width, height, intrinsics, radial, (p1, p2))
-    if k5 or k6 or (k4 and kind is FullOpenCV):
+    if k5 or k6 or (k4 and kind.name == "FULL_OPENCV"):
         numbers = (k1, k2, p1, p2, k3, k4, k5, k6)
-        return FullOpenCV(width, height, (*intrinsics, *numbers))
+        return models.lens_of("FULL_OPENCV", width, height, (*intrinsics, *numbers))
     return perspective(where, width, height, intrinsics, radial, (p1, p2))
 
 

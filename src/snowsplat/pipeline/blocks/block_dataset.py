@@ -13,8 +13,9 @@ import numpy as np
 
 from snowsplat.data.colmap import ColmapImage, write_model
 from snowsplat.data.dataset import Points, PosedImage
+from snowsplat.data.lens.brown import as_colmap
 from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.perspective import Pinhole
+from snowsplat.data.lens.models import lens_of
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import Origin, opposite
@@ -53,8 +54,8 @@ def write_block_dataset(
         camera, lens = image.camera, image.lens
         if lens.is_pinhole:
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-            lens = Pinhole(camera.width, camera.height, intrinsics)
-        lens, error = lens.as_colmap()
+            lens = lens_of("PINHOLE", camera.width, camera.height, intrinsics)
+        lens, error = as_colmap(lens)
         worst = max(worst, error)
         number = cameras.setdefault(lens, len(cameras) + 1)
         pose = camera.seen_from(opposite(origin)).cam_from_world

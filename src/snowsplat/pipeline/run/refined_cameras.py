@@ -15,7 +15,8 @@ import numpy as np
 
 from snowsplat.data import Dataset, View
 from snowsplat.data.colmap import ColmapImage, posed_camera, read_model, write_model
-from snowsplat.data.lens.perspective import Pinhole
+from snowsplat.data.lens.lens import Lens
+from snowsplat.data.lens.models import lens_of
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import opposite
@@ -28,12 +29,12 @@ def write_refined(output: TrainingFolder, views: Iterable[View], full: Dataset) 
     ``full``: the same dataset, with the photos at their full size.
     """
     sizes = {v.name: (v.camera.width, v.camera.height) for v in [*full.train, *full.test]}
-    numbers: dict[Pinhole, int] = {}
+    numbers: dict[Lens, int] = {}
     images = []
     for view in views:
         camera = view.camera.scaled(*sizes[view.name])
         params = camera.fx, camera.fy, camera.cx, camera.cy
-        pinhole = Pinhole(camera.width, camera.height, params)
+        pinhole = lens_of("PINHOLE", camera.width, camera.height, params)
         number = numbers.setdefault(pinhole, len(numbers) + 1)
         pose = camera.seen_from(opposite(full.origin)).cam_from_world
         numbers_of_pose = (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist())

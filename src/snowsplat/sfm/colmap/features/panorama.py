@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.data.lens.fisheye import Equirectangular
+from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.resample import resample
 from snowsplat.data.lens.views import LensView, lens_views
 from snowsplat.sfm.colmap.features.sift import Features, detect_in_grey, read_grey, read_mask
@@ -29,7 +29,7 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
     grey, (width, height) = read_grey(photo, image_size)
     allowed = None if mask is None else read_mask(mask, grey)
     rows, columns = grey.shape
-    lens = Equirectangular(columns, rows, (float(columns), float(rows)))
+    lens = lens_of("EQUIRECTANGULAR", columns, rows, (float(columns), float(rows)))
     parts = []
     for view in lens_views(lens):
         seen = _seen(grey, view)
