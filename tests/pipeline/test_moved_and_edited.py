@@ -96,7 +96,7 @@ def test_make_keeps_its_name_if_only_the_photos_were_renamed(
     stages.about = {"name": recorded}
     inputs = tmp_path, "new", sources, None, stages
     job = make._Job(*inputs, make.MakeOptions(), False, SILENT, None, 0.0)
-    job._make_dataset(MakePlan("draft", 9))
+    job._make_dataset(MakePlan("draft", 900))
     assert (job.file, job.stages.about["name"]) == (tmp_path / f"{name}.ply", name)
 
 
