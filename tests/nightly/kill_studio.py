@@ -45,7 +45,8 @@ from snowsplat.formats.sog import read_sog
 from snowsplat.pipeline.film import moved_film, page_frames
 from snowsplat.project.edit_record import read_record
 from snowsplat.project.page_film import PageFilm
-from snowsplat.studio.library import Library, Scene
+from snowsplat.project.studio_scene import StudioScene
+from snowsplat.studio.library import Library
 from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.util.safe_json import from_json
 
@@ -131,7 +132,7 @@ class Kills:
             (self.files / name).write_bytes(data)
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> StudioScene:
         return Library(self.server.library).find(self.name)
 
     def ask(self, path: str = "", method: str = "GET", body: Any = None) -> Any:
@@ -449,7 +450,7 @@ class Kills:
         files = [str(self.files / name) for name in self.photos]
         page.call("DOM.setFileInputFiles", files=files, nodeId=field["nodeId"])
 
-    def _all_there(self, scene: Scene) -> bool:
+    def _all_there(self, scene: StudioScene) -> bool:
         if not scene.photos.is_dir():
             return False
         return {path.name: path.read_bytes() for path in scene.photos.iterdir()} == self.photos

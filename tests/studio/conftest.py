@@ -21,10 +21,11 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.formats import write_gaussians
 from snowsplat.pipeline.publish import publish
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.studio import job, worker
 from snowsplat.studio.app import POLICY, studio_app
-from snowsplat.studio.library import Library, Scene
+from snowsplat.studio.library import Library
 from snowsplat.util.errors import UserError
 from snowsplat.viewer.http.server import WebServer
 
@@ -35,9 +36,9 @@ from ..browser import Page
 HOLDER = """
 import os, signal, socket, sys, time
 from pathlib import Path
-from snowsplat.studio.library import Scene
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.util.run_lock import InUse, locked
-task, scene = sys.argv[1], Scene(Path(sys.argv[2]))
+task, scene = sys.argv[1], StudioScene(Path(sys.argv[2]))
 def end(*_):
     scene.write_state({"outcome": "stopped"}, task)
     sys.exit(130)
@@ -154,7 +155,7 @@ def holder(monkeypatch, tmp_path) -> None:
 
 
 @pytest.fixture
-def finished(library) -> Scene:
+def finished(library) -> StudioScene:
     """A scene of Gaussians in a flat box, as a job leaves it."""
     scene = library.new("Box", [])
     box = torch.tensor([[-2.0, -1.0, -0.1], [2.0, 1.0, 0.1]])

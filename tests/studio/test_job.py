@@ -16,11 +16,11 @@ import torch
 from PIL import Image
 
 from snowsplat.pipeline.quality import PRESETS
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.sfm.cost import Speed
 from snowsplat.studio import job, worker
-from snowsplat.studio.library import Scene
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
@@ -33,7 +33,7 @@ def wait_for(true, seconds=30.0):
         time.sleep(0.05)
 
 
-def begun(scene: Scene) -> int:
+def begun(scene: StudioScene) -> int:
     """The process of the job, when it has the lock."""
     wait_for(lambda: "process" in scene.state())
     return scene.state()["process"]

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name
+from snowsplat.project.studio_scene import StudioScene
+from snowsplat.studio.library import Library, UnknownScene, safe_name
 from snowsplat.util.errors import UserError
 
 from .conftest import of_the_command_line
@@ -65,7 +66,7 @@ def test_output_folders_of_the_command_line_are_scenes(library):
     assert (scene.found, scene.job.title) == (True, "The tour: 1")
     assert library.find(scene.name).scene_file() == file
     scene.change(title="A tour")
-    assert Scene(scene.folder).job.title == "A tour"
+    assert StudioScene(scene.folder).job.title == "A tour"
     assert {each.name for each in scene.folder.iterdir()} == {
         "cfg_args",
         "point_cloud",
@@ -98,7 +99,7 @@ def test_a_scene_is_removed_without_its_photos(library, tmp_path):
     link = library.folder / "link"
     link.symlink_to(library.new("b", []).folder)
     with pytest.raises(UserError, match="made in a terminal"):
-        Scene(link).remove()
+        StudioScene(link).remove()
 
 
 @given(st.text())

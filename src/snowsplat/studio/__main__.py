@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from snowsplat.studio.library import TASKS, Scene
+from snowsplat.project.studio_scene import TASKS, StudioScene
 from snowsplat.util.run_lock import InUse, locked
 
 
@@ -17,7 +17,7 @@ def main(words: list[str]) -> int:
     """Returns the exit code; 2 if another process does the task."""
     if words[0] not in TASKS:
         return _work(words)
-    scene = Scene(Path(words[1]))
+    scene = StudioScene(Path(words[1]))
     try:
         with locked(scene.lock(words[0]), f"{scene.folder}: in use by"):
             return _work(words)

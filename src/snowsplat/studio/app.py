@@ -48,9 +48,10 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from snowsplat.project.edit_record import PageEdit, read_record
+from snowsplat.project.edit_record import PageEdit
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import (
     FORMATS,
@@ -60,13 +61,12 @@ from snowsplat.studio.hand_on import (
     is_exported,
     make_command,
 )
-from snowsplat.studio.library import Library, Scene, UnknownScene, safe_name, safe_title
+from snowsplat.studio.library import Library, UnknownScene, safe_name, safe_title
 from snowsplat.studio.relay import relay_file, relay_socket
 from snowsplat.studio.uploads import NoSpace, Upload, WrongPart, uploads, write_part
 from snowsplat.util.errors import UserError, message_of
-from snowsplat.util.files import write_json
 from snowsplat.util.run_lock import is_locked
-from snowsplat.util.safe_json import from_json, is_file, printable, read_json
+from snowsplat.util.safe_json import from_json, is_file, printable
 from snowsplat.util.theme import THEME
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
@@ -101,7 +101,7 @@ _TOOLS = (
     'data-version="{version}"></script>'
 )
 
-_Answer = Callable[[Request, Scene], Awaitable[Any]]
+_Answer = Callable[[Request, StudioScene], Awaitable[Any]]
 
 
 def studio_app(library: Library, addresses: Callable[[], list[str]]) -> Starlette:
@@ -211,10 +211,10 @@ class _Studio:
         title = str(wanted.get("title") or "".join(names))
         return {"name": self._library.new(title, inputs).name}
 
-    async def _scene(self, request: Request, scene: Scene) -> Any:
+    async def _scene(self, request: Request, scene: StudioScene) -> Any:
         return await asyncio.to_thread(_details, scene)
 
-    async def _remove(self, request: Request, scene: Scene) -> Any:
+    async def _remove(self, request: Request, scene: StudioScene) -> Any:
         if job.is_being_made(scene) or job.is_running(scene, "film"):
             raise UserError("the scene or its film is being made; stop that, then remove it")
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "upload"]:
@@ -223,19 +223,19 @@ class _Studio:
             photos = await asyncio.to_thread(scene.remove)
         return {"photos": None if photos is None else str(photos)}
 
-    async def _picture(self, request: Request, scene: Scene) -> Any:
+    async def _picture(self, request: Request, scene: StudioScene) -> Any:
         picture = await asyncio.to_thread(_picture_of, scene)
         if picture is None:
             raise UnknownScene("there is no picture yet")
         return Response(await asyncio.to_thread(_small, picture), media_type="image/jpeg")
 
-    async def _open(self, request: Request, scene: Scene) -> Any:
+    async def _open(self, request: Request, scene: StudioScene) -> Any:
         async with self._locks[scene.name, "edit"]:
             if scene.is_shown():
                 return {}
             return await asyncio.to_thread(job.work, "show", scene.folder)
 
-    async def _rename(self, request: Request, scene: Scene) -> Any:
+    async def _rename(self, request: Request, scene: StudioScene) -> Any:
         title = (await _object(request)).get("title")
         if not isinstance(title, str) or not title.strip():
             raise UserError("the title is empty; write one")
@@ -246,11 +246,11 @@ class _Studio:
                 await asyncio.to_thread(job.work, "rename", scene.folder, title)
         return {}
 
-    async def _uploads(self, request: Request, scene: Scene) -> Any:
+    async def _uploads(self, request: Request, scene: StudioScene) -> Any:
         async with self._locks[scene.name, "upload"]:
             return [asdict(file) for file in await asyncio.to_thread(uploads, scene)]
 
-    async def _upload(self, request: Request, scene: Scene) -> Any:
+    async def _upload(self, request: Request, scene: StudioScene) -> Any:
         query = request.query_params
         numbers = (_whole(query.get(name)) for name in ("size", "modified", "start"))
         file = Upload(query.get("path", ""), *numbers)
@@ -267,11 +267,11 @@ class _Studio:
             self._library.find(scene.name)  # it may have been removed meanwhile
             return {"received": await asyncio.to_thread(write_part, scene, file, data)}
 
-    async def _survey(self, request: Request, scene: Scene) -> Any:
+    async def _survey(self, request: Request, scene: StudioScene) -> Any:
         async with self._locks["", "survey"]:
             return await asyncio.to_thread(job.work, "survey", scene.folder)
 
-    async def _start(self, request: Request, scene: Scene) -> Any:
+    async def _start(self, request: Request, scene: StudioScene) -> Any:
         wanted = await _object(request)
         quality, minutes = wanted.get("quality"), wanted.get("minutes")
         if quality is not None and quality not in _QUALITIES:
@@ -296,39 +296,39 @@ class _Studio:
             job.start(scene)
         return {}
 
-    async def _stop(self, request: Request, scene: Scene) -> Any:
+    async def _stop(self, request: Request, scene: StudioScene) -> Any:
         job.stop(scene)
         return {}
 
-    async def _photos(self, request: Request, scene: Scene) -> Any:
+    async def _photos(self, request: Request, scene: StudioScene) -> Any:
         return await asyncio.to_thread(_photo_list, scene)
 
-    async def _photo(self, request: Request, scene: Scene) -> Any:
+    async def _photo(self, request: Request, scene: StudioScene) -> Any:
         shown = await asyncio.to_thread(_shown_photos, scene)
         number = request.path_params["number"]
         if number >= len(shown):
             raise UnknownScene("there is no such photo")
         return Response(await asyncio.to_thread(_small, shown[number]), media_type="image/jpeg")
 
-    async def _map(self, request: Request, scene: Scene) -> Any:
+    async def _map(self, request: Request, scene: StudioScene) -> Any:
         return _File(scene.map)
 
-    async def _export(self, request: Request, scene: Scene) -> Any:
+    async def _export(self, request: Request, scene: StudioScene) -> Any:
         kind = _kind(request)
         async with self._locks["", "export"], self._locks[scene.name, "edit"]:
             if is_exported(scene, kind):  # needs no process, and no folder that can be written
                 return {"file": export_file(scene, kind).name}
             return await asyncio.to_thread(job.work, "export", scene.folder, kind)
 
-    async def _exported(self, request: Request, scene: Scene) -> Any:
+    async def _exported(self, request: Request, scene: StudioScene) -> Any:
         file = export_file(scene, _kind(request))
         name = f"attachment; filename*=UTF-8''{quote(file.name)}"
         return _File(file, **{"Content-Disposition": name})
 
-    async def _film(self, request: Request, scene: Scene) -> Any:
+    async def _film(self, request: Request, scene: StudioScene) -> Any:
         state = scene.state("film")
         try:
-            plan = from_json(PageFilm, read_json(scene.plan))
+            plan = scene.film_plan()
         except (OSError, ValueError):  # there is none
             plan = None
         return {
@@ -341,60 +341,60 @@ class _Studio:
             "command": plan and film_command(scene, plan),
         }
 
-    async def _render_film(self, request: Request, scene: Scene) -> Any:
+    async def _render_film(self, request: Request, scene: StudioScene) -> Any:
         plan = await _planned(request)
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "film"]:
             scene.check_version(_version(request))
             if not job.is_running(scene, "film"):
-                write_json(scene.plan, asdict(plan))
+                scene.write_film_plan(plan)
                 scene.write_state({}, "film")
             job.start(scene, "film")
         return {}
 
-    async def _stop_film(self, request: Request, scene: Scene) -> Any:
+    async def _stop_film(self, request: Request, scene: StudioScene) -> Any:
         job.stop(scene, "film")
         return {}
 
-    async def _film_path(self, request: Request, scene: Scene) -> Any:
+    async def _film_path(self, request: Request, scene: StudioScene) -> Any:
         plan = await _planned(request)
         async with self._locks[scene.name, "edit"], self._locks[scene.name, "film"]:
             scene.check_version(_version(request))
             if job.is_running(scene, "film"):
                 raise UserError("a film is being rendered; wait until it ends, or stop it")
-            write_json(scene.plan, asdict(plan))
+            scene.write_film_plan(plan)
             return await asyncio.to_thread(job.work, "preview", scene.folder)
 
-    async def _film_file(self, request: Request, scene: Scene) -> Any:
+    async def _film_file(self, request: Request, scene: StudioScene) -> Any:
         name = f"inline; filename*=UTF-8''{quote(safe_name(scene.job.title))}.mp4"
         return _File(scene.film, **{"Content-Disposition": name})
 
-    async def _edit(self, request: Request, scene: Scene) -> Any:
+    async def _edit(self, request: Request, scene: StudioScene) -> Any:
         try:
             changes = from_json(PageEdit, await _object(request))
         except ValueError as error:
             raise UserError("this cannot be stored: {error}", error=error) from None
         async with self._locks[scene.name, "edit"]:
             await _film_has_read(scene)
-            write_json(scene.edits, asdict(changes))
+            scene.write_page_edit(changes)
             return await asyncio.to_thread(job.work, "edit", scene.folder, _version(request))
 
-    async def _undo(self, request: Request, scene: Scene) -> Any:
+    async def _undo(self, request: Request, scene: StudioScene) -> Any:
         async with self._locks[scene.name, "edit"]:
             await _film_has_read(scene)
             return await asyncio.to_thread(job.work, "undo", scene.folder, _version(request))
 
-    async def _site(self, request: Request, scene: Scene) -> Any:
+    async def _site(self, request: Request, scene: StudioScene) -> Any:
         kind = "small" if (scene.site / "scene.sog").is_file() else "levels"
         return await self._with_tools(request, scene, scene.site, kind)
 
-    async def _write_whole(self, request: Request, scene: Scene) -> Any:
+    async def _write_whole(self, request: Request, scene: StudioScene) -> Any:
         async with self._locks[scene.name, "edit"]:
             return await asyncio.to_thread(job.work, "whole", scene.folder)
 
-    async def _whole(self, request: Request, scene: Scene) -> Any:
+    async def _whole(self, request: Request, scene: StudioScene) -> Any:
         return await self._with_tools(request, scene, scene.whole, "whole")
 
-    async def _with_tools(self, request: Request, scene: Scene, site: Path, kind: str) -> Any:
+    async def _with_tools(self, request: Request, scene: StudioScene, site: Path, kind: str) -> Any:
         path = request.path_params["path"] or "index.html"
         file = _inside(site, path)
         if path == "index.html" and is_file(file):
@@ -407,11 +407,11 @@ class _Studio:
             return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
         return _File(file, **{"Content-Security-Policy": _SITE_POLICY})
 
-    async def _made(self, request: Request, scene: Scene) -> Any:
+    async def _made(self, request: Request, scene: StudioScene) -> Any:
         file = _inside(scene.made, request.path_params["path"])
         return _File(file, **{"Content-Security-Policy": _REPORT_POLICY})
 
-    async def _live(self, request: Request, scene: Scene) -> Any:
+    async def _live(self, request: Request, scene: StudioScene) -> Any:
         page = scene.state().get("page")
         if page is None:
             raise UnknownScene("no training runs")
@@ -455,7 +455,7 @@ def _page_files() -> dict[str, Path]:
     return {"": files["index.html"], **files}
 
 
-def _summary(scene: Scene) -> dict[str, Any]:
+def _summary(scene: StudioScene) -> dict[str, Any]:
     """A scene in the list of all; one whose file is damaged does not hide the others."""
     try:
         about = {"title": scene.job.title, "created": scene.job.created}
@@ -466,7 +466,7 @@ def _summary(scene: Scene) -> dict[str, Any]:
     return {"name": scene.name, "picture": _picture_of(scene) is not None, **about}
 
 
-def _details(scene: Scene) -> dict[str, Any]:
+def _details(scene: StudioScene) -> dict[str, Any]:
     """A scene for its own page."""
     state, made = scene.state(), scene.job
     has_page = state.pop("page", None) is not None  # its address is a secret of the job
@@ -490,7 +490,7 @@ def _details(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _status(scene: Scene, state: dict[str, Any]) -> str:
+def _status(scene: StudioScene, state: dict[str, Any]) -> str:
     """One of new, running, done, stopped, failed or, if the process was killed, interrupted.
 
     A scene of the command line is "found" until its site was written; any other one is "opening"
@@ -508,10 +508,10 @@ def _status(scene: Scene, state: dict[str, Any]) -> str:
     return "opening" if behind and os.access(scene.kept, os.W_OK) else status
 
 
-def _edited(scene: Scene) -> float:
+def _edited(scene: StudioScene) -> float:
     """When the scene that is shown was edited, in seconds; 0 if it was not."""
     file = scene.scene_file()
-    return file.stat().st_mtime if file and read_record(file) else 0
+    return file.stat().st_mtime if file and Project.open(file).edit else 0
 
 
 def _version(request: Request) -> str:
@@ -519,7 +519,7 @@ def _version(request: Request) -> str:
     return request.query_params.get("version", "")
 
 
-async def _film_has_read(scene: Scene) -> None:
+async def _film_has_read(scene: StudioScene) -> None:
     """Wait until a film that has started has read the scene: it shows the scene as it was then."""
     while job.is_running(scene, "film") and "now" not in scene.state("film"):
         await asyncio.sleep(0.1)
@@ -595,7 +595,7 @@ def _is_folder(path: Path) -> bool:
         return False
 
 
-def _photo_list(scene: Scene) -> list[dict[str, Any]]:
+def _photo_list(scene: StudioScene) -> list[dict[str, Any]]:
     """The names of the photos that are shown, and whether they have a pose so far."""
     shown, placed = _shown_photos(scene), scene.state().get("placed")
     if placed is None:
@@ -605,7 +605,7 @@ def _photo_list(scene: Scene) -> list[dict[str, Any]]:
     return [{"name": name, "placed": path in names} for name, path in inside]
 
 
-def _shown_photos(scene: Scene) -> list[Path]:
+def _shown_photos(scene: StudioScene) -> list[Path]:
     """The photos of the dataset: those with a pose as soon as they are known, before that all."""
     dataset = Project.open(scene.made).dataset
     # While poses are estimated, the images of an earlier job may still be there.
@@ -618,7 +618,7 @@ def _shown_photos(scene: Scene) -> list[Path]:
     return []
 
 
-def _picture_of(scene: Scene) -> Path | None:
+def _picture_of(scene: StudioScene) -> Path | None:
     """Of the site; before that a rendered test view, or a photo."""
     poster = scene.site / "poster.jpg"
     if is_file(poster):

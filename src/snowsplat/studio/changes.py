@@ -1,7 +1,7 @@
 """What changes a finished scene, or hands it on: edits, title, site, files in other formats.
 
-Each of these is called by one process at a time, which holds `Scene.edit_lock`. If this process is
-killed, the next call finishes what is left, or does all of it.
+Each of these is called by one process at a time, which holds `StudioScene.edit_lock`. If this
+process is killed, the next call finishes what is left, or does all of it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames, write_keys
 from snowsplat.pipeline.options.publish import PublishOptions
 from snowsplat.pipeline.publish import publish
-from snowsplat.project.edit_record import PageEdit, edited_file
+from snowsplat.project.edit_record import edited_file
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio.hand_on import export_file, is_exported
 from snowsplat.studio.job import is_being_made
-from snowsplat.studio.library import Scene, safe_title
+from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.safe_json import from_json, is_file, read_json
@@ -32,12 +33,7 @@ from snowsplat.viewer.web.publication import PAGE
 from snowsplat.viewer.web.publication import SCENE as SITE_SCENE
 
 
-def film_plan(scene: Scene) -> PageFilm:
-    """The plan of its film. Raises OSError, ValueError: there is none."""
-    return from_json(PageFilm, read_json(scene.plan))
-
-
-def finished(scene: Scene) -> Path:
+def finished(scene: StudioScene) -> Path:
     """The scene file. Raises: UserError: the scene is not finished."""
     file = scene.scene_file()
     if file is None:
@@ -45,7 +41,7 @@ def finished(scene: Scene) -> Path:
     return file
 
 
-def export(scene: Scene, kind: str) -> dict[str, Any]:
+def export(scene: StudioScene, kind: str) -> dict[str, Any]:
     """Write the scene in another format, unless that is done; returns the name of the file.
 
     Raises: UserError: the scene is not finished.
@@ -89,7 +85,7 @@ def _written_at(file: Path) -> int:
     return file.stat().st_mtime_ns if file.is_file() else 0
 
 
-def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
+def edit_scene(scene: StudioScene, version: str, undo: bool) -> dict[str, Any]:
     """Write the edited scene and its page; or remove it, and write the page of the other one.
 
     Args:
@@ -97,14 +93,14 @@ def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
 
     Raises: UserError: the scene is not finished, is being made, or was changed since then.
     """
-    changes = None if undo else from_json(PageEdit, read_json(scene.edits))
+    changes = None if undo else scene.page_edit()
     if is_being_made(scene):
         raise UserError("the scene is being made; stop it, then edit it")
     scene.check_version(version)
     finish_edit(scene)  # an earlier one
     file, plan = finished(scene), None
     with suppress(OSError, ValueError):  # no film is planned
-        plan = moved_film(film_plan(scene), page_frames(file), [])
+        plan = moved_film(scene.film_plan(), page_frames(file), [])
     title = changes.title and safe_title(changes.title) if changes else ""
     edited = edited_file(file)
     name = edited.relative_to(scene.folder).as_posix()
@@ -123,7 +119,7 @@ def edit_scene(scene: Scene, version: str, undo: bool) -> dict[str, Any]:
     return show_scene(scene)
 
 
-def finish_edit(scene: Scene) -> None:
+def finish_edit(scene: StudioScene) -> None:
     """Do what is left of an edit whose process was killed, if the scene was edited: the title is
     changed, and the keys of the film keep their places. Doing it again changes nothing."""
     try:
@@ -136,13 +132,13 @@ def finish_edit(scene: Scene) -> None:
         if begun.plan is not None:
             file = finished(scene)
             plan = moved_film(begun.plan, [], page_frames(file))
-            write_json(scene.plan, asdict(plan))
+            scene.write_film_plan(plan)
             if is_file(scene.keys):
                 write_keys(file, plan, scene.keys)
     scene.begun.unlink()
 
 
-def show_scene(scene: Scene) -> dict[str, Any]:
+def show_scene(scene: StudioScene) -> dict[str, Any]:
     """Write the site of a finished scene as it is now, and its figures.
 
     Raises: UserError: the scene is not finished.
@@ -163,7 +159,7 @@ def show_scene(scene: Scene) -> dict[str, Any]:
     return {"file": file.name}
 
 
-def rename(scene: Scene, title: str) -> dict[str, Any]:
+def rename(scene: StudioScene, title: str) -> dict[str, Any]:
     """Change the title, also in the site if there is one."""
     if scene.scene_file() is None:
         scene.change(title=safe_title(title))
@@ -173,7 +169,7 @@ def rename(scene: Scene, title: str) -> dict[str, Any]:
     return show_scene(scene)
 
 
-def show_whole(scene: Scene) -> dict[str, Any]:
+def show_whole(scene: StudioScene) -> dict[str, Any]:
     """Write the page that edits a scene whose site has levels of detail, unless it is there.
 
     Raises: UserError: the scene is not finished.
@@ -185,7 +181,7 @@ def show_whole(scene: Scene) -> dict[str, Any]:
     return {}
 
 
-def _found(scene: Scene) -> dict[str, Any]:
+def _found(scene: StudioScene) -> dict[str, Any]:
     """What a scene of the command line tells about its training."""
     project = Project.open(scene.folder)
     folder = project.training_folder()
@@ -202,7 +198,7 @@ def _found(scene: Scene) -> dict[str, Any]:
     }
 
 
-def existing_reports(scene: Scene, reports: Mapping[str, Path | None]) -> dict[str, str]:
+def existing_reports(scene: StudioScene, reports: Mapping[str, Path | None]) -> dict[str, str]:
     """The paths of the reports that exist, in the output folder."""
     return {
         name: path.relative_to(scene.made).as_posix()

@@ -6,7 +6,8 @@ import shlex
 from pathlib import Path
 
 from snowsplat.project.page_film import PageFilm
-from snowsplat.studio.library import Job, Scene, safe_name
+from snowsplat.project.studio_scene import Job, StudioScene
+from snowsplat.studio.library import safe_name
 from snowsplat.util.safe_json import is_file
 
 #: By kind: the end of the file's name.
@@ -20,12 +21,12 @@ FORMATS = {
 }
 
 
-def export_file(scene: Scene, kind: str) -> Path:
+def export_file(scene: StudioScene, kind: str) -> Path:
     """The file of a scene in one of `FORMATS`; it need not exist."""
     return scene.exports / (safe_name(scene.job.title) + FORMATS[kind])
 
 
-def is_exported(scene: Scene, kind: str) -> bool:
+def is_exported(scene: StudioScene, kind: str) -> bool:
     """Whether this file has the scene as it is now: `export` gives it the time of the scene."""
     file, target = scene.scene_file(), export_file(scene, kind)
     return (
@@ -35,7 +36,7 @@ def is_exported(scene: Scene, kind: str) -> bool:
     )
 
 
-def export_command(scene: Scene, kind: str) -> str:
+def export_command(scene: StudioScene, kind: str) -> str:
     """The command line that writes it."""
     file = scene.scene_file() or scene.made
     if kind == "zip":
@@ -43,14 +44,14 @@ def export_command(scene: Scene, kind: str) -> str:
     return shlex.join(["snowsplat", "convert", str(file), export_file(scene, kind).name])
 
 
-def film_command(scene: Scene, plan: PageFilm) -> str:
+def film_command(scene: StudioScene, plan: PageFilm) -> str:
     """The command line that renders the film again."""
     words = ["snowsplat", "render", str(scene.scene_file() or scene.made), "--path"]
     words += [str(scene.keys), "--seconds", f"{plan.seconds:g}", "--size", plan.size]
     return shlex.join([*words, *["--ease"] * plan.ease, "--video", "film.mp4"])
 
 
-def make_command(scene: Scene, job: Job) -> str:
+def make_command(scene: StudioScene, job: Job) -> str:
     """The command line that makes the scene."""
     inputs = job.inputs or [str(scene.photos)]
     words = ["snowsplat", "make", *inputs, "-o", str(scene.made)]

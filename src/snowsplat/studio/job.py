@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from snowsplat.studio.library import Scene
+from snowsplat.project.studio_scene import StudioScene
 from snowsplat.util.errors import UserError
 from snowsplat.util.run_lock import LOCK, holder, is_locked
 
@@ -22,7 +22,7 @@ _WORKER = [sys.executable, "-m", "snowsplat.studio"]
 _started: dict[Path, subprocess.Popen[bytes]] = {}
 
 
-def start(scene: Scene, task: str = "make") -> None:
+def start(scene: StudioScene, task: str = "make") -> None:
     """Start one of the `TASKS` of a scene, or resume it. It goes on if this process ends.
 
     Raises: UserError: it runs already.
@@ -40,22 +40,22 @@ def start(scene: Scene, task: str = "make") -> None:
         )
 
 
-def is_running(scene: Scene, task: str = "make") -> bool:
+def is_running(scene: StudioScene, task: str = "make") -> bool:
     """Whether a process, started here or elsewhere, does this."""
     return _own_process(scene, task) is not None or is_locked(scene.lock(task))
 
 
-def _own_process(scene: Scene, task: str) -> subprocess.Popen[bytes] | None:
+def _own_process(scene: StudioScene, task: str) -> subprocess.Popen[bytes] | None:
     process = _started.get(scene.lock(task))
     return process if process is not None and process.poll() is None else None
 
 
-def is_being_made(scene: Scene) -> bool:
+def is_being_made(scene: StudioScene) -> bool:
     """Whether its job runs, or a command in a terminal writes its output folder."""
     return is_running(scene) or is_locked(scene.made / LOCK)
 
 
-def stop(scene: Scene, task: str = "make") -> None:
+def stop(scene: StudioScene, task: str = "make") -> None:
     """Ask the job to save what it has, and to end; does nothing if none runs.
 
     Raises: UserError: it runs on another computer.

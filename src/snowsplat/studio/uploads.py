@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.studio.library import PART, Scene, safe_name
+from snowsplat.project.studio_scene import PART, StudioScene
+from snowsplat.studio.library import safe_name
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
 
@@ -56,7 +57,7 @@ class Upload:
     received: int = 0
 
 
-def uploads(scene: Scene) -> list[Upload]:
+def uploads(scene: StudioScene) -> list[Upload]:
     """The files that have arrived, and those of which a part has.
 
     A file that was complete when the process was killed gets its name.
@@ -79,7 +80,7 @@ def uploads(scene: Scene) -> list[Upload]:
     return found
 
 
-def write_part(scene: Scene, file: Upload, data: bytes) -> int:
+def write_part(scene: StudioScene, file: Upload, data: bytes) -> int:
     """Append a part of an uploaded file, after the bytes that it has received.
 
     If there is another file of this name, the file gets a number, unless both are the same.

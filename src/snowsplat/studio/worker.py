@@ -43,6 +43,7 @@ from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.stage_lines import described
 from snowsplat.project.edit_record import shown_file
 from snowsplat.project.project import Project
+from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, steps_of, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
@@ -50,8 +51,7 @@ from snowsplat.sfm.progress import Report
 from snowsplat.sfm.report.dataset_report import draw_from_above
 from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.studio import changes
-from snowsplat.studio.changes import existing_reports, film_plan, finished
-from snowsplat.studio.library import TASKS, Scene, version_of
+from snowsplat.studio.changes import existing_reports, finished
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.files import write_text
@@ -70,7 +70,7 @@ _CURVE = 400  # points of the curve of the loss
 class _Recorder(Observer):
     """Writes the progress of a task to the state of its scene."""
 
-    def __init__(self, scene: Scene, task: str = "make") -> None:
+    def __init__(self, scene: StudioScene, task: str = "make") -> None:
         self._scene, self._task = scene, task
         self._written = 0.0
         self._every = 1  # steps between two points of the curve
@@ -159,7 +159,7 @@ class _Recorder(Observer):
             self.note(message("there is no map of the cameras: {error}", error=error))
 
 
-def run_job(scene: Scene, task: str) -> int:
+def run_job(scene: StudioScene, task: str) -> int:
     """Do one of the `TASKS`, or resume it, under its lock; returns the exit code."""
     recorder = _Recorder(scene, task)
     code, outcome = _outcome(scene, task, recorder)
@@ -170,7 +170,7 @@ def run_job(scene: Scene, task: str) -> int:
     return code
 
 
-def _outcome(scene: Scene, task: str, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
+def _outcome(scene: StudioScene, task: str, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
     """The exit code of the job, and what it adds to the state."""
     try:
         with ended_by_signals():
@@ -195,7 +195,7 @@ def _line(error: UserError | OSError) -> str:
     return printable(" ".join(message.split()))
 
 
-def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
+def _make(scene: StudioScene, recorder: _Recorder) -> dict[str, Any]:
     with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
         # An edit that has begun ends first; none begins while this job runs. What an edit that was
         # killed has left to do is not for the scene that is made now.
@@ -215,12 +215,12 @@ def _make(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
     return _result(scene, made) | {"gaussians": site.gaussians, "shown": shown}
 
 
-def _film(scene: Scene, recorder: _Recorder) -> dict[str, Any]:
-    file = film(finished(scene), film_plan(scene), scene.keys, scene.film, observer=recorder)
+def _film(scene: StudioScene, recorder: _Recorder) -> dict[str, Any]:
+    file = film(finished(scene), scene.film_plan(), scene.keys, scene.film, observer=recorder)
     return {"bytes": file.stat().st_size}
 
 
-def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
+def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
     known = made.figures
     reports = {"training": made.training.report, "photos": made.dataset_report}
     return {
@@ -235,7 +235,7 @@ def _result(scene: Scene, made: MakeResult) -> dict[str, Any]:
     }
 
 
-def survey_photos(scene: Scene) -> dict[str, Any]:
+def survey_photos(scene: StudioScene) -> dict[str, Any]:
     """What `make` would use of the inputs, and the seconds that it takes at each quality.
 
     Raises: UserError: there is nothing to use.
@@ -253,11 +253,11 @@ def survey_photos(scene: Scene) -> dict[str, Any]:
     return {"facts": facts, "count": photos.count, "seconds": seconds}
 
 
-def _answer(scene: Scene, words: list[str]) -> dict[str, Any]:
+def _answer(scene: StudioScene, words: list[str]) -> dict[str, Any]:
     if words[0] == "survey":
         return survey_photos(scene)
     if words[0] == "preview":
-        return {"path": film_preview(finished(scene), film_plan(scene))}
+        return {"path": film_preview(finished(scene), scene.film_plan())}
     scene.kept.mkdir(exist_ok=True, mode=0o700)
     with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
         if words[0] == "export":
@@ -271,7 +271,7 @@ def _answer(scene: Scene, words: list[str]) -> dict[str, Any]:
         return changes.edit_scene(scene, words[1], words[0] == "undo")
 
 
-def _printed(scene: Scene, words: list[str]) -> int:
+def _printed(scene: StudioScene, words: list[str]) -> int:
     try:
         answer = _answer(scene, words)
     except (UserError, OSError) as error:
@@ -282,7 +282,7 @@ def _printed(scene: Scene, words: list[str]) -> int:
 
 def main(words: list[str]) -> int:
     logging.basicConfig(level=logging.WARNING)
-    scene = Scene(Path(words[1]))
+    scene = StudioScene(Path(words[1]))
     if words[0] in TASKS:
         return run_job(scene, words[0])
     return _printed(scene, [words[0], *words[2:]])
