@@ -57,7 +57,6 @@ class _Projection:
     down: np.ndarray  # (3,) world direction that points down in the drawing
 
 
-_UNITS = message("units")
 _NO_MARKS = np.empty((0, 3))
 _Project = Callable[[np.ndarray], np.ndarray]  # (n, 3) world to (n, 2) of the drawing
 
@@ -78,7 +77,7 @@ def draw_scene(
     xyz: np.ndarray,
     rgb: np.ndarray,
     marks: np.ndarray = _NO_MARKS,
-    unit: Message | str = _UNITS,
+    unit: Message | str = "units",
 ) -> list[Drawing]:
     """One drawing for each projection, of points (P, 3) and their colours (P, 3) uint8.
 

@@ -3,23 +3,31 @@
 import { say, told } from "./text.js";
 
 /**
+ * The type of an element with this tag: "input.wide" is an HTMLInputElement.
+ * @template {string} T
+ * @typedef {T extends `${infer Name}.${string}` ? ElementOf<Name>
+ *     : T extends keyof HTMLElementTagNameMap ? HTMLElementTagNameMap[T] : HTMLElement} ElementOf
+ */
+
+/**
  * A new element.
- * @param {string} tag name, with classes: "p.soft"
- * @param {Record<string, any>} [attributes] functions are listeners: {click: …}
+ * @template {string} T
+ * @param {T} tag name, with classes: "p.soft"
+ * @param {Record<string, unknown>} [attributes] functions are listeners: {click: …}
  * @param {...(Node | string | null | undefined | false)} children
- * @returns {HTMLElement}
+ * @returns {ElementOf<T>}
  */
 export function make(tag, attributes = {}, ...children) {
     const [name, ...classes] = tag.split(".");
     const element = document.createElement(name);
     element.classList.add(...classes);
     for (const [key, value] of Object.entries(attributes)) {
-        if (typeof value === "function") element.addEventListener(key, value);
+        if (typeof value === "function") element.addEventListener(key, /** @type {EventListener} */ (value));
         else if (value === true) element.setAttribute(key, "");
         else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, String(value));
     }
     element.append(...children.filter(child => child !== null && child !== undefined && child !== false));
-    return element;
+    return /** @type {ElementOf<T>} */ (element);
 }
 
 /** A button with a text. */

@@ -1,7 +1,8 @@
 // The start page, and which page is shown.
 
 import { action, ask, make, notice, reasonOf } from "./page.js";
-import { showScene, upload } from "./scene.js";
+import { ScenePage } from "./scene.js";
+import { upload } from "./scene_upload.js";
 import { chosenLanguage, chosenTheme, say, speak } from "./text.js";
 import { chosen, dropped, titleOf } from "./upload.js";
 
@@ -13,7 +14,7 @@ function route() {
     closing = new AbortController();
     notice("");
     const name = decodeURIComponent(location.hash.slice(1));
-    if (name) showScene(main, name, closing.signal);
+    if (name) new ScenePage(main, name, closing.signal);
     else showStart(closing.signal);
     main.scrollIntoView();
 }

@@ -251,11 +251,14 @@ export function speak(language) {
 }
 
 /**
- * A line that the program tells, which is English, in the chosen language; some lines remain English.
- * @param {string} line
+ * A text of the program in the chosen language; some lines remain English.
+ * @param {import("./types.js").Told} text
  * @returns {string}
  */
-export const told = line => (column ? /** @type {any} */ (globalThis).snowsplatChinese(line) : line);
+export const told = text => {
+    if (typeof text !== "string") return column ? text.zh : text.en;
+    return column ? /** @type {any} */ (globalThis).snowsplatChinese(text) : text;
+};
 
 /**
  * A text in the chosen language; {0}, {1} are replaced.
