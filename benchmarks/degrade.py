@@ -29,7 +29,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat import Dataset, load_dataset
-from snowsplat.data.colmap import read_model, read_points, write_model
+from snowsplat.data.colmap.model import read_model, read_points, write_model
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 from snowsplat.training.starts.point_colors import point_colors

@@ -25,7 +25,8 @@ from PIL import Image
 from torch.nn.functional import interpolate, normalize
 
 from snowsplat import Trainer, load_dataset, recipe
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, quat_from_rotation

@@ -18,7 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.scenes.street import street
 from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
 from snowsplat.synthetic.lens import Lens

@@ -23,7 +23,8 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
 from snowsplat.synthetic.lens import Lens

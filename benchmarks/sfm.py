@@ -41,7 +41,7 @@ from sfm_plain import MODES
 from sfm_scenes import CACHE_VARIABLE, KINDS, SIZE, cache_folder, photos_of, video_of
 from torch import Tensor
 
-from snowsplat.data.colmap import read_model
+from snowsplat.data.colmap.model import read_model
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.sfm.gps import east_north_up, middle_of
 from snowsplat.sfm.ingest.photos.exif import read_exif

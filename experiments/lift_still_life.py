@@ -21,7 +21,8 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.evaluation.metrics import psnr
 from snowsplat.extras.lift.lift import lift

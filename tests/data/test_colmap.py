@@ -8,15 +8,9 @@ import pytest
 import torch
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import (
-    ColmapImage,
-    ColmapModel,
-    posed_camera,
-    read_model,
-    read_points,
-    types,
-    write_model,
-)
+from snowsplat.data.colmap import types
+from snowsplat.data.colmap.model import posed_camera, read_model, read_points, write_model
+from snowsplat.data.colmap.types import ColmapImage, ColmapModel
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError

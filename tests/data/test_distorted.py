@@ -13,10 +13,11 @@ import torch
 from PIL import Image
 
 from snowsplat.data import ImageLoader, load_dataset
-from snowsplat.data.colmap import ColmapImage, read_model, write_model
+from snowsplat.data.colmap.model import read_model, write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.judge.verdict import judge
 from snowsplat.data.lens.models import COLMAP_MODELS, lens_of
-from snowsplat.data.maps.depth_file import to_z
+from snowsplat.data.maps.map_files import to_z
 from snowsplat.data.photos.decode import load_image, load_thumbnail
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.util.errors import UserError

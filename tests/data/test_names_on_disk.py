@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import ColmapImage, read_model, write_model
+from snowsplat.data.colmap.model import read_model, write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.util.errors import UserError
 
 

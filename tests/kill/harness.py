@@ -31,7 +31,8 @@ import torch
 from PIL import Image
 
 import snowsplat
-from snowsplat.data.colmap import ColmapImage, read_model, read_points
+from snowsplat.data.colmap.model import read_model, read_points
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.formats import read_gaussians
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import rotation_from_quat

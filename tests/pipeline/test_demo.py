@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.pipeline.demo import compare_with_truth, is_accurate
 from snowsplat.project.dataset_folder import DatasetFolder

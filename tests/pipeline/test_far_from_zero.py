@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import posed_camera, read_model, read_points, write_model
+from snowsplat.data.colmap.model import posed_camera, read_model, read_points, write_model
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.pipeline.blocks.merge import merge_blocks
 from snowsplat.pipeline.blocks.plan import plan_blocks

@@ -17,7 +17,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.data.colmap import read_model
+from snowsplat.data.colmap.model import read_model
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
 from snowsplat.synthetic import light, still_life, write_synthetic_photos
 from snowsplat.synthetic.lens import Lens

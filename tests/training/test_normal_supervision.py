@@ -14,7 +14,8 @@ from torch import Tensor
 
 from snowsplat import Trainer, recipe
 from snowsplat.data import load_dataset
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.dataset import Dataset
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera

@@ -16,10 +16,10 @@ from snowsplat.data.frame.move_to_origin import move_to_origin
 from snowsplat.data.frame.near import near_of
 from snowsplat.data.hold_out import held_out_names
 from snowsplat.data.image_sizes import ImageSize, image_sizes, with_smaller_copies
-from snowsplat.data.lens.circle import image_circle
+from snowsplat.data.lens.coverage import image_circle
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
-from snowsplat.data.maps.map_file import MAP_SUFFIXES
+from snowsplat.data.maps.map_files import MAP_SUFFIXES
 from snowsplat.data.photos.decode import ImageSource, load_thumbnail
 from snowsplat.data.readers import read_poses
 from snowsplat.scene.camera import Camera

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from snowsplat.data.colmap import posed_camera, read_model
+from snowsplat.data.colmap.model import posed_camera, read_model
 from snowsplat.pipeline.make import make
 from snowsplat.pipeline.make_result import MakeResult
 from snowsplat.pipeline.observer import SILENT, Observer

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at, quat_from_rotation

@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 import torch
 
-from snowsplat.data.colmap import posed_camera, read_model
+from snowsplat.data.colmap.model import posed_camera, read_model
 from snowsplat.data.colmap.tracks import points_with_tracks
 from snowsplat.data.dataset import Points, Tracks, View
 from snowsplat.data.judge.rig import Rig

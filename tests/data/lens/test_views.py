@@ -6,8 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.data.lens.circle import image_circle
-from snowsplat.data.lens.coverage import covered_pixels
+from snowsplat.data.lens.coverage import covered_pixels, image_circle
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.models import COLMAP_MODELS, lens_of
 from snowsplat.data.lens.resample import nearest, resample

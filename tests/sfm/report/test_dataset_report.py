@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.data.colmap import read_model, read_points, write_model
+from snowsplat.data.colmap.model import read_model, read_points, write_model
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.scene.geometry import look_at
 from snowsplat.sfm.report import dataset_report

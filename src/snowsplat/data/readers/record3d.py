@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from snowsplat.data.maps.map_file import MAP_SUFFIXES
+from snowsplat.data.maps.map_files import MAP_SUFFIXES
 from snowsplat.data.photos.decode import is_photo
 from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import Intrinsics, perspective

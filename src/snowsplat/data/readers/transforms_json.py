@@ -29,7 +29,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from snowsplat.data.colmap import find_models, read_points
+from snowsplat.data.colmap.model import read_points
+from snowsplat.data.colmap.places import find_models
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.photo_files import find_photos, warn_of_missing
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, read_header

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from snowsplat.data.maps.depth_alignment import Alignment
-from snowsplat.data.maps.depth_file import read_depth_file, to_z
+from snowsplat.data.maps.map_files import read_depth_file, to_z
 from snowsplat.evaluation.metrics import Evaluation, compare
 from snowsplat.extras.lift.depth_model import estimate_depth
 from snowsplat.extras.lift.edges import resize_depth

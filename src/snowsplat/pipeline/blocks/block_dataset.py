@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.data.colmap import ColmapImage, write_model
+from snowsplat.data.colmap.model import write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.data.lens.brown import as_colmap
 from snowsplat.data.lens.lens import Lens

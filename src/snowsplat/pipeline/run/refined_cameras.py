@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.data import Dataset, View
-from snowsplat.data.colmap import ColmapImage, posed_camera, read_model, write_model
+from snowsplat.data.colmap.model import posed_camera, read_model, write_model
+from snowsplat.data.colmap.types import ColmapImage
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.models import lens_of
 from snowsplat.project.training_folder import TrainingFolder

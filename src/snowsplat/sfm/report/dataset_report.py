@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from snowsplat.data.colmap import posed_camera, read_model, read_points
+from snowsplat.data.colmap.model import posed_camera, read_model, read_points
 from snowsplat.data.frame.placement import placement_of
 from snowsplat.data.photos.colour_profile import plain_pixels
 from snowsplat.evaluation.verdict import Verdict

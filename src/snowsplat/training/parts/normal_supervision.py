@@ -28,7 +28,7 @@ from torch.nn.functional import interpolate
 
 from snowsplat.data.dataset import View
 from snowsplat.data.lens.resample import nearest
-from snowsplat.data.maps.normal_file import read_normal_file
+from snowsplat.data.maps.map_files import read_normal_file
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import RenderOutput

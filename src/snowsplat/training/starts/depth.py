@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.lens.resample import nearest
 from snowsplat.data.maps.depth_alignment import align
-from snowsplat.data.maps.depth_file import DepthKind, read_depth_file, to_z
+from snowsplat.data.maps.map_files import DepthKind, read_depth_file, to_z
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.depth_map import (

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from snowsplat.data.maps.depth_file import read_depth_file, to_z
+from snowsplat.data.maps.map_files import read_depth_file, to_z
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 

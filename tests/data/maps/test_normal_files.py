@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.data.maps.normal_file import read_normal_file
+from snowsplat.data.maps.map_files import read_normal_file
 from snowsplat.util.errors import UserError
 
 
