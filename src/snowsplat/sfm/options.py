@@ -11,7 +11,8 @@ from snowsplat.util.settings import Settings, group, setting, switch
 Mapper = Literal["incremental", "global"]
 EffortName = Literal["draft", "normal", "best"]
 
-MIN_PHOTOS = 3  # minimum number of photos
+#: Two photos tell no scale of a third one: with fewer photos, there is no scene.
+MIN_PHOTOS = 3
 _MIN_SIZE = 128  # pixels
 
 

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 
 _POINTS_SAMPLED = 5000  # number of points from which medians are computed
+_PARALLEL = math.radians(10)  # axes within this angle meet nowhere
+# The axes meet at a point that is in front of most cameras, by a share of the distance of their
+# points; and that is nearer to the axes than this share of its distance from the cameras.
+_MOST, _AHEAD, _NEAR = 0.75, 0.2, 0.5
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,7 @@ def _meeting_point(cameras: Cameras) -> np.ndarray | None:
     axes, centres = cameras.forward, cameras.centres
     # (N, 3, 3) matrices that project a vector onto the plane perpendicular to an axis.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] < math.sin(math.radians(10)) ** 2:
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < math.sin(_PARALLEL) ** 2:
         return None
     typical = cameras.distance
     weights = np.ones(len(axes))
@@ -112,5 +116,7 @@ def _meeting_point(cameras: Cameras) -> np.ndarray | None:
         away = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
         weights = 1 / np.maximum(away, 0.01 * typical)
     ahead = np.einsum("ni,ni->n", point - centres, axes)  # the depth of the point in each camera
-    is_met = (ahead > 0.2 * typical).mean() > 0.75 and np.median(away) < 0.5 * np.median(ahead)
+    is_met = (ahead > _AHEAD * typical).mean() > _MOST and np.median(away) < _NEAR * np.median(
+        ahead
+    )
     return point if is_met else None

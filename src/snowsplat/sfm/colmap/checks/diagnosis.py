@@ -8,6 +8,7 @@ from pathlib import Path
 
 from snowsplat.sfm.colmap.database import Pair, displacement_of, feature_counts, verified_pairs
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.options import MIN_PHOTOS
 from snowsplat.util.errors import UserError
 
 # A photo with fewer features is too dark, blurred or plain.
@@ -70,7 +71,7 @@ class Evidence:
     @property
     def more_effort_is_useless(self) -> bool:
         """Whether an attempt with more effort cannot find a model, if no model was found yet."""
-        return self.still or self.flat or self.usable < 3
+        return self.still or self.flat or self.usable < MIN_PHOTOS
 
 
 def gather_evidence(database: Path, photos: Sequence[Photo], matched: int) -> Evidence:
@@ -129,14 +130,14 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
     count = len(evidence.features)
     usable = sum(features >= _FEW_FEATURES for features in evidence.features)
     paired = {i for pair in evidence.pairs for i in (pair.first, pair.second)}
-    if usable < 3:
+    if usable < MIN_PHOTOS:
         return UserError(
             "photos: only {usable} of {count} show enough detail, and the others are too dark, "
             "blurred or plain; take sharp, well-lit photos of objects with texture",
             usable=usable,
             count=count,
         )
-    if len(paired) < 3:
+    if len(paired) < MIN_PHOTOS:
         matching = f"only {len(paired)} of them match" if paired else "no two of them match"
         return UserError(
             "photos: the {count} photos do not overlap ({matching}); take photos of one scene, "

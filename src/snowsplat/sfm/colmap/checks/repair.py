@@ -17,7 +17,8 @@ from snowsplat.sfm.colmap.checks.consistency import (
     unconfirmed_photos,
 )
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
-from snowsplat.sfm.colmap.mapping.mapping import MIN_PHOTOS, Mapping
+from snowsplat.sfm.colmap.mapping.mapping import Mapping
+from snowsplat.sfm.options import MIN_PHOTOS
 
 _ROUNDS = 3  # a new model is made at most this number of times
 

@@ -25,7 +25,7 @@ from snowsplat.sfm.colmap.lenses.lens import robust_adjustment
 from snowsplat.sfm.colmap.mapping.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
 from snowsplat.sfm.colmap.options import photos_with_adjustment
-from snowsplat.sfm.options import Mapper
+from snowsplat.sfm.options import MIN_PHOTOS, Mapper
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import new_folder
 
@@ -33,7 +33,6 @@ from snowsplat.util.files import new_folder
 # errors to a third; then fewer points are sufficient.
 MIN_POINTS = 15
 _MIN_POINTS_ALIGNED = 10
-MIN_PHOTOS = 3
 # At the end, observations with a larger reprojection error are removed. In pixels of the resized
 # photo in which the features were detected.
 _MAX_REPROJECTION_ERROR = 3.0

@@ -20,7 +20,7 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.options import CAMERA_MODELS, SfmResult, thread_count
 from snowsplat.sfm.colmap.process.growing_map import read_poses
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.options import SfmOptions
+from snowsplat.sfm.options import MIN_PHOTOS, SfmOptions
 from snowsplat.sfm.progress import Figures, Report, ShowPoses
 from snowsplat.util.errors import SettingError, UserError
 
@@ -73,7 +73,7 @@ def estimate_poses(
             explains why), or COLMAP crashed twice.
         OSError: the disk is full.
     """
-    if len(photos) < 3:
+    if len(photos) < MIN_PHOTOS:
         raise UserError(
             "photos: {photos} are not enough; take at least 3, preferably 30 or more",
             photos=len(photos),

@@ -47,6 +47,10 @@ _SYMMETRIC = 0.02  # opposite bars that differ by less, as a fraction of the sid
 
 _FINE, _COARSE = 1.0, 3.0  # pixels: standard deviations of the band-pass filter. Shading is coarser
 _EDGE = 4.0  # grey levels per pixel: gradient of an edge that can be a feature
+_WEAK_EDGE = 0.75  # of `_EDGE`: a slow edge may be this weak
+# The edge of a photo is that of the overlay if at least this share of the overlay's gradient is in
+# it, in the same direction, and if it is not stronger than the overlay's by this factor.
+_SAME_EDGE, _STRONGER = 0.25, 2.5
 # Photos with an edge, divided by all photos. Before a background as bright as itself, a text has no
 # edge. In few photos, edges meet at a pixel by chance.
 _FIXED, _FIXED_IN_FEW, _SLOW = 0.75, 0.85, 0.5
@@ -61,6 +65,8 @@ _NEAR_BORDER = 0.15  # distance, as a fraction of the height or the width
 _AROUND = 8  # pixels: edges at most this far from a fixed edge are around it
 _MIN_EDGES = 40  # pixels of fixed edges in an overlay
 _GAP = 12  # pixels: gap between two words of a text
+_BLUR = np.ones((9, 9), np.uint8)  # what is masked around a fixed edge: its blur is fixed, too
+_PART_OF_ALL = 0.15  # of the overlays: a smaller part is not named
 _TEXT_HEIGHT = 0.12  # of the height of the frame; higher overlays are no line of text
 # The last digits of a clock change, so that they have no fixed edges. This number of times the
 # height of a text is masked beside it.
@@ -235,11 +241,11 @@ def _edges(copies: NDArray[np.uint8]) -> _Edges:
     x, y = np.median(across, axis=0), np.median(down, axis=0)
     strength = np.hypot(x, y)
     sizes = np.hypot(across, down)
-    same = (across * x + down * y >= 0.25 * strength**2) & (sizes <= 2.5 * strength)
+    same = (across * x + down * y >= _SAME_EDGE * strength**2) & (sizes <= _STRONGER * strength)
     share = same.mean(axis=0)
     least = _FIXED if len(copies) >= _FEW_PHOTOS else _FIXED_IN_FEW
     fixed = (strength >= _EDGE) & (share >= least)
-    slow = fixed | ((strength >= 0.75 * _EDGE) & (share >= _SLOW))
+    slow = fixed | ((strength >= _WEAK_EDGE * _EDGE) & (share >= _SLOW))
     return _Edges(fixed, slow, (sizes >= _EDGE).sum(axis=0), x, y)
 
 
@@ -263,7 +269,7 @@ def _overlays(edges: _Edges, copies: NDArray[np.uint8]) -> NDArray[np.bool_]:
         found |= part
     if not found.any() or found.mean() > _ALL_OF_IT:
         return np.zeros_like(found)
-    found = cv2.dilate(found.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    found = cv2.dilate(found.astype(np.uint8), _BLUR) > 0
     return _with_enclosed(found, copies)
 
 
@@ -341,7 +347,7 @@ def _places(overlays: NDArray[np.bool_]) -> str:
         for column, name in enumerate(line):
             rows = slice(row * height // 3, (row + 1) * height // 3)
             columns = slice(column * width // 3, (column + 1) * width // 3)
-            if overlays[rows, columns].sum() >= 0.15 * overlays.sum():
+            if overlays[rows, columns].sum() >= _PART_OF_ALL * overlays.sum():
                 names.append(name)
     return _listed(names)
 

@@ -24,6 +24,8 @@ _ON_CIRCLE = 0.85  # share of the directions whose edge is on the circle
 _MIN_SEEN = 0.25  # share of the directions in which the edge is inside of the frame
 _OFF_CENTRE = 0.15  # distance of the centres of disc and frame, relative to the shorter side
 _SMALLEST = 0.6  # diameter, relative to the shorter side
+_STEP = 0.5  # pixels along a direction
+_AT_BORDER = 3.0  # pixels: an edge that is nearer to the border of the frame is the border's
 _MARGIN = 0.015  # of the radius: the outermost part of the disc is blurred
 
 
@@ -84,7 +86,7 @@ def _edge(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
     A direction counts only if the frame is black between this pixel and the border."""
     height, width = lit.shape
     turn = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
-    steps = np.arange(0.0, np.hypot(width, height) / 2, 0.5)
+    steps = np.arange(0.0, np.hypot(width, height) / 2, _STEP)
     x = width / 2 + np.cos(turn)[:, None] * steps
     y = height / 2 + np.sin(turn)[:, None] * steps
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -92,7 +94,7 @@ def _edge(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
     seen = lit[row, column] & inside
     last = seen.shape[1] - 1 - seen[:, ::-1].argmax(1)
     border = inside.sum(1) - 1
-    chosen = seen.any(1) & (last < border - 6)  # 3 pixels
+    chosen = seen.any(1) & (last < border - _AT_BORDER / _STEP)
     rows = np.flatnonzero(chosen)
     return np.stack([x[rows, last[rows]], y[rows, last[rows]]], 1)
 

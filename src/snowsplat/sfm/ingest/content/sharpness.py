@@ -31,6 +31,10 @@ _MIN_DETAIL = {160: 0.09, 80: 0.16}
 # Minimum range of the grey levels (0.5% to 99.5% quantile) of an image with content. A photo with
 # the lens cap on has 2 to 5.
 _MIN_RANGE = 8.0
+# Grey levels. An image without content is black if all of it is darker than the first one, and
+# white if all of it is brighter than the second one.
+_BLACK, _WHITE = 64, 191
+_SMALLEST = 8  # pixels: smaller copies have no detail that could be measured
 
 # Reasons why an image is unusable.
 BLACK = "is completely black"
@@ -69,7 +73,7 @@ def why_unusable(grey: np.ndarray) -> str | None:
     """The reason why an image is unusable for SfM, or None. ``grey``: a copy of `CONTENT_SIDE`."""
     low, high = np.quantile(grey, [0.005, 0.995])
     if high - low < _MIN_RANGE:
-        return BLACK if high < 64 else WHITE if low > 191 else FLAT
+        return BLACK if high < _BLACK else WHITE if low > _WHITE else FLAT
     # Motion blur keeps the detail perpendicular to its direction: such an image is still usable.
     blurred = any(max(fine_detail(grey, side)) < least for side, least in _MIN_DETAIL.items())
     return BLURRED if blurred else None
@@ -84,7 +88,7 @@ def fine_detail(grey: np.ndarray, side: int) -> tuple[float, float]:
     Returns: The share of the vertical and that of the horizontal gradient.
     """
     small = grey_copy(Image.fromarray(grey), side).astype(np.float32)
-    if min(small.shape) < 8:
+    if min(small.shape) < _SMALLEST:
         return 1.0, 1.0
     blurred = (small[:-2] + 2 * small[1:-1] + small[2:]) / 4
     blurred = (blurred[:, :-2] + 2 * blurred[:, 1:-1] + blurred[:, 2:]) / 4

@@ -21,8 +21,12 @@ _SAME_LEVEL = 6.0  # grey levels; compression and noise change a pixel by less
 _NOISE = 3.0  # changes of less than this multiple of the noise are no changes
 _PATCH = np.ones((5, 5), np.uint8)  # what has to be the same as in another photo, around a pixel
 _TEXTURED = 0.3  # share of the pixels of a part of the backdrop with texture
-# Share of the photos that have the same patch, if it belongs to the backdrop.
-_SEEN = 0.2
+# Share of the photos, and number of photos, that have the same patch if it belongs to the backdrop.
+_SEEN, _FEWEST = 0.2, 3.0
+# A block shows edges that stand still if at least the first share of its edges does, and an object
+# if less than the second share does.
+_STILL_EDGES, _MOVING_EDGES = 0.5, 0.1
+_ELSEWHERE = 0.05  # of the largest part that moves; smaller ones are not the object
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ def find_backdrop(
         return None
     largest = boxes[1:, cv2.CC_STAT_AREA].max()
     for i in range(1, number):  # what moves elsewhere is not the object
-        if boxes[i, cv2.CC_STAT_AREA] < 0.05 * largest:
+        if boxes[i, cv2.CC_STAT_AREA] < _ELSEWHERE * largest:
             changed[labels == i] = 0
     level, known = _common_level(copies, tolerance)
     return Backdrop(_from_border(changed == 0), level, known, tolerance)
@@ -119,7 +123,9 @@ def _object_before_background(
     if not textured.any():
         return False
     share = in_fixed[textured] / in_all[textured]
-    return bool((share >= 0.5).mean() >= _STILL and (share < 0.1).mean() >= _OBJECT)
+    return bool(
+        (share >= _STILL_EDGES).mean() >= _STILL and (share < _MOVING_EDGES).mean() >= _OBJECT
+    )
 
 
 def _common_level(
@@ -136,7 +142,7 @@ def _common_level(
     best = votes.argmax(axis=0)[None]
     level = np.take_along_axis(copies, best, axis=0)[0]
     most = np.take_along_axis(votes, best, axis=0)[0]
-    return level, most >= max(3.0, _SEEN * len(copies))
+    return level, most >= max(_FEWEST, _SEEN * len(copies))
 
 
 def _difference(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint8]:

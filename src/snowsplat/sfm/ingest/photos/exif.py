@@ -16,6 +16,9 @@ from snowsplat.sfm.ingest.photos.attitude import read_attitude
 _SRGB = 1
 _PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
+# Focal lengths divided by the longest side: fields of view of 150° and 1.5°. Values beyond them
+# were not set correctly.
+_WIDEST, _NARROWEST = 0.13, 40
 _JPEG_LIMIT = 65000  # bytes of EXIF that fit into a JPEG segment
 
 
@@ -76,8 +79,7 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
         sizes = [_number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
         original = max((size for size in sizes if size), default=max(width, height))
         focal = length * density / unit * max(width, height) / original
-    # These limits are fields of view of 150° and 1.5°. Values beyond them were not set correctly.
-    plausible = focal is not None and 0.13 < focal / max(width, height) < 40
+    plausible = focal is not None and _WIDEST < focal / max(width, height) < _NARROWEST
     return focal if plausible else None
 
 

@@ -13,9 +13,7 @@ from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
 from snowsplat.sfm.ingest.video.clip import film_size, why_no_video
-
-#: With fewer photos, there is no scene.
-MIN_PHOTOS = 3
+from snowsplat.sfm.options import MIN_PHOTOS
 
 
 @dataclass

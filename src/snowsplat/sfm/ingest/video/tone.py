@@ -17,6 +17,8 @@ _HLG = 18  # ARIB STD-B67
 _BT709 = 1
 _UNSPECIFIED = 2
 _BT2020 = 9
+# Rows of a frame from which on video players assume the matrix of BT.709, if none is declared.
+_HD = 720
 # The luminance that is shown as white: nominal diffuse white of BT.2408, in cd/m².
 _WHITE = 203.0
 # Linear BT.2020 to BT.709 (BT.2087).
@@ -35,8 +37,8 @@ _STEPS = 4096  # entries of the lookup tables
 def rgb_image(frame: VideoFrame) -> np.ndarray:
     """(H, W, 3) uint8 sRGB of a decoded frame, in the stored orientation."""
     matrix = None  # None: the matrix that the frame declares
-    if frame.colorspace == _UNSPECIFIED and frame.height >= 720:
-        matrix = _BT709  # video players assume this matrix for frames of this size
+    if frame.colorspace == _UNSPECIFIED and frame.height >= _HD:
+        matrix = _BT709
     transfer = frame.color_trc
     if transfer not in (_PQ, _HLG):
         return frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()

@@ -65,6 +65,9 @@ _MIN_STEP = 0.01
 _MIN_COUNT = 30
 # With fewer key frames, what is fixed to the frame is not found reliably.
 _FEW_KEY_FRAMES = 8
+_MOST_CANDIDATES = 4  # times the number of frames to keep; then half of them are deleted
+_REPORTED = 10  # frames between two reports of the progress
+_WHOLE = 0.97  # of the declared frames; if fewer can be decoded, the video is damaged
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def extract_frames(
                 grey = _cropped(_grey(frame), crop)
                 candidates.offer(frame, grey, max(seconds, 0.0), motion.add(grey))
                 frames.read += 1
-                if frames.read % 10 == 0:
+                if frames.read % _REPORTED == 0:
                     report(min(frames.read, clip.packets), clip.packets, f"frames of {name}")
         frames.kept = candidates.finish()
     except (av.FFmpegError, ValueError) as error:
@@ -238,7 +241,7 @@ class _Candidates:
             self._frames[self._written] = _write(best, self._clip, path, self._size, self._crop)
             self._candidates.append(Candidate(best.moved, best.sharpness, self._written))
             self._last = small
-            if len(self._candidates) > 4 * self._count:
+            if len(self._candidates) > _MOST_CANDIDATES * self._count:
                 self._thin(2 * self._count)
         else:
             self.skipped.append((best.seconds, reason))
@@ -316,7 +319,7 @@ def _write(best: _Sharpest, clip: Clip, path: Path, size: int | None, crop: Crop
 
 
 def _log_summary(clip: Clip, frames: Frames) -> None:
-    if frames.read < 0.97 * clip.declared_frames:
+    if frames.read < _WHOLE * clip.declared_frames:
         logger.warning(
             "%s: the video is damaged or truncated; %d of its %d frames could be decoded",
             shown(clip.path),
