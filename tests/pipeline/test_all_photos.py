@@ -41,7 +41,8 @@ def trained(tmp_path) -> TrainingFolder:
         history.step_ends(step, 0.1, 300)
     history.write(folder.history)
     names = [view.name for view in dataset.train]
-    folder.write_exposure({name: [0.1 * i, 0.0, -0.1] for i, name in enumerate(names)})
+    exposures = {name: [0.1 * i, 0.0, -0.1] for i, name in enumerate(names)}
+    folder.write_files({"exposure.json": {"unit": "EV", "photos": exposures}})
     return folder
 
 

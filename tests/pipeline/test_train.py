@@ -20,7 +20,7 @@ from snowsplat.pipeline.train import resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.parts import unexplained
-from snowsplat.training.parts.unexplained import left_out_line
+from snowsplat.training.parts.unexplained import excluded_line
 from snowsplat.util.errors import SettingError, UserError
 
 
@@ -177,26 +177,27 @@ def test_what_moves_is_masked_and_shown(tmp_path):
     settings = {"iterations": 240, "checkpoint_every": 150}
     recorder = Recorder()
     result = train(photos, tmp_path / "out", TrainOptions(settings=settings), observer=recorder)
-    most_masked = sorted(result.moving, key=lambda name: -result.moving[name])
+    moving = result.parts["transients"].facts
+    most_masked = sorted(moving, key=lambda name: -moving[name])
     assert set(most_masked[:3]) == {"view_03.png", "view_06.png", "view_10.png"}
     # After so few steps, the scene is incomplete at the borders of one or two other photos.
     assert len(most_masked) <= 5
-    assert all(result.moving[name] < 0.2 for name in most_masked[3:])
+    assert all(moving[name] < 0.2 for name in most_masked[3:])
     count = len(most_masked)
-    mean = 100 * sum(result.moving.values()) / count
+    mean = 100 * sum(moving.values()) / count
     line = f"something moves in {count} of 30 photos: masked there, {mean:.1f}% of their pixels; "
     assert recorder.notes.count(line + "see the report") == 1
-    for name in result.moving:
+    for name in moving:
         with Image.open(tmp_path / "out" / "masks" / f"{name}.png") as mask:
             assert mask.size == (128, 96)
-            assert mask.histogram()[0] == round(result.moving[name] * 128 * 96)
+            assert mask.histogram()[0] == round(moving[name] * 128 * 96)
     report = result.report.read_text()
     assert "<h2>What moves</h2>" in report
     assert report.count(": masked parts") == count * 2  # alt and title
 
     recorder = Recorder()
     again = resume(tmp_path / "out", observer=recorder)
-    assert again.moving == result.moving
+    assert again.parts["transients"].facts == moving
     assert recorder.notes.count(line + "see the report") == 1
 
 
@@ -232,7 +233,7 @@ def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
     ],
 )  # fmt: skip
 def test_the_line_about_photos_that_are_left_out(count, expected):
-    assert left_out_line([f"{i}.jpg" for i in range(count)]) == expected
+    assert str(excluded_line([f"{i}.jpg" for i in range(count)])) == expected
 
 
 def test_options_that_contradict_each_other():

@@ -36,7 +36,7 @@ def main(dataset: str, output: str, runs: str) -> None:
                     "state": trainer.state_tensors(),
                     "losses": losses,
                     "psnr": trainer.evaluate().psnr,
-                    "left_out": trainer.left_out,
+                    "left_out": trainer.excluded,
                     "sent": shards.table(torch.tensor([sent])).flatten().tolist(),
                 }
             )

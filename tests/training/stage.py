@@ -39,7 +39,7 @@ def stage(
         "device": torch.device("cpu"),
         "initial": None,
         "resumed": False,
-        "left_out": (),
+        "excluded": (),
         "sh_degree": 0,
         "render": None,
         "note": lambda line: None,

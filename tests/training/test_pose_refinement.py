@@ -208,7 +208,7 @@ def test_perturbed_poses_come_back(dataset: Dataset) -> None:
     drift = trainer.part(PoseRefinement).drift()
     assert 0.1 < float(drift.rotations.median()) < 1.0
     assert 0.001 < float(drift.translations.median()) < 0.03
-    assert "camera poses refined: rotation by 0." in str(drift)
+    assert "camera poses refined: rotation by 0." in str(drift.line)
 
 
 def test_exact_poses_are_left_unchanged(dataset: Dataset, monkeypatch) -> None:
@@ -220,7 +220,7 @@ def test_exact_poses_are_left_unchanged(dataset: Dataset, monkeypatch) -> None:
         each.run()
     drift = trainer.part(PoseRefinement).drift()
     assert drift.exact
-    assert "left unchanged" in str(drift)
+    assert "left unchanged" in str(drift.line)
     assert not drift.rotations.any()
     for name, tensor in without.state_tensors().items():
         assert torch.equal(trainer.state_tensors()[name], tensor), name

@@ -103,7 +103,6 @@ WRONG = [
     ("ssim_weight", 5, "5", "too large; use a number from 0 to 1"),
     ("ssim_weight", [0.2], "x", "use a number from 0 to 1"),
     ("init", "cloud", "cloud", "is unknown; use one of points, random, depth, sweep"),
-    ("init", "points+carve", "points+carve", "'carve' was removed; use sweep"),
     ("init", "points+swep", "points+swep", "is unknown ('swep'); did you mean sweep?"),
     ("init", "", "", "is unknown"),
     ("init", "points+", "points+", "is unknown ('')"),
@@ -390,13 +389,6 @@ def test_settings_of_a_newer_version_are_ignored_with_a_warning(caplog):
 
     assert "'gravity' is unknown to this version" in caplog.text
     assert "'colour' is unknown to this version" in caplog.text
-
-
-def test_a_training_of_an_earlier_version_that_began_with_carving_can_be_resumed() -> None:
-    values = config_to_json(TrainConfig()) | {"init": "points+carve"}
-    assert config_from_json(values).starts == ("points", "sweep")
-    with pytest.raises(UserError, match="'carve' was removed"):
-        config_from_json(values, strict=True)
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def assert_identical(a: Gaussians, b: Gaussians) -> None:
 def test_the_check_changes_no_bit_if_all_poses_are_right(right):
     checked, unchecked = (run(right, replace(CONFIG, leave_out_after=w)) for w in (0.5, 0))
     assert checked.part(Unexplained)._decided
-    assert checked.left_out == ()
+    assert checked.excluded == ()
     assert_identical(checked.gaussians, unchecked.gaussians)
 
 
@@ -236,9 +236,9 @@ def test_a_view_with_a_wrong_pose_is_not_used_after_the_check(wrong, monkeypatch
 
     monkeypatch.setattr(trainer.queue, "take", recorded)
     trainer.run(until=100)
-    assert trainer.left_out == ()  # it is decided before step 101
+    assert trainer.excluded == ()  # it is decided before step 101
     trainer.run()
-    assert trainer.left_out == (WRONG,)
+    assert trainer.excluded == (WRONG,)
     name = wrong.train[WRONG].name
     assert max(step for step, each in used if each == name) <= 100
     assert {each for step, each in used if step > 150} == {
@@ -255,7 +255,7 @@ def test_a_resumed_run_keeps_the_decision(wrong, uninterrupted, tmp_path, stop):
     second = Trainer(wrong, CONFIG)
     second.load_state(checkpoint.load(path).tensors)
     second.run()
-    assert second.left_out == uninterrupted.left_out == (WRONG,)
+    assert second.excluded == uninterrupted.excluded == (WRONG,)
     assert_identical(second.gaussians, uninterrupted.gaussians)
 
 
@@ -263,20 +263,20 @@ def test_a_resumed_run_keeps_the_decision(wrong, uninterrupted, tmp_path, stop):
 def test_the_decision_is_made_once(wrong):
     trainer = Trainer(wrong, CONFIG)
     trainer.run(until=101)
-    assert trainer.left_out == (WRONG,)
-    trainer.queue.left_out = ()
+    assert trainer.excluded == (WRONG,)
+    trainer.queue.excluded = ()
     trainer.run(until=110)
-    assert trainer.left_out == ()
+    assert trainer.excluded == ()
 
 
 def test_a_checkpoint_without_the_setting_is_as_before(right):
     state = Trainer(right, replace(CONFIG, leave_out_after=0)).state_tensors()
-    assert not {"checked", "left_out"} & state.keys()
+    assert not [name for name in state if name.startswith("unexplained.")]
 
 
-@pytest.mark.parametrize("left_out", [[COUNT], [-1], list(range(COUNT))])
-def test_a_damaged_decision_is_rejected(right, left_out):
+@pytest.mark.parametrize("excluded", [[COUNT], [-1], list(range(COUNT))])
+def test_a_damaged_decision_is_rejected(right, excluded):
     trainer = Trainer(right, CONFIG)
-    state = trainer.state_tensors() | {"left_out": torch.tensor(left_out)}
+    state = trainer.state_tensors() | {"unexplained.left_out": torch.tensor(excluded)}
     with pytest.raises(UserError, match="another dataset or recipe"):
         trainer.load_state(state)

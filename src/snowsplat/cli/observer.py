@@ -92,8 +92,9 @@ class TerminalObserver(Observer):
         print(message("{report}: the report of the training", report=result.report))
         if result.evaluation is not None:
             print(held_out_line(*result.evaluation))
-        if result.poses is not None:
-            print(result.poses)
+        for part in result.parts.values():
+            for line in part.lines:
+                print(line)
         if result.time is not None:
             spent, given = map(duration, result.time)
             print(message("{spent} in total, of {given}", spent=spent, given=given))

@@ -33,8 +33,7 @@ from snowsplat.training.core import checkpoint
 from snowsplat.training.core.checkpoint import Checkpoint
 from snowsplat.training.core.run import Loss
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.exposure import exposure_hint
-from snowsplat.training.parts.list import parts_of
+from snowsplat.training.parts.list import hints, parts_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.processes.shards import ALONE, Shards
 from snowsplat.training.settings.config import TrainConfig
@@ -212,9 +211,9 @@ class _Job:
         self.photos = stamps_of(dataset, settings.path)
         self.shards.of_first(Setup(settings, memory.plan.config))
         trainer = self._trainer(dataset, memory.plan.config)
-        chosen = options.config is not None or "exposure" in options.settings
-        if config.exposure == "off" and not chosen and (hint := exposure_hint(trainer)):
-            self.observer.note(hint)
+        if options.config is None:
+            for hint in hints(trainer, options.settings):
+                self.observer.note(hint)
         self.out.remove_results()
         write_beginning(self.out, dataset, settings, memory.plan.config)
         time_ratio = 1.0 if plan is None else plan.time_ratio

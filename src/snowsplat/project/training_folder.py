@@ -49,7 +49,7 @@ from snowsplat.util.run_lock import LOCK
 from snowsplat.util.safe_json import from_json, read_json
 
 if TYPE_CHECKING:
-    from PIL import Image
+    pass
 
 logger = logging.getLogger(__name__)
 
@@ -393,12 +393,11 @@ class TrainingFolder:
         found = names if isinstance(names, list) else []
         return [LeftOut(str(name), "training", UNEXPLAINED) for name in found]
 
-    def write_exposure(self, exposures: Mapping[str, Sequence[float]]) -> None:
-        """Write `exposure.json`: the exposure of each training photo in EV, for each channel."""
-        write_json(self.path / "exposure.json", {"unit": "EV", "photos": exposures})
-
     def exposures(self) -> dict[str, list[float]]:
-        """What `write_exposure` has written; empty if no gains were learnt. Raises UserError."""
+        """The exposure of each training photo in EV, by channel; empty if no gains were learnt.
+
+        Raises UserError: the file is damaged.
+        """
         file = self.path / "exposure.json"
         if not file.is_file():
             return {}
@@ -408,10 +407,13 @@ class TrainingFolder:
         except (ValueError, KeyError, TypeError, AttributeError):
             raise UserError("{file}: damaged; train again", file=file) from None
 
-    def write_masks(self, masks: Mapping[str, Image.Image]) -> None:
-        """Write masks by the name of the photo, in the format of the masks of a dataset."""
-        for name, image in masks.items():
-            path = self.masks / f"{name}.png"
+    def write_files(self, files: Mapping[str, Any]) -> None:
+        """Write JSON objects, and images in PNG files, by their paths in this folder."""
+        for name, content in files.items():
+            path = self.path / name
             path.parent.mkdir(parents=True, exist_ok=True)
+            if isinstance(content, Mapping):
+                write_json(path, content)
+                continue
             with atomic_path(path) as temporary:
-                image.save(temporary, format="PNG")
+                content.save(temporary, format="PNG")

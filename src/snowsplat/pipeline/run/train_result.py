@@ -9,6 +9,7 @@ from pathlib import Path
 from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.project.left_out import LeftOut
+from snowsplat.training.parts.part_report import PartReport
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,8 @@ class TrainResult:
         evaluation: the step and the metrics of the last evaluation on held-out photos.
         left_out: the training photos that were left out, because the scene does not explain
             them; see ``TrainConfig.leave_out_after``.
-        moving: the share of each photo that is masked because something moves there, by name; see
-            ``TrainConfig.transients``.
-        poses: the line about the camera poses: how far they were refined, or that they are not
-            exact; None if there is nothing to say.
+        parts: what the parts of the training report, by their names; for example, ``facts`` of
+            "transients" is the share of each photo that is masked because something moves there.
         verdict: whether the scene is good, usable or poor, and why; None if no photos were held
             out.
         time: the seconds that were used, including earlier runs, and the time budget in seconds;
@@ -47,8 +46,7 @@ class TrainResult:
     reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
     left_out: tuple[LeftOut, ...]
-    moving: Mapping[str, float]
-    poses: str | None
+    parts: Mapping[str, PartReport]
     verdict: Verdict | None
     time: tuple[float, float] | None
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from statistics import pstdev
-
-from PIL.Image import Image
 
 from snowsplat.data import Dataset
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
@@ -40,12 +38,8 @@ from snowsplat.training.budgets.steps_left import StepsLeft
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.history import History
 from snowsplat.training.core.progress import Progress
-from snowsplat.training.core.run import DatasetCameras
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.exposure import Exposure
-from snowsplat.training.parts.misalignment import misalignment
-from snowsplat.training.parts.pose_refinement import PoseRefinement
-from snowsplat.training.parts.transients import Transients
+from snowsplat.training.parts.part_report import PartReport
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.report.scene_verdict import scene_verdict
 from snowsplat.training.settings.stored import config_to_json
@@ -89,8 +83,6 @@ class TrainingRun:
         self._left = StepsLeft(Work.for_training(self.config, self.trainer.dataset))
         self.together = Collective(self.trainer)
         self.watchers = Watchers(self.out.path, self.trainer, self.page)
-        self.transients = self.trainer.part(Transients)
-        self.poses = self.trainer.part(PoseRefinement)
 
     def run(self) -> TrainResult:
         """Run all steps and write the results.
@@ -173,10 +165,7 @@ class TrainingRun:
 
     def _left_out(self) -> tuple[LeftOut, ...]:
         views = self.trainer.dataset.train
-        return tuple(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.left_out)
-
-    def _masks(self) -> dict[str, Image]:
-        return {} if self.transients is None else self.transients.pictures()
+        return tuple(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.excluded)
 
     def _checkpoint_is_due(self, step: int) -> bool:
         every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
@@ -201,7 +190,7 @@ class TrainingRun:
     def _write_scene(self, gaussians: Gaussians) -> Path:
         self._restore_folder()
         cameras = self.trainer.cameras
-        if not isinstance(cameras, DatasetCameras):  # a part has refined them
+        if self.trainer.refines_cameras:
             views = [*cameras.views(), *cameras.test_views()]
             write_cameras(self.out, views)
             write_refined(self.out, views, read_dataset(replace(self.settings, resolution=-1)))
@@ -257,12 +246,11 @@ class TrainingRun:
         if self.page is not None:
             self.page.end_training(self._result_lines(len(gaussians), seconds))
         self.history.write(self.out.history)
-        if exposures := self._exposures():
-            self.out.write_exposure(exposures)
-        self.out.write_masks(self._masks())
-        poses = self._about_poses(gaussians)
-        verdict = self._verdict(gaussians, poses)
-        report = self._write_report(gaussians, poses, verdict)
+        reports = {part.name: part.report(self.trainer, gaussians) for part in self.trainer.parts}
+        for each in reports.values():
+            self.out.write_files(each.files)
+        verdict = self._verdict(gaussians, list(reports.values()))
+        report = self._write_report(gaussians, list(reports.values()), verdict)
         time_used = None
         if self.budget is not None:
             longer = config_to_json(replace(self.config, iterations=step))
@@ -279,8 +267,7 @@ class TrainingRun:
             reductions=self.memory.plan.reductions,
             evaluation=self.evaluation,
             left_out=self._left_out(),
-            moving={} if self.transients is None else self.transients.shares(),
-            poses=poses,
+            parts=reports,
             verdict=verdict,
             time=time_used,
         )
@@ -295,38 +282,12 @@ class TrainingRun:
             lines.append(f"PSNR {means.psnr:.2f} dB, {len(means.views)} held-out photos")
         return lines
 
-    def _exposures(self) -> dict[str, list[float]]:
-        """The exposure of each training photo in EV, by name: red, green, blue; empty if no gains
-        were learnt.
-        """
-        exposure = self.trainer.part(Exposure)
-        if exposure is None or not exposure.active:
-            return {}
-        names = (view.name for view in self.trainer.dataset.train)
-        return dict(zip(names, exposure.ev.tolist(), strict=True))
-
-    def _about_poses(self, gaussians: Gaussians) -> str | None:
-        """The line about the camera poses; see `TrainResult.poses`."""
-        if self.poses is not None:
-            return str(self.poses.drift())
-        if not isinstance(self.trainer.cameras, DatasetCameras):
-            return None
-        views = self.trainer.dataset.train
-        used = [view for i, view in enumerate(views) if i not in self.trainer.left_out]
-        pixels = misalignment(gaussians, used, self.out.settings()[1], self.trainer.step)
-        if pixels is None:
-            return None
-        return (
-            f"the photos are off by {pixels:.1f} pixels in the median: the camera poses are not "
-            "exact; try --refine-poses"
-        )
-
-    def _verdict(self, gaussians: Gaussians, about_poses: str | None) -> Verdict | None:
+    def _verdict(self, gaussians: Gaussians, reports: Sequence[PartReport]) -> Verdict | None:
         """The verdict on the scene; see `TrainResult.verdict`."""
         if self.evaluation is None:
             return None
         dataset = self._dataset()
-        used = [view for i, view in enumerate(dataset.train) if i not in self.trainer.left_out]
+        used = [view for i, view in enumerate(dataset.train) if i not in self.trainer.excluded]
         with single_threaded():
             trained_on = evaluate_views(
                 gaussians,
@@ -337,9 +298,7 @@ class TrainingRun:
             self.evaluation[1],
             trained_on,
             dataset,
-            left_out=[each.photo for each in self._left_out()],
-            spread=pstdev(exposures) if (exposures := self._mean_exposures()) else 0.0,
-            poses=about_poses if self.poses is None else None,  # refined poses are no fault
+            [reason for each in reports for reason in each.reasons],
             capture=recorded_verdict(Path(self.settings.path)),
         )
 
@@ -348,14 +307,11 @@ class TrainingRun:
         cameras = self.trainer.cameras
         return replace(self.trainer.dataset, train=cameras.views(), test=cameras.test_views())
 
-    def _mean_exposures(self) -> tuple[float, ...]:
-        """The exposure of each training photo in EV, the mean over the channels."""
-        return tuple(sum(ev) / 3 for ev in self._exposures().values())
-
     def _write_report(
-        self, gaussians: Gaussians, about_poses: str | None, verdict: Verdict | None
+        self, gaussians: Gaussians, reports: Sequence[PartReport], verdict: Verdict | None
     ) -> Path:
         # Users may share the report, so it contains names of files but no paths.
+        sections = [section for each in reports for section in each.sections]
         project = Project.open(self.out.path)
         folder = project.home
         dataset = asdict(self.settings)
@@ -373,9 +329,9 @@ class TrainingRun:
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=tuple(each.photo for each in self._left_out()),
-                exposures=self._mean_exposures(),
-                masks=self._masks(),
-                poses=about_poses,
+                exposures=next((s.values for s in sections if s.values), ()),
+                masks={name: mask for s in sections for name, mask in s.masks.items()},
+                poses=next((str(line) for each in reports for line in each.lines), None),
                 doubts=self.doubts,
                 verdict=verdict,
                 settings={

@@ -93,10 +93,8 @@ def read(path: Path) -> CheckpointFile:
                 )
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         intact = header["crc32"] == {name: _crc32(array) for name, array in arrays.items()}
-        # Older files do not have the next two values. In them, an error in the header may not be
-        # found.
-        intact = intact and header.get("layout", _layout(arrays)) == _layout(arrays)
-        intact = intact and metadata.get("crc32", str(zlib.crc32(text))) == str(zlib.crc32(text))
+        intact = intact and header["layout"] == _layout(arrays)
+        intact = intact and metadata["crc32"] == str(zlib.crc32(text))
         if not isinstance(header["meta"], dict):
             raise ValueError("meta is not an object")
         content = CheckpointFile(path, int(header["step"]), arrays, header["meta"])
@@ -123,7 +121,7 @@ def read(path: Path) -> CheckpointFile:
 
 
 def _layout(arrays: Mapping[str, np.ndarray]) -> dict[str, list[Any]]:
-    """Name → dtype and shape. Dtypes have the names of torch, as in earlier files."""
+    """Name → dtype and shape. Dtypes have the names of torch."""
     return {name: [f"torch.{array.dtype}", list(array.shape)] for name, array in arrays.items()}
 
 

@@ -283,9 +283,14 @@ class Run:
         return self.config.sh_degree_at(self.step)
 
     @property
-    def left_out(self) -> tuple[int, ...]:
+    def excluded(self) -> tuple[int, ...]:
         """Indices of the training views that are not used any more."""
-        return self.queue.left_out
+        return self.queue.excluded
+
+    @property
+    def refines_cameras(self) -> bool:
+        """Whether a part has replaced the cameras of the dataset."""
+        return not isinstance(self.cameras, DatasetCameras)
 
     def downscale_at(self, step: int) -> int:
         """The factor by which the photos are reduced at a step."""

@@ -18,8 +18,6 @@ from snowsplat.util.errors import UserError
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
 
-#: Names in checkpoints of version 0.1, and the present ones.
-_FORMER_NAMES = {"checked": "unexplained.checked", "left_out": "unexplained.left_out"}
 #: Before the names of the user's own parts and loss. The tensors have no elements: they only tell
 #: that a run without them would continue differently.
 _PART, _LOSS, _WITHOUT = "part.", "loss.", "without."
@@ -68,13 +66,6 @@ def _own(run: Run) -> list[str]:
 
 def load_state(run: Run, tensors: dict[str, Tensor]) -> None:
     """See `Run.load_state`."""
-    # Version 0.2 had a part of this name. The other state does not depend on it.
-    former = () if f"{_PART}overfitting" in tensors else ("overfitting.",)
-    tensors = {
-        _FORMER_NAMES.get(name, name): tensor
-        for name, tensor in tensors.items()
-        if not name.startswith(former)
-    }
     own = set(_own(run))
     _check_own(own, {name for name in tensors if name.startswith((_PART, _LOSS, _WITHOUT))})
     # What the user's own parts have saved is checked by themselves.

@@ -23,7 +23,7 @@ class ViewQueue:
 
     Attributes:
         order: indices of the views of the next steps.
-        left_out: indices of the views that are not used any more.
+        excluded: indices of the views that are not used any more.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class ViewQueue:
             shards: the processes; each loads only the photos of the views that it blends.
         """
         self.order: list[int] = []
-        self.left_out: tuple[int, ...] = ()
+        self.excluded: tuple[int, ...] = ()
         self._views = views
         self._camera_of = camera_of
         self._images = images
@@ -67,7 +67,7 @@ class ViewQueue:
         if len(self.order) <= ahead:
             while len(self.order) <= ahead:
                 order = torch.randperm(len(self._views), generator=self._generator).tolist()
-                self.order += [i for i in order if i not in self.left_out]
+                self.order += [i for i in order if i not in self.excluded]
             self._prefetch(downscale)
         elif downscale != self._downscale_at(after):
             self._prefetch(downscale)
@@ -81,10 +81,10 @@ class ViewQueue:
         camera = self._camera_of(i).downscaled(downscale)
         return BatchView(i, self._views[i], camera, photo, self._background.draw())
 
-    def leave_out(self, indices: Iterable[int], after: int) -> None:
+    def exclude(self, indices: Iterable[int], after: int) -> None:
         """Do not use these views in the steps that follow ``after``."""
-        self.left_out = tuple(indices)
-        self.continue_with([i for i in self.order if i not in self.left_out], after)
+        self.excluded = tuple(indices)
+        self.continue_with([i for i in self.order if i not in self.excluded], after)
 
     def continue_with(self, order: list[int], after: int) -> None:
         """Replace the order of the views of the steps that follow ``after``."""

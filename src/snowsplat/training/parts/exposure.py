@@ -19,23 +19,30 @@ Where a photo is overexposed, it only says that the image is at least as bright;
 from __future__ import annotations
 
 import math
+from statistics import pstdev
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from snowsplat.data.photos.decode import LoadedImage
+from snowsplat.evaluation.verdict import Reason
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.exposed_image import ExposedImages
 from snowsplat.training.parts.exposure_start import GAMMA, ExposureStart, exposure_start
 from snowsplat.training.parts.neutral_photos import NeutralPhotos
 from snowsplat.training.parts.part import Part
+from snowsplat.training.parts.part_report import PartReport, Section
 from snowsplat.training.step.batch import Batch, BatchView
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
 
 #: With a smaller spread, in EV, the gains are not learnt.
 LEAST_SPREAD = 0.05
+#: With a larger one, in EV, the camera should be set by hand.
+_VISIBLE_SPREAD = 0.3
 #: The learning rate of the log-gains at the first and at the last step.
 _RATE, _LAST_RATE = 5e-3, 5e-4
 _BETAS = 0.9, 0.99
@@ -145,6 +152,37 @@ class Exposure(Part):
         square = self._square[i].lerp_(gradient.square(), 1.0 - b2) / (1.0 - b2**n)
         gain -= rate * mean / (square.sqrt() + _EPSILON)
 
+    def report(self, run: Run, gaussians: Gaussians) -> PartReport:
+        """The exposure of each photo in EV, if gains are learnt."""
+        if not self.active:
+            return PartReport()
+        names = (view.name for view in run.dataset.train)
+        ev = dict(zip(names, self.ev.tolist(), strict=True))
+        means = tuple(sum(channels) / 3 for channels in ev.values())
+        spread = pstdev(means)
+        text = message(
+            "the exposures of the photos differ by {spread:.1f} EV, which the training corrects",
+            spread=spread,
+        )
+        advice = message("fix the exposure and the white balance of the camera")
+        section = Section(
+            message("Exposures of the photos"),
+            (
+                message(
+                    "In EV (factors of two of light), relative to their mean, which is the "
+                    "exposure of the scene."
+                ),
+            ),
+            means,
+            message("exposure, EV"),
+        )
+        return PartReport(
+            reasons=(Reason("good", text, advice),) if spread >= _VISIBLE_SPREAD else (),
+            files={"exposure.json": {"unit": "EV", "photos": ev}},
+            sections=(section,) if any(means) else (),
+            facts=ev,
+        )
+
     def state(self) -> dict[str, Tensor]:
         """The gains and the moments of Adam."""
         return {
@@ -166,7 +204,7 @@ class Exposure(Part):
         self._updates.copy_(tensors["updates"])
 
 
-def exposure_hint(run: Run) -> str | None:
+def exposure_hint(run: Run) -> Message | None:
     """A line for a training without gains whose photos differ in exposure; None if they do not.
 
     Without gains, a scene reproduces the exposure of each photo by veils and by colours that depend
@@ -175,7 +213,10 @@ def exposure_hint(run: Run) -> str | None:
     start = exposure_start(run.dataset, run.images)
     if not _differ(start):
         return None
-    return f"exposure: {_found(start)}; exposure=auto learns one gain for each photo and channel"
+    return message(
+        "exposure: {found}; exposure=auto learns one gain for each photo and channel",
+        found=_found(start),
+    )
 
 
 def _differ(start: ExposureStart) -> bool:
@@ -183,16 +224,26 @@ def _differ(start: ExposureStart) -> bool:
     return start.spread is not None and start.spread >= LEAST_SPREAD and start.everywhere
 
 
-def _found(start: ExposureStart) -> str:
-    return f"photos differ by {start.spread:.2f} EV (standard deviation, from {start.source})"
-
-
-def _reason(start: ExposureStart, active: bool) -> str:
+def _found(start: ExposureStart) -> Message:
     if start.spread is None:
-        found = "not known, because there are neither points nor EXIF data"
-    else:
-        found = _found(start)
-        if start.spread >= LEAST_SPREAD and not start.everywhere:
-            found += ", but not by the same in all parts of the scene, as shiny surfaces do"
-    what = "one gain for each photo and channel is learnt" if active else "no gains are learnt"
-    return f"exposure: {found}; {what}"
+        return message("not known, because there are neither points nor EXIF data")
+    found = message(
+        "photos differ by {spread:.2f} EV (standard deviation, from {source})",
+        spread=start.spread,
+        source=start.source,
+    )
+    if start.spread >= LEAST_SPREAD and not start.everywhere:
+        return message(
+            "{found}, but not by the same in all parts of the scene, as shiny surfaces do",
+            found=found,
+        )
+    return found
+
+
+def _reason(start: ExposureStart, active: bool) -> Message:
+    found = _found(start)
+    if active:
+        return message(
+            "exposure: {found}; one gain for each photo and channel is learnt", found=found
+        )
+    return message("exposure: {found}; no gains are learnt", found=found)

@@ -33,6 +33,7 @@ from snowsplat.data.photos.exif_exposure import exif_exposure
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.point_colors import point_colors, point_pixels
+from snowsplat.util.messages import Message, message
 
 #: Photos are encoded approximately by this power: value = light^(1 / 2.2).
 GAMMA = 2.2
@@ -69,14 +70,14 @@ class ExposureStart:
             in each channel of its encoded values. The mean over the photos is 0.
         spread: standard deviation of the exposures in EV (factors of two of light), over photos and
             channels; None if it is unknown.
-        source: what the photos were compared by, for the user.
+        source: what the photos were compared by, for the user; None: they were not.
         everywhere: whether the differences are the same in all parts of the scene, as those of an
             exposure are.
     """
 
     log_gains: Tensor
     spread: float | None
-    source: str = ""
+    source: Message | None = None
     everywhere: bool = True
 
 
@@ -97,14 +98,16 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
         if products.isfinite().float().mean() > _LEAST_SHARE:
             spread = GAMMA / math.log(2.0) * math.sqrt(max(0.0, float(products.nanmean())))
             gains = whole.nan_to_num().to(torch.float32)
-            return ExposureStart(gains, spread, "points", same_everywhere(logs, half))
+            return ExposureStart(gains, spread, message("points"), same_everywhere(logs, half))
     values = [exif_exposure(view.image.path) for view in views]
     known = [value for value in values if value is not None]
     if len(views) > 1 and len(known) == len(views):
         ev = torch.tensor(known, dtype=torch.float64)
         ev -= ev.mean()
         gains = (ev * math.log(2.0) / GAMMA)[:, None].expand(-1, 3)
-        return ExposureStart(gains.to(torch.float32), float(ev.square().mean().sqrt()), "EXIF data")
+        return ExposureStart(
+            gains.to(torch.float32), float(ev.square().mean().sqrt()), message("EXIF data")
+        )
     return ExposureStart(torch.zeros(len(views), 3), None)
 
 

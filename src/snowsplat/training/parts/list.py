@@ -1,11 +1,15 @@
-"""`parts_of`: which parts take part in a training."""
+"""`parts_of`: which parts take part in a training; `hints`: which ones it could use."""
 
 from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING
 
 from snowsplat.training.parts.decay import Decay
 from snowsplat.training.parts.densification import Densification
 from snowsplat.training.parts.depth_supervision import DepthSupervision
-from snowsplat.training.parts.exposure import Exposure
+from snowsplat.training.parts.exposure import Exposure, exposure_hint
+from snowsplat.training.parts.misalignment import PoseCheck
 from snowsplat.training.parts.near_limit import NearLimit
 from snowsplat.training.parts.normal_supervision import NormalSupervision
 from snowsplat.training.parts.part import Part
@@ -17,6 +21,10 @@ from snowsplat.training.parts.surfaces import Surfaces
 from snowsplat.training.parts.transients import Transients
 from snowsplat.training.parts.unexplained import Unexplained
 from snowsplat.training.settings.config import TrainConfig
+from snowsplat.util.messages import Message
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 
 def parts_of(config: TrainConfig) -> list[Part]:
@@ -25,9 +33,10 @@ def parts_of(config: TrainConfig) -> list[Part]:
     A new option is a field of `TrainConfig`, a part in its own file, and a line here.
     """
     parts: list[tuple[bool, Part]] = [
-        (config.exposure != "off", Exposure(config.exposure)),
         (config.leave_out_after > 0, Unexplained(config.leave_out_after)),
         (config.refine_poses, PoseRefinement()),
+        (not config.refine_poses, PoseCheck()),
+        (config.exposure != "off", Exposure(config.exposure)),
         (config.transients != "off", Transients(config.transients)),
         (config.depth_weight > 0, DepthSupervision(config.depth_weight)),
         (config.depth_weight > 0, NormalSupervision(config.depth_weight)),
@@ -40,3 +49,14 @@ def parts_of(config: TrainConfig) -> list[Part]:
         (config.surfaces, Surfaces()),
     ]
     return [part for used, part in parts if used]
+
+
+def hints(run: Run, settings: Collection[str]) -> list[Message]:
+    """Lines about parts that the photos need, but that are off in a training.
+
+    ``settings``: names of those that the user has chosen.
+    """
+    if run.config.exposure != "off" or "exposure" in settings:
+        return []
+    hint = exposure_hint(run)
+    return [] if hint is None else [hint]

@@ -1,4 +1,4 @@
-"""`misalignment`: how far the photos are shifted against the renderings of their views.
+"""`PoseCheck`: how far the photos are shifted against the renderings of their views at the end.
 
 If camera poses are not exact, no scene agrees with all photos. A trained scene is then a compromise
 of them, and each photo is shifted against its rendering. The shift (a, b) is found by one
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,9 +21,16 @@ from torch import Tensor
 from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.renderings import renderings
+from snowsplat.evaluation.verdict import Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
+from snowsplat.training.parts.part import Part
+from snowsplat.training.parts.part_report import PartReport
+from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
+
+if TYPE_CHECKING:
+    from snowsplat.training.core.run import Run
 
 #: At most this number of views is compared, evenly chosen, to limit the time.
 _VIEWS = 24
@@ -38,6 +46,29 @@ _FACTORS = (1, 2, 4)  # those of `ImageLoader`
 #: The smallest shift after a training that shows that poses are not exact, as a share of the
 #: diagonal; see docs/cameras.md.
 SHIFTED = 0.0009
+
+
+class PoseCheck(Part):
+    """Reports at the end whether the camera poses, which do not change, are exact. No state."""
+
+    name = "pose_check"
+
+    def report(self, run: Run, gaussians: Gaussians) -> PartReport:
+        """The line about poses that are not exact, which also counts for the verdict."""
+        if run.refines_cameras:  # by a part of the user
+            return PartReport()
+        views = run.dataset.train
+        used = [view for i, view in enumerate(views) if i not in run.excluded]
+        background = run.background.evaluation.tolist()
+        pixels = misalignment(gaussians, used, background, run.step)
+        if pixels is None:
+            return PartReport()
+        line = message(
+            "the photos are off by {pixels:.1f} pixels in the median: the camera poses are not "
+            "exact; try --refine-poses",
+            pixels=pixels,
+        )
+        return PartReport(lines=(line,), reasons=(Reason("usable", line),))
 
 
 def misalignment(

@@ -26,6 +26,7 @@ from snowsplat.data.dataset import Points
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import RenderOutput
+from snowsplat.training.parts.part_report import PartReport
 from snowsplat.training.step.batch import Batch, BatchView, Gradients
 
 if TYPE_CHECKING:  # these modules import this one
@@ -127,6 +128,16 @@ class Part:
 
     def after_step(self, run: Run, step: int, batch: Batch) -> None:
         """Called after the optimiser, when the step is known to be valid."""
+
+    # At the end, in process 0
+
+    def report(self, run: Run, gaussians: Gaussians) -> PartReport:
+        """What the part has to report.
+
+        ``gaussians``: the scene: those of all processes.
+        Raises: UserError: a photo is missing or damaged.
+        """
+        return PartReport()
 
     # In checkpoints
 

@@ -31,11 +31,14 @@ from torch import Tensor
 from snowsplat.data.dataset import View
 from snowsplat.ops import camera_gradient
 from snowsplat.scene.camera import Camera
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.misalignment import shift_of
 from snowsplat.training.parts.part import Part
+from snowsplat.training.parts.part_report import PartReport
 from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
 from snowsplat.training.step.batch import Batch, Gradients
 from snowsplat.training.step.view_gradient import ViewGradient
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     from snowsplat.training.core.run import Run
@@ -233,6 +236,10 @@ class PoseRefinement(Part):
             focals=factors - 1.0,
         )
 
+    def report(self, run: Run, gaussians: Gaussians) -> PartReport:
+        """The line about the poses. Refined poses are no fault of the scene."""
+        return PartReport(lines=(self.drift().line,))
+
     def state(self) -> dict[str, Tensor]:
         """The state of the cameras and of their optimiser."""
         return self._state
@@ -260,15 +267,21 @@ class PoseDrift:
     translations: Tensor
     focals: Tensor
 
-    def __str__(self) -> str:
+    @property
+    def line(self) -> Message:
+        """What the user is told."""
         if self.exact:
-            return "the photos agree with the camera poses, which are left unchanged"
+            return message("the photos agree with the camera poses, which are left unchanged")
         turn, shift = self.rotations, 100.0 * self.translations
-        return (
-            f"camera poses refined: rotation by {float(turn.median()):.2f}° in the median, at most "
-            f"{float(turn.max()):.2f}°; position by {float(shift.median()):.2f}% of the extent, at "
-            f"most {float(shift.max()):.2f}%; focal length by "
-            f"{100.0 * float(self.focals[self.focals.abs().argmax()]):+.2f}%"
+        return message(
+            "camera poses refined: rotation by {turn:.2f}° in the median, at most "
+            "{turn_most:.2f}°; position by {shift:.2f}% of the extent, at most {shift_most:.2f}%; "
+            "focal length by {focal:+.2f}%",
+            turn=float(turn.median()),
+            turn_most=float(turn.max()),
+            shift=float(shift.median()),
+            shift_most=float(shift.max()),
+            focal=100.0 * float(self.focals[self.focals.abs().argmax()]),
         )
 
 

@@ -36,7 +36,9 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.evaluation.renderings import renderings
+from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.part import Part
+from snowsplat.training.parts.part_report import PartReport, Section
 from snowsplat.training.parts.view_residuals import (
     CellMap,
     cell_map,
@@ -124,12 +126,12 @@ class Transients(Part):
             return
         self._compute(run)
         if run.step >= moments[-1]:
-            self._tell()
+            self._note()
         run.queue.continue_with(run.queue.order, run.step)
 
     def _compute(self, run: Run) -> None:
         views = run.dataset.train
-        used = [i for i in range(len(views)) if i not in run.left_out]
+        used = [i for i in range(len(views)) if i not in run.excluded]
         # At the size of the training: Gaussians that were trained on larger photos are too small
         # for reduced ones, and their rendering is too bright or too dark.
         shown = renderings(
@@ -172,7 +174,25 @@ class Transients(Part):
             if not bool(mask.all())
         }
 
-    def _tell(self) -> None:
+    def report(self, run: Run, gaussians: Gaussians) -> PartReport:
+        """The masks, and the masked share of each photo that has one."""
+        masks = self.pictures()
+        if not masks:
+            return PartReport()
+        text = message(
+            "In {some} of {all} photos, something looks different from what the other photos show "
+            "at this place, for example a person who walks past.",
+            some=len(masks),
+            all=len(self.masks),
+        )
+        unused = message("The tinted parts were not used for training.")
+        return PartReport(
+            files={f"masks/{name}.png": mask for name, mask in masks.items()},
+            sections=(Section(message("What moves"), (text, unused), masks=masks),),
+            facts=self.shares(),
+        )
+
+    def _note(self) -> None:
         shares, photos = self.shares().values(), len(self.masks)
         if shares:
             mean = 100.0 * sum(shares) / len(shares)
@@ -200,7 +220,7 @@ class Transients(Part):
         if self.shares():
             self._mode = self.mode
         if self._run.step > self._run.schedule.step_of(MOMENTS[-1]):
-            self._tell()
+            self._note()
 
 
 def _moving_cells(

@@ -22,9 +22,12 @@ from snowsplat.data.dataset import View
 from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.evaluation.color_alignment import color_fit
 from snowsplat.evaluation.renderings import renderings
+from snowsplat.evaluation.verdict import Grade, Reason
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
 from snowsplat.training.parts.part import Part
+from snowsplat.training.parts.part_report import PartReport, Section
+from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.names import first_names
 from snowsplat.util.settings import When
 
@@ -59,8 +62,10 @@ _LOW_PSNR = 20.0
 _HIGHEST_PSNR = 60.0
 #: If more than this share of the views stand out, the scene is unsuitable for this comparison.
 _MOST = 0.25
-#: Largest number of photos that a line names.
-_LISTED = 10
+#: Largest number of photos that a line names, and the page.
+_LISTED, _LISTED_IN_PAGE = 10, 200
+#: If more than this share of the photos is excluded, the verdict on the scene counts it.
+_MANY = 0.05
 
 
 class Unexplained(Part):
@@ -87,7 +92,7 @@ class Unexplained(Part):
         """
         if self._decided or run.step < run.schedule.step_of(self.after):
             return
-        left_out = unexplained_views(
+        excluded = unexplained_views(
             run.gaussians,
             run.cameras.views(),
             run.images,
@@ -96,34 +101,62 @@ class Unexplained(Part):
             render=run.render,
         )
         self._decided = True
-        run.queue.leave_out(left_out, run.step)
-        self._tell()
+        run.queue.exclude(excluded, run.step)
+        self._note()
 
-    def _tell(self) -> None:
-        if self._run.left_out:
-            names = [self._run.dataset.train[i].name for i in self._run.left_out]
-            self._run.note(left_out_line(names))
+    def _names(self) -> list[str]:
+        return [self._run.dataset.train[i].name for i in self._run.excluded]
+
+    def _note(self) -> None:
+        if names := self._names():
+            self._run.note(excluded_line(names))
+
+    def report(self, run: Run, gaussians: Gaussians) -> PartReport:
+        """The excluded photos."""
+        names = self._names()
+        if not names:
+            return PartReport()
+        count = len(run.dataset.train)
+        text = message(
+            "{number} of {count} photos contradict the others and were left out: {names}",
+            number=len(names),
+            count=count,
+            names=first_names(names, 3),
+        )
+        section = Section(
+            message("Photos that the scene does not explain"),
+            (
+                message(
+                    "Left out of the training, because their camera poses are probably wrong: "
+                    "{names}.",
+                    names=first_names(names, _LISTED_IN_PAGE),
+                ),
+            ),
+        )
+        grade: Grade = "usable" if len(names) > _MANY * count else "good"
+        return PartReport(reasons=(Reason(grade, text),), sections=(section,))
 
     def state(self) -> dict[str, Tensor]:
         """Whether it is decided, and the indices of the views that are left out."""
-        left_out = torch.tensor(self._run.left_out, dtype=torch.int64)
-        return {"checked": torch.tensor(self._decided), "left_out": left_out}
+        excluded = torch.tensor(self._run.excluded, dtype=torch.int64)
+        return {"checked": torch.tensor(self._decided), "left_out": excluded}
 
     def load(self, tensors: dict[str, Tensor]) -> None:
         """See `Part.load`."""
         self._decided = bool(tensors["checked"])
-        self._run.queue.left_out = tuple(tensors["left_out"].tolist())
-        self._tell()
+        self._run.queue.excluded = tuple(tensors["left_out"].tolist())
+        self._note()
 
 
-def left_out_line(names: Sequence[str]) -> str:
+def excluded_line(names: Sequence[str]) -> Message:
     """The line about photos that the scene does not explain; at least one name."""
-    one = len(names) == 1
-    photos, poses = ("photo is", "pose is") if one else ("photos are", "poses are")
-    listed = first_names(names, _LISTED)
-    return (
-        f"{len(names)} {photos} not explained by the scene and left out of the training: {listed}; "
-        f"{'its' if one else 'their'} camera {poses} probably wrong"
+    return plural(
+        "{n} photo is not explained by the scene and left out of the training: {names}; its camera "
+        "pose is probably wrong",
+        "{n} photos are not explained by the scene and left out of the training: {names}; their "
+        "camera poses are probably wrong",
+        n=len(names),
+        names=first_names(names, _LISTED),
     )
 
 

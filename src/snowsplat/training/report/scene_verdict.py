@@ -15,7 +15,7 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.training.starts.point_colors import point_pixels
-from snowsplat.util.messages import Message, message, plural
+from snowsplat.util.messages import message, plural
 from snowsplat.util.names import first_names
 
 #: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
@@ -30,8 +30,6 @@ _VISIBLE = 36.0
 _LACKS_PHOTOS = 2.0
 #: Below this SSIM, fine detail is blurred in held-out photos.
 _SHARP = 0.7
-#: If more than this share of the photos is left out, it counts.
-_LEFT_OUT = 0.05
 #: A point is seen by few photos if at most this number of training photos shows it.
 _FEW_PHOTOS = 2
 #: Few photos explain a wrong photo if they see at least this share of its points.
@@ -40,8 +38,6 @@ _SELDOM = 0.4
 _EVIDENCE = 3
 #: Number of points whose photos are counted.
 _POINTS = 2000
-#: Standard deviation of the exposures, in EV, from which the camera should be set by hand.
-_SPREAD = 0.3
 
 _MORE = message(
     "take more photos, closer together, also from the places of the worst held-out photos"
@@ -55,10 +51,7 @@ def scene_verdict(
     held_out: Evaluation,
     trained_on: Evaluation,
     dataset: Dataset,
-    *,
-    left_out: Sequence[str] = (),
-    spread: float = 0.0,
-    poses: Message | None = None,
+    of_parts: Sequence[Reason] = (),
     capture: Verdict | None = None,
 ) -> Verdict:
     """The verdict.
@@ -67,9 +60,7 @@ def scene_verdict(
         held_out: of at least one held-out photo.
         trained_on: of at least one training photo.
         dataset: with the present cameras.
-        left_out: names of the training photos that the training has left out.
-        spread: standard deviation of the learnt exposures in EV; 0 if none are learnt.
-        poses: the line about poses that are not exact.
+        of_parts: the reasons of the parts of the training, see `Part.report`.
         capture: the verdict on the photos of the dataset.
     """
     typical = _typical(held_out)
@@ -77,9 +68,7 @@ def scene_verdict(
         *_new_views(held_out, trained_on),
         *_worst(held_out, dataset),
         *_sharpness(held_out),
-        *_left_out(left_out, len(dataset.train)),
-        *([] if poses is None else [Reason("usable", poses)]),
-        *_exposures(spread),
+        *of_parts,
     ]
     sure = typical >= _GOOD and len(held_out.views) >= _EVIDENCE
     for reason in capture.reasons if capture is not None else ():
@@ -173,34 +162,6 @@ def _sharpness(held_out: Evaluation) -> list[Reason]:
         Reason(
             "usable",
             message("fine detail is blurred in held-out photos (SSIM {ssim:.2f})", ssim=ssim),
-        )
-    ]
-
-
-def _left_out(names: Sequence[str], count: int) -> list[Reason]:
-    if not names:
-        return []
-    text = message(
-        "{number} of {count} photos contradict the others and were left out: {names}",
-        number=len(names),
-        count=count,
-        names=first_names(names, 3),
-    )
-    return [Reason("usable" if len(names) > _LEFT_OUT * count else "good", text)]
-
-
-def _exposures(spread: float) -> list[Reason]:
-    if spread < _SPREAD:
-        return []
-    return [
-        Reason(
-            "good",
-            message(
-                "the exposures of the photos differ by {spread:.1f} EV, which the training "
-                "corrects",
-                spread=spread,
-            ),
-            message("fix the exposure and the white balance of the camera"),
         )
     ]
 

@@ -40,10 +40,6 @@ def register_start(name: str, start: Start) -> None:
 def check_starts(names: str) -> Message | None:
     """What is wrong with names of starts, joined by "+"; None: nothing."""
     for name in names.split("+"):
-        if name == "carve":
-            return message(
-                "'carve' was removed; use sweep, which is faster and finds more of the surface"
-            )
         if name not in STARTS:
             advice = suggestion(name, list(STARTS)) or message(
                 "use one of {names}", names=[*STARTS]

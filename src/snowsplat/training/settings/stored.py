@@ -46,9 +46,6 @@ def config_from_json(values: dict[str, Any], strict: bool = False) -> TrainConfi
         "learning_rates": LearningRates,
         "decay": DecayRates,
     }
-    # A resumed training has its first Gaussians already.
-    if not strict and isinstance(start := values.get("init"), str):
-        values["init"] = start.replace("carve", "sweep")
     for part, kind in kinds.items():
         if part in values:
             values[part] = _known(kind, values[part], strict)

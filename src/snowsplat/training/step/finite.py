@@ -29,7 +29,7 @@ class Diverged(UserError):
 
 
 def rows_not_finite(tensors: Mapping[str, Tensor]) -> dict[str, int]:
-    """Name → number of rows with infinity or NaN; names without such rows are left out."""
+    """Name → number of rows with infinity or NaN; only names with such rows."""
     found: dict[str, int] = {}
     for name, tensor in tensors.items():
         # The sum is a fast test. Because it may overflow for large finite values, the rows are
@@ -62,7 +62,7 @@ def check_state(
 
     Args:
         rows: the part of the state of the trainer with one row for each Gaussian.
-        common: the other part. Only ``order`` and the views left out may have another size.
+        common: the other part. Only ``order`` and the excluded views may have another size.
         given: the state to load.
         views: number of training views of the trainer.
 
@@ -83,9 +83,9 @@ def check_state(
     )
     every = set(range(views))
     if fits and "unexplained.left_out" in given:
-        left_out = set(given["unexplained.left_out"].tolist())
-        fits = left_out < every
-        every -= left_out
+        excluded = set(given["unexplained.left_out"].tolist())
+        fits = excluded < every
+        every -= excluded
     if not fits or int(given["step"]) < 0 or not set(given["order"].tolist()) <= every:
         raise UserError(
             "the checkpoint: made with another dataset or recipe; resume with the original ones"
