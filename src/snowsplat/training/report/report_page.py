@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from PIL import Image
 
 from snowsplat import ops
 from snowsplat.data import Dataset
@@ -19,6 +18,7 @@ from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.history import History
+from snowsplat.training.parts.part_report import PartReport, Section
 from snowsplat.training.report import masks, pictures
 from snowsplat.util import charts
 from snowsplat.util.files import write_text
@@ -50,11 +50,7 @@ class Trained:
     evaluation: Evaluation | None
     settings: dict[str, Any]  # the settings by name, as JSON values
     left_out: tuple[str, ...] = ()  # names of the training views that the training has left out
-    # The learnt exposure of each training view in EV; empty if none is learnt.
-    exposures: tuple[float, ...] = ()
-    # The masks of what moves, by the name of the training view; see `Transients.pictures`.
-    masks: Mapping[str, Image.Image] = field(default_factory=dict)
-    poses: str | None = None  # the line about the camera poses; None if there is nothing to say
+    parts: Sequence[PartReport] = ()  # what the parts of the training report
     # What is doubtful about the cameras of the dataset, a sentence each.
     doubts: tuple[str, ...] = ()
     verdict: Verdict | None = None  # the verdict on the scene; None if no photos were held out
@@ -85,9 +81,8 @@ def write_training_report(path: Path, trained: Trained) -> None:
             trained=trained,
             evaluation=evaluation,
             held_out=held_out,
-            masked=masks.masked(trained.dataset.train, trained.masks),
+            sections=_sections(trained),
             curves=_curves(trained.history),
-            exposures=_exposures(trained.exposures),
             groups=pictures.compared(trained.gaussians, views, evaluation, trained.background),
             white_error=pictures.WHITE_ERROR,
             errors=errors,
@@ -132,12 +127,21 @@ def _curves(history: History) -> list[tuple[Message, Markup]]:
     return [(caption, drawing) for caption, drawing in drawings if drawing]
 
 
-def _exposures(exposures: tuple[float, ...]) -> Markup:
-    """The exposures of the training photos, in the order of their names."""
+def _sections(trained: Trained) -> list[tuple[Section, list[masks.Masked], Markup]]:
+    """The sections of the parts, with their photos and charts."""
+    return [
+        (section, masks.masked(trained.dataset.train, section.masks), _chart(section))
+        for part in trained.parts
+        for section in part.sections
+    ]
+
+
+def _chart(section: Section) -> Markup:
+    """The values of the training photos, in the order of their names; "" if there are none."""
     return charts.chart(
-        [(float(i), ev) for i, ev in enumerate(exposures, 1)] if any(exposures) else [],
+        [(float(i), value) for i, value in enumerate(section.values, 1)],
         x_label=message("training photo"),
-        y_label=message("exposure, EV"),
+        y_label=section.label or "",
         dots=True,
         from_zero=False,
     )
