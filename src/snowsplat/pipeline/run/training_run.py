@@ -311,7 +311,6 @@ class TrainingRun:
         self, gaussians: Gaussians, reports: Sequence[PartReport], verdict: Verdict | None
     ) -> Path:
         # Users may share the report, so it contains names of files but no paths.
-        sections = [section for each in reports for section in each.sections]
         project = Project.open(self.out.path)
         folder = project.home
         dataset = asdict(self.settings)
@@ -329,9 +328,7 @@ class TrainingRun:
                 history=self.history,
                 evaluation=None if self.evaluation is None else self.evaluation[1],
                 left_out=tuple(each.photo for each in self._left_out()),
-                exposures=next((s.values for s in sections if s.values), ()),
-                masks={name: mask for s in sections for name, mask in s.masks.items()},
-                poses=next((str(line) for each in reports for line in each.lines), None),
+                parts=reports,
                 doubts=self.doubts,
                 verdict=verdict,
                 settings={
