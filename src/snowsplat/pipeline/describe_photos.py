@@ -11,7 +11,7 @@ from snowsplat.data.maps.mask_look import doubt_about_files
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.colmap.options import thread_count
-from snowsplat.sfm.cost import measure_speed, steps_of, survey
+from snowsplat.sfm.cost import measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.photos.photo_files import Header, Unusable, read_header
 from snowsplat.sfm.ingest.search.archive import files_in
 from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, Source, Sources
@@ -37,8 +37,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
     left_out += [LeftOut(name, "photos", why) for name, why in unusable.items()]
     photos = survey(sources)
     speed = measure_speed(thread_count(None))
-    steps = steps_of(photos, PRESETS["normal"].photos, "normal").values()
-    time = duration(sum(step.seconds(speed) for step in steps))
+    time = duration(predicted_seconds(photos, PRESETS["normal"].photos, "normal", speed))
     doubt = doubt_about_files([s.mask for s in sources.photos if s.mask is not None])
     return {
         "kind": "photos" if usable else "video",

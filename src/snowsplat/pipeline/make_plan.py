@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 from snowsplat.pipeline.quality import PRESETS, Quality
 from snowsplat.sfm.colmap.options import EFFORTS
-from snowsplat.sfm.cost import Photos, Speed, steps_of
+from snowsplat.sfm.cost import Photos, Speed, predicted_seconds
 from snowsplat.util.duration import duration
 
 #: The share of the time that everything before the training may take.
@@ -56,8 +56,7 @@ def choose_plan(
     """
 
     def fits(photos: Photos, quality: Quality, size: int) -> bool:
-        steps = steps_of(photos, size, quality).values()
-        return sum(step.seconds(speed) for step in steps) <= _SHARE * seconds
+        return predicted_seconds(photos, size, quality, speed) <= _SHARE * seconds
 
     allowed = list(_sizes(quality))
     for quality, size in allowed:

@@ -173,6 +173,11 @@ def steps_of(photos: Photos, size: int | None, effort: EffortName) -> dict[str, 
     }
 
 
+def predicted_seconds(photos: Photos, size: int | None, effort: EffortName, speed: Speed) -> float:
+    """The time of all `steps_of` structure from motion on a machine with this speed."""
+    return sum(step.seconds(speed) for step in steps_of(photos, size, effort).values())
+
+
 def steps_of_pairs(pairs: float, features: float) -> dict[str, Step]:
     """The steps "pairs" and "verified" for this number of pairs, and of features in a photo."""
     thousands = features / 1000

@@ -222,7 +222,7 @@ def _undistort(
     for name in IMAGE_FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)
     model = pycolmap.Reconstruction(DatasetFolder(folder).distorted_model)
-    marker: tuple[MarkerScale | None, list[str]] = (None, [])
+    marker: tuple[MarkerScale | None, list[Message]] = (None, [])
     if options.marker is not None:
         marker = scale_of_markers(model, photos, DatasetFolder(folder).photos, options.marker)
     oriented = orientation(model, photos, marker)

@@ -45,7 +45,7 @@ from snowsplat.project.edit_record import shown_file
 from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
-from snowsplat.sfm.cost import Step, measure_speed, steps_of, survey
+from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.report.dataset_report import draw_from_above
@@ -245,12 +245,15 @@ def survey_photos(scene: StudioScene) -> dict[str, Any]:
     speed = measure_speed(thread_count(None))
     seconds = {}
     for quality, preset in PRESETS.items():
-        steps = [Step(preset.training)]
+        seconds[quality] = Step(preset.training).seconds(speed)
         if sources.posed is None:
-            steps += steps_of(photos, preset.photos, quality).values()
-        seconds[quality] = round(sum(step.seconds(speed) for step in steps))
+            seconds[quality] += predicted_seconds(photos, preset.photos, quality, speed)
     facts = describe_photos(sources) | {"poses": sources.posed is not None}
-    return {"facts": facts, "count": photos.count, "seconds": seconds}
+    return {
+        "facts": facts,
+        "count": photos.count,
+        "seconds": {quality: round(value) for quality, value in seconds.items()},
+    }
 
 
 def _answer(scene: StudioScene, words: list[str]) -> dict[str, Any]:

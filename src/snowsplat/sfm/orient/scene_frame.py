@@ -77,7 +77,7 @@ class _North:
 def orientation(
     model: pycolmap.Reconstruction,
     photos: Sequence[Photo] = (),
-    marker: tuple[MarkerScale | None, list[str]] = (None, []),
+    marker: tuple[MarkerScale | None, list[Message]] = (None, []),
 ) -> Oriented:
     """The frame of the scene, in which y points down.
 
