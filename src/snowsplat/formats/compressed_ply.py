@@ -30,7 +30,7 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
 from snowsplat.formats.ply import is_antialiased, placement_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 from snowsplat.util.ply import PlyTable, header_of, open_table
 
 _CHUNK = 256
@@ -163,9 +163,7 @@ def write_compressed_ply(path: Path | str, gaussians: GaussianArrays) -> None:
 
     Raises: OSError: the folder is missing or not writable, or the disk is full.
     """
-    parts = _encode(Path(path), gaussians)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(parts)
+    write_bytes(path, _encode(Path(path), gaussians))
 
 
 def encode_compressed_ply(path: Path, gaussians: GaussianArrays) -> bytes:

@@ -34,7 +34,7 @@ from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import Origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 from snowsplat.util.safe_json import quoted
 from snowsplat.util.srgb import from_linear, to_linear
 
@@ -55,8 +55,6 @@ _LEAST_BYTES = 26  # per Gaussian, with all attributes quantised except the colo
 _MOST_COPIES = 8  # maximum number of copies of the splats, by nodes that share a mesh
 _MOST_PRIMITIVES = 1 << 20  # maximum number of primitives of all nodes
 _MOST_PARTS = 1 << 12  # maximum number of primitives with splats
-OPACITY_RANGE = 1e-12, 1 - 2.0**-25  # 0 and 1 have no logit
-LOG_SCALES = -87.0, 88.0  # logarithms of the scales that float32 can store
 _GLB_LIMIT = (1 << 32) - 1
 _POINTS = 0  # the mode of a primitive
 
@@ -233,10 +231,6 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
         return glb.accessor(document, attributes[name], *(kinds or ("VEC3",)))
 
     means = read("POSITION")
-    quats = read(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]]
-    quats[(quats == 0).all(1)] = 1, 0, 0, 0
-    opacity = read(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0].astype(np.float64)
-    opacity = np.clip(opacity, *OPACITY_RANGE)
     names = _coefficients(3)
     present = [name for name in names if name in attributes]
     if not present and "COLOR_0" in attributes:
@@ -251,8 +245,8 @@ def _splats(document: Document, attributes: dict[str, Any], notes: set[str]) -> 
     arrays = (
         means,
         read(f"{EXTENSION}:SCALE"),
-        quats,
-        np.log(opacity / (1 - opacity)),
+        packing.quats_of_xyzw(read(f"{EXTENSION}:ROTATION", "VEC4")),
+        packing.logits(read(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]),
         sh[0][:, None],
         np.stack(sh[1:], 1) if sh[1:] else np.zeros((len(means), 0, 3)),
     )
@@ -270,7 +264,6 @@ def _coefficients(degree: int) -> list[str]:
     ]
 
 
-@np.errstate(over="ignore", under="ignore")
 def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write one mesh of splats in one node, atomically.
 
@@ -280,19 +273,17 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     """
     path = Path(path)
     scene = packing.flipped(packing.packable(path, gaussians))
-    means, log_scales, quats, opacity_logits, sh_dc, sh_rest = scene
-    opacity = (1 / (1 + np.exp(-opacity_logits))).astype("<f4")
+    means = scene.means
     cut = packing.Cut(path, "glTF", len(means))
-    packing.cut_scales(cut, log_scales, *LOG_SCALES, step=0)
+    scales, opacity, sh = packing.linear_values(cut, scene)
     attributes: dict[str, np.ndarray] = {
         "POSITION": means,
-        "COLOR_0": _point_colors(sh_dc, opacity),
-        f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": np.exp(np.clip(log_scales, *LOG_SCALES)),
+        "COLOR_0": _point_colors(scene.sh_dc, opacity),
+        f"{EXTENSION}:ROTATION": scene.quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": opacity[:, None],
     }
-    sh = np.concatenate([sh_dc, sh_rest], 1)
-    degree = SH_REST_COUNTS.index(sh_rest.shape[1])
+    degree = SH_REST_COUNTS.index(sh.shape[1] - 1)
     attributes |= {name: sh[:, k] for k, name in enumerate(_coefficients(degree))}
     attributes = {
         name: np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
@@ -315,8 +306,7 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
         node = _node(gaussians.origin, gaussians.metres_per_unit or 1.0)
         contents, arrays = glb.contents(node, primitive, attributes)
         document |= contents
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(glb.pack(document, arrays))
+    write_bytes(path, glb.pack(document, arrays))
     cut.report(".ply keeps them")
 
 

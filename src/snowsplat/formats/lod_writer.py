@@ -30,7 +30,7 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays
 from snowsplat.formats.lod import INDEX, read_index
 from snowsplat.formats.sog import encode_sog
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path, new_folder, write_text
+from snowsplat.util.files import new_folder, write_bytes, write_text
 
 _FACTOR = 4  # between the numbers of Gaussians of two levels
 _FARTHER = 2.3  # see `simplify`: each level is shown from about three times the distance
@@ -266,8 +266,7 @@ class _Writer:
         folder = self._folder / name
         folder.mkdir()
         for member, content in encode_sog(GaussianArrays.cat(parts)).items():
-            with atomic_path(folder / member) as temporary:
-                temporary.write_bytes(content)
+            write_bytes(folder / member, content)
 
 
 def _corners(gaussians: GaussianArrays) -> np.ndarray:

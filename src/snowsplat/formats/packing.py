@@ -29,6 +29,8 @@ FLAT = float(np.log(1e-4))
 #: Signs that convert between x right, y down, z forward (our frame, and that of most scene files)
 #: and x right, y up, z back (OpenGL, three.js, glTF), in both directions.
 UP_BACK = (1, -1, -1)
+#: Logarithms of the scales that float32 can store.
+LOG_SCALES = -87.0, 88.0
 _RARE = 0.001  # share of Gaussians, see `Cut`
 _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no logarithm
 
@@ -119,6 +121,31 @@ def cut_scales(cut: Cut, log_scales: np.ndarray, low: float, high: float, step: 
     thick = (log_scales.min(1) < low - step) & (longest < low + math.log(10))
     details = f"down to {smallest:.4g}, at least {math.exp(low):.4g}"
     cut.note("the small scales", thick, details, rare=True)
+
+
+def linear_values(cut: Cut, gaussians: GaussianArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scales (N, 3), opacities (N,) and SH (N, 1 + K, 3), as glTF and USD store them.
+
+    Scales that float32 cannot store are noted in ``cut``.
+    """
+    cut_scales(cut, gaussians.log_scales, *LOG_SCALES, step=0)
+    scales = np.exp(np.clip(gaussians.log_scales, *LOG_SCALES))
+    with np.errstate(over="ignore", under="ignore"):
+        opacities = (1 / (1 + np.exp(-gaussians.opacity_logits))).astype(np.float32)
+    return scales, opacities, np.concatenate([gaussians.sh_dc, gaussians.sh_rest], 1)
+
+
+def logits(opacities: np.ndarray) -> np.ndarray:
+    """(N,) float64 logits of opacities from 0 to 1, which are limited to those that have one."""
+    opacities = np.clip(opacities.astype(np.float64), 1e-12, 1 - 2.0**-25)
+    return np.log(opacities / (1 - opacities))
+
+
+def quats_of_xyzw(xyzw: np.ndarray) -> np.ndarray:
+    """(N, 4) wxyz; the quaternion of length 0 becomes the identity."""
+    quats = xyzw[:, [3, 0, 1, 2]]
+    quats[(quats == 0).all(1)] = 1, 0, 0, 0
+    return quats
 
 
 def fitting_factor(log_scales: np.ndarray, low: float, high: float) -> float | None:

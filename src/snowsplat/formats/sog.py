@@ -44,7 +44,7 @@ from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 
 #: The name of the description of a scene, in a zip file or a folder.
 META = "meta.json"
@@ -225,9 +225,7 @@ def write_sog(path: Path | str, gaussians: GaussianArrays) -> None:
         UserError: more Gaussians than an image can have pixels.
         OSError: the folder is missing or not writable, or the disk is full.
     """
-    content = sog_bytes(Path(path), gaussians)
-    with atomic_path(Path(path)) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, sog_bytes(Path(path), gaussians))
 
 
 def sog_bytes(path: Path, gaussians: GaussianArrays) -> bytes:

@@ -14,7 +14,7 @@ import numpy as np
 from snowsplat.formats import packing
 from snowsplat.formats.damage import Damaged, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _LOG_LIMIT = 87.0  # the exponential of a larger number exceeds float32
@@ -65,8 +65,7 @@ def write_splat(path: Path | str, gaussians: GaussianArrays) -> None:
     rows["rgba"][:, :3] = packing.color_bytes(sh_dc[order])
     rows["rgba"][:, 3] = packing.opacity_bytes(opacity_logits[order])
     rows["quats"] = packing.to_bytes(128 + 128 * quats[order])
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(rows.tobytes())
+    write_bytes(path, rows.tobytes())
     cut = packing.Cut(path, "splat", len(means))
     packing.cut_scales(cut, log_scales, -_LOG_LIMIT, _LOG_LIMIT, step=0)
     cut.report(".ply keeps them")

@@ -39,7 +39,7 @@ from snowsplat.formats.spz_container import (
 )
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 
 __all__ = ["WRITTEN_VERSIONS", "is_spz", "parse_spz", "read_spz", "spz_version", "write_spz"]
 
@@ -207,9 +207,7 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     degree = SH_REST_COUNTS.index(sh_rest.shape[1])
     flags = ANTIALIASED if gaussians.antialiased else 0
     header = Header(version, len(means), degree, bits, flags)
-    data = pack(header, [column.tobytes() for column in columns])
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, pack(header, [column.tobytes() for column in columns]))
     if len(means) and 2.0**-bits > 0.5 * math.exp(min(80.0, float(np.median(log_scales.max(1))))):
         cut.note("positions", np.ones(len(means), bool), f"in steps of {2.0**-bits:.2g}")
     packing.cut_scales(cut, log_scales, *_SCALE_RANGE, step=1 / 32)

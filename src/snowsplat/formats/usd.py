@@ -27,7 +27,7 @@ from snowsplat.formats import packing
 from snowsplat.formats.archive import first_member
 from snowsplat.formats.damage import reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.gltf import LOG_SCALES, OPACITY_RANGE, transformed
+from snowsplat.formats.gltf import transformed
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -128,9 +128,6 @@ def _splats(prim: Any) -> GaussianArrays:
             return np.full((count, width), default, np.float32)
         return values[:count]
 
-    quats = column("orientations", 4, 0.0)[:, [3, 0, 1, 2]]
-    quats[(quats == 0).all(1)] = 1, 0, 0, 0
-    opacity = np.clip(column("opacities", 1, 1.0)[:, 0].astype(np.float64), *OPACITY_RANGE)
     stored = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
     size = (int(stored if stored is not None else 3) + 1) ** 2
     sh = read("radiance:sphericalHarmonicsCoefficients", 3)
@@ -141,14 +138,13 @@ def _splats(prim: Any) -> GaussianArrays:
     return GaussianArrays(
         means,
         packing.log_scales(column("scales", 3, 1.0)),
-        quats,
-        np.log(opacity / (1 - opacity)).astype(np.float32),
+        packing.quats_of_xyzw(column("orientations", 4, 0.0)),
+        packing.logits(column("opacities", 1, 1.0)[:, 0]).astype(np.float32),
         np.ascontiguousarray(sh[:, :1]),
         np.ascontiguousarray(sh[:, 1:]),
     )
 
 
-@np.errstate(over="ignore", under="ignore")
 def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write one prim of splats, atomically; the suffix selects the kind of file.
 
@@ -158,12 +154,9 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
     """
     path = Path(path)
     scene = packing.flipped(packing.packable(path, gaussians))
-    means, quats, sh_rest = scene.means, scene.quats, scene.sh_rest
+    means, quats = scene.means, scene.quats
     cut = packing.Cut(path, "USD", len(means))
-    packing.cut_scales(cut, scene.log_scales, *LOG_SCALES, step=0)
-    scales = np.exp(np.clip(scene.log_scales, *LOG_SCALES))
-    opacities = (1 / (1 + np.exp(-scene.opacity_logits))).astype(np.float32)
-    sh = np.concatenate([scene.sh_dc, sh_rest], 1)
+    scales, opacities, sh = packing.linear_values(cut, scene)
     metres = gaussians.metres_per_unit or 1.0
     with _usd(path) as (Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt):
         kind = path.suffix.lower()
@@ -188,7 +181,7 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
         splats.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(flat(quats[:, [1, 2, 3, 0]])))
         splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(flat(scales)))
         splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
-        splats.CreateRadianceSphericalHarmonicsDegreeAttr(SH_REST_COUNTS.index(sh_rest.shape[1]))
+        splats.CreateRadianceSphericalHarmonicsDegreeAttr(SH_REST_COUNTS.index(sh.shape[1] - 1))
         splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(
             Vt.Vec3fArray.FromNumpy(flat(sh.reshape(-1, 3)))
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -110,7 +111,7 @@ def adam_step(
                 f"on {nonfinite_rows.device}"
             )
     beta1, beta2 = rates.betas
-    updated = {
+    updated: dict[str, Any] = {
         name: {
             "value": value.detach(),
             "m": moments.exp_avg[name],

@@ -134,7 +134,7 @@ class _Project(torch.autograd.Function):
 def visible_splats(gaussians: Struct, camera: Struct) -> tuple[Tensor, Tensor]:
     """`packed` (M, 16) and `ids` (M,) of the splats of the visible Gaussians; see `Splats2D`."""
     means = gaussians["means"]
-    inputs = {"gaussians": gaussians, "camera": camera}
+    inputs: dict[str, Any] = {"gaussians": gaussians, "camera": camera}
     ids = scratch.empty((len(means),), torch.int32, means.device)
     rows = launch(variant("project_cull", means), n=len(means), ids=ids, **inputs)
     ids = ids[:rows]

@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +157,12 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def write_bytes(path: Path | str, data: bytes | Iterable[bytes]) -> None:
+    """Write a file, or its parts one after the other, atomically; see `atomic_path`."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.writelines([data] if isinstance(data, bytes) else data)
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -27,7 +27,7 @@ import torch
 from snowsplat.extras.image.model import ANGLE, OPACITY_LOGIT, ImageGaussians, column_count
 from snowsplat.extras.image.options import MOST_GAUSSIANS, Blending
 from snowsplat.util.errors import Problem, UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 
 SUFFIX = ".gimg"
 _MAGIC = b"GIMG"
@@ -53,8 +53,7 @@ def write_compact(path: Path, gaussians: ImageGaussians) -> ImageGaussians:
         OSError: the file cannot be written.
     """
     data = encode(gaussians)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, data)
     return decode(data)
 
 

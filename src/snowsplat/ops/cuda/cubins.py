@@ -15,7 +15,7 @@ from pathlib import Path
 
 from snowsplat.ops.cuda import nvrtc
 from snowsplat.util.errors import UserError
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import write_bytes
 
 Capability = tuple[int, int]
 
@@ -128,5 +128,4 @@ def _write(path: Path | None, code: bytes) -> None:
         return
     with contextlib.suppress(OSError):  # if writing fails, the code is compiled again next time
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(hashlib.sha256(code).digest() + code)
+        write_bytes(path, hashlib.sha256(code).digest() + code)

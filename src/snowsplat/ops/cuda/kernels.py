@@ -32,7 +32,7 @@ class Run(Protocol):
     """Queues a kernel. ``name``: its full name; ``fields``: those of its struct, as of a launch;
     ``blocks``: by default those for the n items of the struct; 0 queues nothing."""
 
-    def __call__(self, name: str, fields: Fields, blocks: int | None = None) -> None: ...
+    def __call__(self, name: str, fields: Fields, blocks: int | None = None, /) -> None: ...
 
 
 #: By name. Most native functions are one kernel with the same name and parameters; `launches` has

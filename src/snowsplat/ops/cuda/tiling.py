@@ -77,8 +77,9 @@ def tiles_fill(run: Run, suffix: str, p: Fields) -> int:
     # tiles_gather finds the splats afterwards.
     sorts_slots = instance_slot is not None
     sort_values = instance_slot if sorts_slots else instance_splat
-    pair = (sort_values, spare) if sort_passes(bits) % 2 == 0 else (spare, sort_values)
-    slot_splat = empty(torch.int32) if sorts_slots else pair[0]
+    even = sort_passes(bits) % 2 == 0
+    values, values2 = (sort_values, spare) if even else (spare, sort_values)
+    slot_splat = empty(torch.int32) if sorts_slots else values
     run(
         f"tiles_fill{suffix}",
         {
@@ -92,7 +93,7 @@ def tiles_fill(run: Run, suffix: str, p: Fields) -> int:
         },
     )
     keys, _ = sort_pairs(
-        run, capacity, keys, keys2, *pair, (0, bits), count=required, rows=sorts_slots
+        run, capacity, keys, keys2, values, values2, (0, bits), count=required, rows=sorts_slots
     )
     if sorts_slots:
         gather = {"slot_splat": slot_splat, "instance_slot": instance_slot}
