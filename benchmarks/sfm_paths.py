@@ -19,7 +19,7 @@ from snowsplat.scene.geometry import (
     quat_from_rotation,
     rotation_from_quat,
 )
-from snowsplat.synthetic.photographer import rolled
+from snowsplat.synthetic.photographer import roll
 from snowsplat.trajectory.spline import Spline
 
 _UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -72,7 +72,7 @@ def level_loops(count: int, seed: int) -> list[Tensor]:
         view = invert_rigid(pose)
         ahead = view[:, 2] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
         level = look_at(view[:, 3], view[:, 3] + ahead, _UP)
-        poses.append(rolled(level, random.normal(0, 0.017)))
+        poses.append(roll(level, random.normal(0, 0.017)))
     return poses
 
 
@@ -264,5 +264,5 @@ def _hand_held(
     for position, target in zip(positions, targets, strict=True):
         at = torch.from_numpy(position + random.normal(0, 0.025, 3))
         to = torch.from_numpy(target + random.normal(0, 0.05, 3))
-        poses.append(rolled(look_at(at, to, _UP), random.normal(0, 0.05)))
+        poses.append(roll(look_at(at, to, _UP), random.normal(0, 0.05)))
     return poses

@@ -188,7 +188,7 @@ def _carpeted_room(seed: int) -> Scene:
     x, y = 6.0, 4.8
     across, down, tile = 5, 4, 0.6  # numbers of tiles, and the side of a tile in metres
     shades = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
-    carpet = np.tile(paint.woven(_pixels(tile, tile), 5, shades, random), (down, across, 1))
+    carpet = np.tile(paint.cloth(_pixels(tile, tile), 5, shades, random), (down, across, 1))
     carpet = _worn(carpet, random)
     floor = paint.wood(_pixels(x, y), 26, _PINE, random)
     top, left = ((np.array(floor.shape[:2]) - carpet.shape[:2]) // 2).tolist()
@@ -325,7 +325,7 @@ def _with_pictures(wall: np.ndarray, count: int, random: np.random.Generator) ->
         portrait = random.random() < 0.5
         size = (180, 240) if portrait else (240, 180)
         frame = np.full((size[1] + 24, size[0] + 24, 3), random.uniform(0.1, 0.3, 3), np.float32)
-        frame[12:-12, 12:-12] = paint.printed(size, random)
+        frame[12:-12, 12:-12] = paint.poster(size, random)
         at = ((i + random.uniform(0.35, 0.65)) / count, 0.45 + random.normal(0, 0.03))
         metres = random.uniform(0.45, 0.75)
         wall = paint.paste(wall, frame, at, metres / _TEXEL / width, random.normal(0, 1.5))
@@ -348,7 +348,7 @@ def _crate(
     faces = []
     for _ in range(6):
         wall = paint.wood(_pixels(side, side), 4, _PINE, random)
-        label = paint.printed((160, 120), random, lines=7)
+        label = paint.poster((160, 120), random, lines=7)
         middle = (random.uniform(0.4, 0.6), random.uniform(0.4, 0.6))
         faces.append(paint.paste(wall, label, middle, 0.6, random.normal(0, 4)))
     return SceneObject(Box(centre, (side,) * 3, angle), faces)
@@ -383,7 +383,7 @@ def _table(random: np.random.Generator, at: tuple[float, float]) -> list[SceneOb
 def _monument(random: np.random.Generator, at: tuple[float, float]) -> list[SceneObject]:
     """A crate, a drum and a globe on top of each other, 1.4 m high."""
     x, y = at
-    drum = paint.printed(_pixels(1.5, 0.4), random, lines=9)
+    drum = paint.poster(_pixels(1.5, 0.4), random, lines=9)
     lid = paint.wood((96, 96), 2, _DARK, random)
     return [
         _crate(random, (x, y, 0.3), 0.6, 0.3),

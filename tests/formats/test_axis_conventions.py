@@ -14,7 +14,7 @@ from snowsplat.scene.render import render
 
 
 def flipped(scene: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
-    return packing.flipped(GaussianArrays.from_gaussians(scene), signs).to_gaussians()
+    return packing.flip_axes(GaussianArrays.from_gaussians(scene), signs).to_gaussians()
 
 
 def test_a_camera_converted_to_y_up_z_back_sees_the_same_image(make_scene):

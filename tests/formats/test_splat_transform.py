@@ -5,7 +5,7 @@ import torch
 
 from snowsplat.formats import read_gaussians, write_gaussians
 from snowsplat.formats.gaussian_arrays import GaussianArrays
-from snowsplat.formats.packing import flipped
+from snowsplat.formats.packing import flip_axes
 from snowsplat.formats.spz import write_spz
 from snowsplat.scene.edit import transform
 from snowsplat.scene.gaussians import Gaussians
@@ -29,7 +29,7 @@ def assert_same(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
 
 def as_it_reads_spz(scene: Gaussians) -> Gaussians:
     """The scene as splat-transform reads it from an .spz file: it does not convert the frame."""
-    return flipped(GaussianArrays.from_gaussians(scene)).to_gaussians()
+    return flip_axes(GaussianArrays.from_gaussians(scene)).to_gaussians()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

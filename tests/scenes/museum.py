@@ -25,7 +25,7 @@ from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import textures as paint
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import depth_map, rolled, take_photos
+from snowsplat.synthetic.photographer import depth_map, roll, take_photos
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
@@ -115,7 +115,7 @@ def hall(gloss: bool, seed: int = 0) -> Scene:
     for side in (y, y, x, x):
         wall = paint.plain((int(100 * side), 400), random.uniform(0.35, 0.8, 3).tolist(), random)
         for u in (0.14, 0.38, 0.62, 0.86):
-            sheet = paint.printed((240, 200), random)
+            sheet = paint.poster((240, 200), random)
             wall = paint.paste(wall, sheet, (u + random.normal(0, 0.02), 0.55), 1.3 / side, 0)
         walls.append(wall)
     floor = paint.marble((1100, 912), (0.50, 0.44, 0.38), (0.30, 0.26, 0.24), random)
@@ -182,7 +182,7 @@ def arc(count: int, seed: int) -> list[Tensor]:
         position[2] = _EYES + (0.30 if i % 2 else -0.05) + random.normal(0, 0.03)
         target = np.array([0, 0, _EYES - 0.05]) + random.normal(0, 0.03, 3)
         pose = look_at(torch.from_numpy(position), torch.from_numpy(target), up)
-        poses.append(rolled(pose, random.normal(0, 0.04)))
+        poses.append(roll(pose, random.normal(0, 0.04)))
     return poses
 
 

@@ -54,7 +54,7 @@ def figure(
     """A person 1.7 m tall who stands at ``feet``; ``colours``: of the trousers and of the shirt."""
     x, y, floor = feet
     trousers = paint.plain((128, 64), colours[0], clothes)
-    stripes = paint.woven((256, 128), 14, [colours[1], (0.85, 0.82, 0.75)], clothes)
+    stripes = paint.cloth((256, 128), 14, [colours[1], (0.85, 0.82, 0.75)], clothes)
     head = paint.plain((64, 64), _SKIN, clothes, stains=0.4)
     return [
         SceneObject(Frustum((x, y, floor), 0.80, 0.13, 0.17), [trousers]),

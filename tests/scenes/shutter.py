@@ -11,7 +11,7 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.synthetic.lens import CentredLens
-from snowsplat.synthetic.photographer import RAYS, developed, tiles
+from snowsplat.synthetic.photographer import RAYS, develop, tiles
 from snowsplat.synthetic.scene import Scene
 
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples are evenly distributed in time
@@ -82,7 +82,7 @@ def photograph(
                 total += seen(origin + rotation @ offset, own, moved)
             pixels = (total / shutter.samples).reshape(3, shape[1], shape[3])
         light[rows, columns] = pixels.transpose(1, 2, 0)
-    return developed(light, random)
+    return develop(light, random)
 
 
 def shooting(

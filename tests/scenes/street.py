@@ -124,7 +124,7 @@ def _houses(length: float, side: int, random: np.random.Generator) -> list[Scene
         wall = paint.plain(_size((_DEPTH, height), 0.1), (0.5, 0.46, 0.42), random)
         objects.append(SceneObject(house, [wall, wall, front, front, other, other]))
         face = side * (HALF_WIDTH + setback)
-        cloth = paint.woven(
+        cloth = paint.cloth(
             (160, 48), 14, [(0.7, 0.2, 0.15), (0.85, 0.8, 0.7), (0.2, 0.35, 0.5)], random
         )
         if random.random() < 0.6:
@@ -168,7 +168,7 @@ def facade(
     leaf = paint.wood((48, 96), 3, random.uniform(0.15, 0.6, 3).tolist(), random)
     wall = wall.clip(0, 1).astype(np.float32)
     wall = paint.paste(wall, leaf, (door / width, 1 - 0.34 * storey / height), 1.1 / metres[0], 0)
-    sign = paint.printed((240, 36), random, lines=2)
+    sign = paint.poster((240, 36), random, lines=2)
     return paint.paste(wall, sign, (shop[0] / width, 1 - 0.83 * storey / height), 0.5, 0)
 
 

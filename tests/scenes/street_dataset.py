@@ -16,7 +16,7 @@ from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import rolled, take_photos
+from snowsplat.synthetic.photographer import roll, take_photos
 from snowsplat.synthetic.scene import Scene
 
 from .street import HALF_WIDTH, street
@@ -94,7 +94,7 @@ def walk_along(length: float, count: int, seed: int) -> list[Tensor]:
         rise = math.radians(random.uniform(2, 12))
         gaze = np.array([math.cos(yaw), math.sin(yaw), math.tan(rise)])
         pose = look_at(torch.from_numpy(position), torch.from_numpy(position + gaze), up)
-        poses.append(rolled(pose, random.normal(0, 0.03)))
+        poses.append(roll(pose, random.normal(0, 0.03)))
     return poses
 
 

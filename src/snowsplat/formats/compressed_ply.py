@@ -26,7 +26,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.damage import reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.ply import is_antialiased, placement_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -91,7 +91,7 @@ def read_compressed_ply(path: Path, data: bytes | None = None) -> GaussianArrays
         np.float32(2)
     )
     steps = _largest_integers(_XYZ)
-    scene = decoded(
+    scene = usable_gaussians(
         path,
         _dequantize(bounds[:, :3], bounds[:, 3:6], _fields(words[:, 0], _XYZ), steps).astype("f4"),
         _dequantize(bounds[:, 6:9], bounds[:, 9:], _fields(words[:, 2], _XYZ), steps),

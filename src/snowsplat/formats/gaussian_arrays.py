@@ -128,15 +128,15 @@ class GaussianArrays:
         return replace(self, **own)
 
 
-def decoded(path: Path, *arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
+def usable_gaussians(path: Path, *arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
     """The six arrays read from ``path``, as float32; rows that are not usable are left out.
 
     Positions in float64 are stored relative to an origin if float32 would lose precision.
     """
-    return without_unusable(path, placed(*arrays, antialiased=antialiased))
+    return without_unusable(path, float32_gaussians(*arrays, antialiased=antialiased))
 
 
-def placed(*arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
+def float32_gaussians(*arrays: np.ndarray, antialiased: bool = False) -> GaussianArrays:
     """The six arrays as float32. Positions in float64 get an origin if they need one."""
     means, log_scales, *others = arrays
     origin = HERE

@@ -27,7 +27,7 @@ import numpy as np
 
 from snowsplat.formats import glb, packing
 from snowsplat.formats.damage import Damaged, reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.glb import Document
 from snowsplat.formats.spz import parse_spz
 from snowsplat.scene.length import stored_metres
@@ -102,7 +102,7 @@ def read_gltf(path: Path) -> GaussianArrays:
                 (replace(part, log_scales=packing.log_scales(part.log_scales)), matrix)
                 for part, matrix in parts
             ]
-        placed = [transformed(part, matrix) for part, matrix in parts]
+        placed = [place_in_scene(part, matrix) for part, matrix in parts]
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
         raise Damaged("its JSON is not valid glTF") from None
     for note in sorted(notes):
@@ -110,7 +110,7 @@ def read_gltf(path: Path) -> GaussianArrays:
     scene = GaussianArrays.cat(placed)
     if any(any(part.origin) for part in placed):
         scene = replace(scene, means=np.concatenate([part.world_means() for part in placed]))
-    found = decoded(path, *packing.flipped(scene), antialiased=scene.antialiased)
+    found = usable_gaussians(path, *packing.flip_axes(scene), antialiased=scene.antialiased)
     try:
         metres = stored_metres(document.json["asset"]["extras"]["metres_per_unit"])
     except (KeyError, IndexError, TypeError):
@@ -155,7 +155,7 @@ def _parts(
 
 def _unpacked(path: Path, document: Document, view: int) -> GaussianArrays:
     """As `_splats`, of an .spz file."""
-    scene = packing.flipped(parse_spz(path, bytes(glb.view(document, view))))
+    scene = packing.flip_axes(parse_spz(path, bytes(glb.view(document, view))))
     return replace(scene, log_scales=np.exp(scene.log_scales))
 
 
@@ -189,7 +189,7 @@ def _are_logarithms(scales: list[np.ndarray]) -> bool:
     return low < -_ROUNDING * high
 
 
-def transformed(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
+def place_in_scene(part: GaussianArrays, world_from_mesh: np.ndarray) -> GaussianArrays:
     """The splats in the frame of the scene; ``world_from_mesh`` is (4, 4).
 
     Positions are relative to an origin: float32 may not be able to store the translation.
@@ -272,7 +272,7 @@ def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    scene = packing.flipped(packing.packable(path, gaussians))
+    scene = packing.flip_axes(packing.packable(path, gaussians))
     means = scene.means
     cut = packing.Cut(path, "glTF", len(means))
     scales, opacity, sh = packing.linear_values(cut, scene)

@@ -17,7 +17,7 @@ import numpy as np
 
 from snowsplat.formats.archive import first_member
 from snowsplat.formats.damage import Damaged, reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -62,7 +62,9 @@ def read_checkpoint(path: Path) -> GaussianArrays:
     if rest > SH_REST_COUNTS[-1]:
         logger.warning("%s: its SH degree is reduced to 3", path)
     _name_other_ranks(path)
-    return decoded(path, means, scales, quats, opacities, sh0, shN[:, : SH_REST_COUNTS[-1]])
+    return usable_gaussians(
+        path, means, scales, quats, opacities, sh0, shN[:, : SH_REST_COUNTS[-1]]
+    )
 
 
 def _load(path: Path) -> Any:

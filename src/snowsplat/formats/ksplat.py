@@ -28,7 +28,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.damage import Damaged, reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 
@@ -79,7 +79,7 @@ def read_ksplat(path: Path) -> GaussianArrays:
     parts = [GaussianArrays.empty(SH_REST_COUNTS[degree])]
     for section in sections:
         parts.append(_unpack(section, level, bounds, SH_REST_COUNTS[degree]))
-    return decoded(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
+    return usable_gaussians(path, *(np.concatenate(c) for c in zip(*parts, strict=True)))
 
 
 def _sections(data: bytes, section_count: int, level: int) -> list[_Section]:

@@ -256,7 +256,7 @@ def from_largest_of_four(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return unit_quats(quats)
 
 
-def flipped(gaussians: GaussianArrays, signs: tuple[int, int, int] = UP_BACK) -> GaussianArrays:
+def flip_axes(gaussians: GaussianArrays, signs: tuple[int, int, int] = UP_BACK) -> GaussianArrays:
     """The Gaussians with each axis multiplied by its sign, ±1; float64 positions stay float64.
 
     A rotation R becomes M R M, where M is the diagonal matrix of the signs. That is a rotation

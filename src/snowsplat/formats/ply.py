@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, unusable
+from snowsplat.formats.gaussian_arrays import GaussianArrays, float32_gaussians, unusable
 from snowsplat.formats.packing import FLAT
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, Origin, add_origins, stored_origin
@@ -139,7 +139,7 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
             log_scales, opacity_logits = _filtered(log_scales, opacity_logits, filters)
             logger.info("%s: its filter_3D (Mip-Splatting) is applied to scales, opacities", path)
         arrays = (means, log_scales, quats, opacity_logits, sh_dc, sh_rest)
-        scene = placed(*arrays, antialiased=is_antialiased(table.comments))
+        scene = float32_gaussians(*arrays, antialiased=is_antialiased(table.comments))
     if problem := unusable(scene):
         logger.warning("%s: %s; they are not shown", path, problem)
     origin, metres = placement_in(table.comments)

@@ -38,7 +38,7 @@ from PIL import Image
 from snowsplat.formats import packing
 from snowsplat.formats.codebooks import LEVELS, levels_for, palette_for
 from snowsplat.formats.damage import Damaged, reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, placed, without_unusable
+from snowsplat.formats.gaussian_arrays import GaussianArrays, float32_gaussians, without_unusable
 from snowsplat.formats.sog_container import Bundle
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, add_origins, stored_origin
@@ -80,7 +80,7 @@ def read_stored(path: Path) -> GaussianArrays:
         packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
         arrays = _decode(files, layout)
     antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
-    scene = placed(*arrays, antialiased=antialiased)
+    scene = float32_gaussians(*arrays, antialiased=antialiased)
     asset = meta.get("asset")
     asset = asset if isinstance(asset, dict) else {}
     stored = stored_origin(asset.get("origin"))

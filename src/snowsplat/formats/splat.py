@@ -13,7 +13,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.damage import Damaged, reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.util.files import write_bytes
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -34,7 +34,7 @@ def read_splat(path: Path) -> GaussianArrays:
             row=_ROW.itemsize,
         )
     rows = np.frombuffer(data, _ROW)
-    return decoded(
+    return usable_gaussians(
         path,
         rows["means"],
         packing.log_scales(rows["scales"]),

@@ -27,7 +27,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.damage import reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.spz_container import (
     ANTIALIASED,
     Header,
@@ -109,8 +109,8 @@ def parse_spz(path: Path, data: bytes) -> GaussianArrays:
         (color.astype(np.float32)[:, None] - 127.5) / _COLOR_STEP,
         (sh_rest.astype(np.float32) - 128) / 128,
     )
-    scene = packing.flipped(stored, _signs(path, contents.extensions))
-    return decoded(path, *scene, antialiased=bool(header.flags & ANTIALIASED))
+    scene = packing.flip_axes(stored, _signs(path, contents.extensions))
+    return usable_gaussians(path, *scene, antialiased=bool(header.flags & ANTIALIASED))
 
 
 def _leaves(path: Path, rows: list[np.ndarray], children: np.ndarray) -> list[np.ndarray]:
@@ -192,7 +192,7 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     if version not in WRITTEN_VERSIONS:
         raise ValueError(f"version {version} of .spz cannot be written; use 2, 3 or 4")
     path = Path(path)
-    scene = packing.flipped(packing.packable(path, gaussians))
+    scene = packing.flip_axes(packing.packable(path, gaussians))
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = scene
     bits = _fractional_bits(means)
     cut = packing.Cut(path, "SPZ", len(means))

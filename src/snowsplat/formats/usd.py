@@ -26,8 +26,8 @@ import numpy as np
 from snowsplat.formats import packing
 from snowsplat.formats.archive import first_member
 from snowsplat.formats.damage import reads
-from snowsplat.formats.gaussian_arrays import GaussianArrays, decoded
-from snowsplat.formats.gltf import transformed
+from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
+from snowsplat.formats.gltf import place_in_scene
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
@@ -95,13 +95,13 @@ def read_usd(path: Path) -> GaussianArrays:
             if prim.IsA(UsdVol.ParticleField3DGaussianSplat):
                 # USD multiplies rows by matrices from the right.
                 matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
-                parts.append(transformed(_splats(prim), matrix))
+                parts.append(place_in_scene(_splats(prim), matrix))
     if not parts:
         raise UserError(
             "{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)", path=path
         )
     scene = GaussianArrays.cat(parts)
-    found = decoded(path, *packing.flipped(replace(scene, means=scene.world_means())))
+    found = usable_gaussians(path, *packing.flip_axes(replace(scene, means=scene.world_means())))
     # A file of ours is in metres; another unit is that of another program that has edited it.
     return replace(found, metres_per_unit=metres and metres * unit)
 
@@ -153,7 +153,7 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
         OSError: the folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
-    scene = packing.flipped(packing.packable(path, gaussians))
+    scene = packing.flip_axes(packing.packable(path, gaussians))
     means, quats = scene.means, scene.quats
     cut = packing.Cut(path, "USD", len(means))
     scales, opacities, sh = packing.linear_values(cut, scene)

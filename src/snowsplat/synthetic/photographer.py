@@ -141,11 +141,11 @@ def walk(count: int, seed: int) -> list[Tensor]:
             torch.from_numpy(target),
             torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64),
         )
-        poses.append(rolled(pose, random.normal(0, 0.06)))
+        poses.append(roll(pose, random.normal(0, 0.06)))
     return poses
 
 
-def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
+def roll(cam_from_world: Tensor, angle: float) -> Tensor:
     """The camera rotated about its optical axis by ``angle`` in radians."""
     cos, sin = math.cos(angle), math.sin(angle)
     roll = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64)
@@ -155,7 +155,7 @@ def rolled(cam_from_world: Tensor, angle: float) -> Tensor:
 def photograph(
     scene: Scene, lens: CentredLens, cam_from_world: Tensor, random: np.random.Generator
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB: the photo from a pose, see `developed`."""
+    """(H, W, 3) uint8 sRGB: the photo from a pose, see `develop`."""
     world_from_cam = invert_rigid(cam_from_world).numpy()
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
     spread = 1 / (lens.focal * RAYS)
@@ -165,10 +165,10 @@ def photograph(
         # A sensor saturates: values above white are clipped before a pixel is averaged.
         seen = scene.radiance(origin, rotation @ rays, spread).clip(0, 1)
         light[rows, columns] = seen.reshape(shape).mean(axis=(2, 4)).transpose(1, 2, 0)
-    return developed(light, random)
+    return develop(light, random)
 
 
-def developed(light: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def develop(light: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """(H, W, 3) linear light -> uint8 sRGB, with the noise of a small image sensor."""
     electrons = _FULL_WELL * light
     electrons += np.sqrt(electrons + _READ_NOISE**2) * random.standard_normal(

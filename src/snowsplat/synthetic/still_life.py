@@ -42,15 +42,15 @@ def _room(random: np.random.Generator) -> list[SceneObject]:
     height = _CEILING - FLOOR
     texel = 0.005
     brick = paint.bricks(_size((y, height), texel), 22, 16, random)
-    brick = paint.paste(brick, paint.printed((180, 240), random), (0.30, 0.52), 0.16, 2)
-    brick = paint.paste(brick, paint.printed((260, 180), random), (0.68, 0.50), 0.22, -1)
+    brick = paint.paste(brick, paint.poster((180, 240), random), (0.30, 0.52), 0.16, 2)
+    brick = paint.paste(brick, paint.poster((260, 180), random), (0.68, 0.50), 0.22, -1)
     boards = paint.wood(_size((y, height), texel), 9, _OAK, random)
     for u in (0.16, 0.42, 0.76):
-        sheet = paint.printed((200, 260), random)
+        sheet = paint.poster((200, 260), random)
         boards = paint.paste(boards, sheet, (u, 0.52), 0.14, random.normal(0, 3))
     plaster = paint.plain(_size((x, height), texel), (0.72, 0.66, 0.52), random)
     for u in (0.12, 0.36, 0.62, 0.86):
-        sheet = paint.printed((240, 200), random)
+        sheet = paint.poster((240, 200), random)
         frame = np.full((232, 272, 3), random.uniform(0.1, 0.3, 3), np.float32)
         frame[16:-16, 16:-16] = sheet
         plaster = paint.paste(plaster, frame, (u, 0.50 + random.normal(0, 0.03)), 0.17, 0)
@@ -72,7 +72,7 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
     rug_colours = [(0.55, 0.20, 0.16), (0.20, 0.28, 0.42), (0.80, 0.70, 0.52), (0.25, 0.35, 0.25)]
     rug = Frustum((0, 0, FLOOR), 0.012, 1.35, 1.35)
     edge = paint.plain((256, 16), (0.5, 0.3, 0.2), random)
-    objects.append(SceneObject(rug, [edge, paint.woven((640, 640), 34, rug_colours, random), edge]))
+    objects.append(SceneObject(rug, [edge, paint.cloth((640, 640), 34, rug_colours, random), edge]))
     shelf = paint.spines(_size((1.7, 1.5), 0.004), 4, random)
     side = paint.wood(_size((0.3, 1.5), 0.005), 2, _DARK, random)
     top = paint.wood(_size((1.7, 0.3), 0.005), 2, _DARK, random)
@@ -96,7 +96,7 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
         faces = []
         for _ in range(6):
             wall = paint.wood(_size((side_length,) * 2, 0.004), 5, _PINE, random)
-            label = paint.printed((160, 120), random, lines=7)
+            label = paint.poster((160, 120), random, lines=7)
             faces.append(paint.paste(wall, label, tuple(random.uniform(0.4, 0.6, 2)), 0.55, 4))
         middle = (x, y, z + side_length / 2)
         objects.append(SceneObject(Box(middle, (side_length,) * 3, angle), faces))
@@ -112,7 +112,7 @@ def _furniture(random: np.random.Generator) -> list[SceneObject]:
 
 def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
     top = paint.wood((960, 960), 7, _OAK, random)
-    sheets = [paint.printed((210, 290), random, lines=18) for _ in range(3)]
+    sheets = [paint.poster((210, 290), random, lines=18) for _ in range(3)]
     for sheet, middle, angle in zip(
         sheets, ((0.62, 0.80), (0.14, 0.50), (0.76, 0.17)), (20.0, -75.0, 130.0), strict=True
     ):
@@ -143,14 +143,14 @@ def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
         (0.29, 0.21, 0.038, 0.75),
         (0.26, 0.19, 0.055, 0.25),
     ):
-        cover = paint.printed(_size((width, depth), 0.0015), random)
-        spine = paint.printed(_size((width, thick), 0.0015), random, lines=3)
+        cover = paint.poster(_size((width, depth), 0.0015), random)
+        spine = paint.poster(_size((width, thick), 0.0015), random, lines=3)
         pages = paint.wood(_size((depth, thick), 0.0015), 9, (0.85, 0.8, 0.68), random)
         box = Box((-0.37, 0.20, z + thick / 2), (width, depth, thick), angle)
         objects.append(SceneObject(box, [pages, pages, spine, spine, cover, cover]))
         z += thick
     for x, y, height, radius in ((-0.10, -0.42, 0.17, 0.055), (0.03, -0.50, 0.11, 0.06)):
-        label = paint.printed(_size((2 * math.pi * radius, height), 0.0012), random, lines=9)
+        label = paint.poster(_size((2 * math.pi * radius, height), 0.0012), random, lines=9)
         lid = paint.plain((64, 64), (0.6, 0.6, 0.62), random)
         can = Frustum((x, y, 0), height, radius, radius)
         objects.append(SceneObject(can, [label, lid, lid], 0.03))
@@ -159,7 +159,7 @@ def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
         (-0.29, -0.28, 0.0, 0.11, -0.2),
         (-0.35, -0.225, 0.11, 0.10, 0.9),
     ):
-        faces = [paint.printed((80, 80), random, lines=3) for _ in range(6)]
+        faces = [paint.poster((80, 80), random, lines=3) for _ in range(6)]
         objects.append(SceneObject(Box((x, y, z + side / 2), (side,) * 3, angle), faces))
 
     glaze = paint.plain((384, 192), (0.50, 0.07, 0.06), random, stains=0.4)
@@ -174,7 +174,7 @@ def _objects_on_the_table(random: np.random.Generator) -> list[SceneObject]:
             gloss=0.05,
         ),
     ]
-    mug = paint.printed(_size((0.33, 0.11), 0.0012), random, lines=6)
+    mug = paint.poster(_size((0.33, 0.11), 0.0012), random, lines=6)
     coffee = paint.plain((64, 64), (0.25, 0.15, 0.09), random)
     handle = paint.plain((128, 32), (0.25, 0.35, 0.55), random)
     objects += [

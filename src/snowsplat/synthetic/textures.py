@@ -123,7 +123,7 @@ def bricks(size: Size, rows: int, columns: int, random: np.random.Generator) -> 
     return _mix(brick, mortar, 1 - (edge - 2.0) / 1.5).clip(0, 1).astype(np.float32)
 
 
-def woven(
+def cloth(
     size: Size, stripes: int, colours: Sequence[Colour], random: np.random.Generator
 ) -> np.ndarray:
     """Cloth with horizontal stripes of random widths and colours, and small woven patterns."""
@@ -162,7 +162,7 @@ def _ink(random: np.random.Generator, inks: Sequence[Ink]) -> Ink:
     return min(255, int(red * change)), min(255, int(green * change)), min(255, int(blue * change))
 
 
-def printed(size: Size, random: np.random.Generator, lines: int = 12) -> np.ndarray:
+def poster(size: Size, random: np.random.Generator, lines: int = 12) -> np.ndarray:
     """A poster, cover or label: coloured shapes, a title and lines of small symbols."""
     scale = 2  # drawn at twice the size, then reduced for smooth edges
     width, height = size[0] * scale, size[1] * scale

@@ -74,7 +74,7 @@ def write_image_report(path: Path, fitted: Fitted) -> None:
     write_text(path, page)
 
 
-def shrunk(gaussians: ImageGaussians, image: Tensor) -> ImageGaussians:
+def shrink(gaussians: ImageGaussians, image: Tensor) -> ImageGaussians:
     """The Gaussians as small opaque ellipses, with the colours of the image (H, W, 3) there."""
     rows = gaussians.rows.clone()
     rows[:, LOG_SIGMAS] += torch.tensor(_SHRUNK).log()
@@ -94,7 +94,7 @@ def _pictures(fitted: Fitted) -> list[tuple[str, Markup, Message]]:
     gaussians, photo = fitted.gaussians, Image.fromarray(fitted.photo.numpy())
     scale = max(1, -(-_LEAST_SIDE // max(photo.size)))
     image = gaussians.render().clamp(0, 1)
-    large, ellipses = gaussians.render(scale), shrunk(gaussians, image).render(scale)
+    large, ellipses = gaussians.render(scale), shrink(gaussians, image).render(scale)
     return [
         ("photo", picture(photo, "photo", 95), message("The photo")),
         ("", picture(_pixels(large), "the Gaussians", 92), message("The Gaussians")),
