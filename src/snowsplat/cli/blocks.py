@@ -79,13 +79,16 @@ class Blocks(Command):
         for flag in flags_of(Blocks):
             owners = [action for action, fields in _FIELDS.items() if flag.path[0] in fields]
             if flag.key in self.given and owners and self.action not in owners:
-                problem = f"belongs to blocks {owners[0]}, not to blocks {self.action}"
                 raise UserError(
-                    "{spellings} {problem}", spellings=flag.spellings[0], problem=problem
+                    "{flag} belongs to blocks {owner}, not to blocks {action}",
+                    flag=flag.spellings[0],
+                    owner=owners[0],
+                    action=self.action,
                 )
         if self.path is None:
-            what = "a dataset" if self.action == "plan" else "the folder of a plan"
-            raise UserError("blocks {action} needs {what}", action=self.action, what=what)
+            if self.action == "plan":
+                raise UserError("blocks plan needs a dataset")
+            raise UserError("blocks {action} needs the folder of a plan", action=self.action)
         actions = {"plan": self._plan, "train": self._train, "merge": self._merge}
         return actions[self.action](self.path)
 
@@ -96,7 +99,7 @@ class Blocks(Command):
 
         plan = plan_blocks(dataset, self.output, self.planned)
         for block in plan.blocks:
-            limit = f"{block.max_gaussians:,}" if block.max_gaussians else "no limit"
+            limit = f"{block.max_gaussians:,}" if block.max_gaussians else message("no limit")
             print(
                 message(
                     "{name}: {views} photos, {points:,} points, at most {limit} Gaussians",
@@ -108,7 +111,7 @@ class Blocks(Command):
             )
         if distance := plan.settings.get("sky_distance"):
             print(message("distance of the sky in all of them: {distance:g}", distance=distance))
-        print(next_step("train them with", "blocks", "train", self.output))
+        print(next_step(message("train them with"), "blocks", "train", self.output))
         return None
 
     def _train(self, folder: Path) -> Exit | None:
@@ -128,7 +131,7 @@ class Blocks(Command):
             except TrainingStopped as stopped:
                 print(message("{stopped}; continue with the same command", stopped=stopped))
                 return Exit(130)
-        print(next_step("when all blocks are trained", "blocks", "merge", folder))
+        print(next_step(message("when all blocks are trained"), "blocks", "merge", folder))
         return None
 
     def _merge(self, folder: Path) -> Exit | None:

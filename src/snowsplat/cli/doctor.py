@@ -36,13 +36,10 @@ class Doctor(JsonCommand):
         problems = [finding for finding in findings if finding.problem]
         names = ", ".join(finding.name for finding in problems)
         if not self.json:
-            missing = f"see above: {names}" if problems else None
-            print(
-                message(
-                    "\n{missing}",
-                    missing=missing or "nothing is missing; to try it: snowsplat demo",
-                )
-            )
+            if problems:
+                print(message("\nsee above: {names}", names=names))
+            else:
+                print(message("\nnothing is missing; to try it: snowsplat demo"))
         facts: dict[str, Any] = {finding.name: finding.values for finding in findings}
         facts["problems"] = [f"{finding.name}: {finding.text}" for finding in problems]
         return Exit(int(any(finding.essential for finding in problems)), facts)

@@ -84,13 +84,22 @@ class Evaluate(JsonCommand):
         )
         show(evaluation, "mean")
         if network is None:
-            print("LPIPS was not measured; to measure it: --lpips vgg")
+            print(message("LPIPS was not measured; to measure it: --lpips vgg"))
         where = scene.folder.path / "metrics.json"
-        which = f"{len(views)} {self.split} views of {evaluation.size}"
-        step = f"iteration {scene.iteration}, " if scene.iteration else ""  # a file has none
-        print(message("{step}{which}: {where}", step=step, which=which, where=where))
+        which = message(
+            "{count} {split} views of {size}: {where}",
+            count=len(views),
+            split=self.split,
+            size=evaluation.size,
+            where=where,
+        )
+        if scene.iteration:  # a file has none
+            which = message("iteration {step}, {which}", step=scene.iteration, which=which)
+        print(which)
         out = chosen.path()
         photos = [] if chosen.dataset is None else ["--dataset", chosen.dataset]
-        print(next_step("to see the renders", "render", out, *photos, "--split", self.split))
+        print(
+            next_step(message("to see the renders"), "render", out, *photos, "--split", self.split)
+        )
         about = {"folder": out, "iteration": scene.iteration, "split": self.split}
         return about | {"size": evaluation.size, **evaluation.as_json()}

@@ -71,8 +71,8 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
                 )
     if extra := re.search(r"Unrecognized options: (.*)", printed):
         usage = SUBCOMMANDS[subcommand].usage
-        names = printable(extra[1].strip(_FRAME))
-        what = message("{names}: too many names", names=names)
+        extras = printable(extra[1].strip(_FRAME))
+        what = message("{names}: too many names", names=extras)
         if recipe := next((each for each in arguments if each in RECIPES), None):
             what = message("{what}; use --recipe {recipe}", what=what, recipe=recipe)
         return Message(f"{what}; snowsplat {subcommand} {usage}")

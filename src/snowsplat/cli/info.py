@@ -10,6 +10,7 @@ from typing import Any
 from snowsplat.cli.command import JsonCommand
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.util.byte_size import format_bytes
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import printable
 from snowsplat.util.settings import needed
 
@@ -48,21 +49,22 @@ class Info(JsonCommand):
         facts = describe(self.path)
         if not self.json:
             _print(facts)
-            print("\n".join(_next(facts, self.path)))
+            for line in _next(facts, self.path):
+                print(line)
         return facts
 
 
-def _next(facts: dict[str, Any], path: Path) -> list[str]:
+def _next(facts: dict[str, Any], path: Path) -> list[Message]:
     """What to do with what was described."""
     kind = facts["kind"]
     if facts.get("scenes") == []:
-        return [next_step("to continue", "train", "-o", path, "--resume")]
+        return [next_step(message("to continue"), "train", "-o", path, "--resume")]
     if kind in ("scene", "output folder"):
         return [see_and_share(path)]
     if kind in ("photos", "video"):
-        return [next_step("to make a scene", "make", path)]
+        return [next_step(message("to make a scene"), "make", path)]
     if kind == "dataset":
-        return [next_step("to make a scene", "train", path, "-o", "OUT", "--eval")]
+        return [next_step(message("to make a scene"), "train", path, "-o", "OUT", "--eval")]
     return []
 
 

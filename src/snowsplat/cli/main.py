@@ -27,7 +27,7 @@ from snowsplat.cli.terminal_text import accept_all_characters
 from snowsplat.util.errors import SettingError, UserError, message_of
 from snowsplat.util.flags import with_flags
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.messages import as_message, language_of_environment, message, use
+from snowsplat.util.messages import Message, as_message, language_of_environment, message, use
 from snowsplat.util.safe_json import printable
 
 if TYPE_CHECKING:
@@ -138,17 +138,21 @@ def _with_flags(message: str, arguments: Sequence[str]) -> str:
     return with_flags(message, load_subcommand(name) if name in SUBCOMMANDS else None)
 
 
-def _unknown_subcommand(name: str) -> str:
+def _unknown_subcommand(name: str) -> Message:
     similar = difflib.get_close_matches(name, [*SUBCOMMANDS, *_FORMER_NAMES], 1)
-    hint = advice(name)
+    hint: Message | str | None = advice(name)
     if hint is None and os.path.exists(name):
-        make, info = next_step("to make a scene", "make", name), next_step("or", "info", name)
-        hint = f"{make}; {info}"
+        make = next_step(message("to make a scene"), "make", name)
+        hint = message("{make}; {info}", make=make, info=next_step(message("or"), "info", name))
     elif hint is None and similar:
-        hint = f"did you mean {_FORMER_NAMES.get(similar[0], similar[0])}?"
+        hint = message("did you mean {name}?", name=_FORMER_NAMES.get(similar[0], similar[0]))
     elif hint is None:
-        hint = f"choose from {', '.join(SUBCOMMANDS)}"
-    return f"{name}: unknown subcommand; {hint} (snowsplat --help describes all of them)"
+        hint = message("choose from {names}", names=[*SUBCOMMANDS])
+    return message(
+        "{name}: unknown subcommand; {hint} (snowsplat --help describes all of them)",
+        name=name,
+        hint=hint,
+    )
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:

@@ -19,7 +19,7 @@ from snowsplat.pipeline.stage_lines import photos_of_last_part
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.duration import duration
 from snowsplat.util.flags import command_line, with_flags, words
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.settings import argument, group, setting, switch
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Make(JsonCommand):
                 )
                 return Exit(130)
             print_summary(result)
-            print("\n" + see_and_share(result.project.path), flush=True)
+            print("\n" + str(see_and_share(result.project.path)), flush=True)
             if page is not None:
                 self._show(result, page)
         return result.as_json()
@@ -119,43 +119,52 @@ class Make(JsonCommand):
 
 def print_summary(made: MakeResult) -> None:
     """Print the files of a finished scene, its quality, and the verdict."""
-    poses = made.dataset_report or f"those of {made.dataset.path} are used"
-    print(
-        message(
-            "\nThe scene, for any viewer:  {scene} ({st_size})\n{what:27} {poses}\nReport on the "
-            "training:     {report}\n{quality}Time:                       {seconds}",
-            scene=made.scene,
-            st_size=format_bytes(made.scene.stat().st_size),
-            what="Report on camera poses:" if made.dataset_report else "Camera poses:",
-            poses=poses,
-            report=made.training.report,
-            quality=_quality(made),
-            seconds=duration(made.seconds),
-        )
-    )
+    size = format_bytes(made.scene.stat().st_size)
+    print()
+    print(message("The scene, for any viewer:  {scene} ({size})", scene=made.scene, size=size))
+    if made.dataset_report:
+        print(message("Report on camera poses:     {report}", report=made.dataset_report))
+    else:
+        print(message("Camera poses:               those of {path}", path=made.dataset.path))
+    print(message("Report on the training:     {report}", report=made.training.report))
+    for line in _quality(made):
+        print(line)
+    print(message("Time:                       {time}", time=duration(made.seconds)))
     if made.verdict is not None:
         print("\n" + "\n".join(made.verdict.lines(message("the scene"))))
     sys.stdout.flush()
 
 
-def _quality(made: MakeResult) -> str:
-    """The lines about the held-out photos; "" if there are none."""
+def _quality(made: MakeResult) -> list[Message]:
+    """The lines about the held-out photos; none if there are none."""
     known = made.figures
     if known.psnr is None:
-        return ""
-    aligned = f"colour-aligned PSNR {known.psnr_aligned:.2f} dB"
-    figures = f"PSNR {known.psnr:.2f} dB, {aligned}, SSIM {known.ssim:.3f}"
+        return []
+    values = {"psnr": known.psnr, "aligned": known.psnr_aligned, "ssim": known.ssim}
+    figures = message(
+        "PSNR {psnr:.2f} dB, colour-aligned PSNR {aligned:.2f} dB, SSIM {ssim:.3f}", **values
+    )
     if known.exposures:  # the scene has the mean exposure of the photos, not that of each of them
-        figures = f"{aligned} (gains of exposure are learnt), SSIM {known.ssim:.3f}"
-    photos = "1 photo" if known.views == 1 else f"{known.views} photos"
+        figures = message(
+            "colour-aligned PSNR {aligned:.2f} dB (gains of exposure are learnt), SSIM {ssim:.3f}",
+            **values,
+        )
     lines = [
-        f"Rendered test views:        {made.renders}",
-        f" and held-out photos:       {made.photos}",
-        f"Quality of these views:     {figures} ({photos} of {known.size})",
+        message("Rendered test views:        {folder}", folder=made.renders),
+        message(" and held-out photos:       {folder}", folder=made.photos),
+        message(
+            "Quality of these views:     {figures} ({photos} of {size})",
+            figures=figures,
+            photos=plural("{n} photo", "{n} photos", n=known.views),
+            size=known.size,
+        ),
     ]
     if made.last_part.steps:
+        used = photos_of_last_part(made.last_part.photos, made.last_part.left_out)
         lines.append(
-            "                            before the last part, which has used "
-            + photos_of_last_part(made.last_part.photos, made.last_part.left_out)
+            message(
+                "                            before the last part, which has used {photos}",
+                photos=used,
+            )
         )
-    return "\n".join(lines) + "\n"
+    return lines

@@ -8,6 +8,7 @@ from typing import Any
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.surface import SurfaceCommand
 from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.util.messages import message
 from snowsplat.util.settings import group
 
 
@@ -39,5 +40,7 @@ class Mesh(SurfaceCommand):
         count = f"{len(surface.mesh.faces):,} of {surface.found:,} triangles"
         points = self.output.with_suffix(".ply")
         return self.reported(
-            surface, count, next_step("for points instead", "points", self.scene, "-o", points)
+            surface,
+            count,
+            next_step(message("for points instead"), "points", self.scene, "-o", points),
         )

@@ -40,7 +40,7 @@ class TerminalObserver(Observer):
         self._stages.hide()
         self.steps_end()
 
-    def note(self, line: Message | str) -> None:
+    def note(self, line: Message) -> None:
         if self._steps is not None:
             self._steps.say(str(line))
         else:
@@ -51,7 +51,7 @@ class TerminalObserver(Observer):
 
     def end(self, stage: str, outcome: Outcome) -> None:
         line, *details = described(stage, outcome.result)
-        self._stages.end(line, outcome.seconds, outcome.again)
+        self._stages.end(str(line), outcome.seconds, outcome.again)
         if not outcome.again:
             for detail in details:
                 self._stages.say(f"          {detail}")
@@ -75,7 +75,9 @@ class TerminalObserver(Observer):
 
     def trained(self, result: TrainResult) -> None:
         steps = result.step - result.first_step
-        count = f"{steps} more steps" if result.first_step else f"{steps} steps"
+        count = message("{steps} more steps", steps=steps)
+        if not result.first_step:
+            count = message("{steps} steps", steps=steps)
         print(
             message(
                 "{scene}: {gaussians:,} Gaussians, {st_size}, {count} in {seconds}, {memory}",

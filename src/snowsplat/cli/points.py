@@ -8,6 +8,7 @@ from typing import Any
 from snowsplat.cli.next_steps import next_step
 from snowsplat.cli.surface import SurfaceCommand
 from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.util.messages import message
 from snowsplat.util.settings import group
 
 
@@ -35,5 +36,7 @@ class Points(SurfaceCommand):
         count = f"{len(surface.mesh.vertices):,} points"
         mesh = self.output.with_suffix(".glb")
         return self.reported(
-            surface, count, next_step("for triangles instead", "mesh", self.scene, "-o", mesh)
+            surface,
+            count,
+            next_step(message("for triangles instead"), "mesh", self.scene, "-o", mesh),
         )

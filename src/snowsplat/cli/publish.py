@@ -73,7 +73,7 @@ class Publish(JsonCommand):
                 bytes=format_bytes(result.bytes),
             )
         )
-        look = next_step("to look at it", "view", result.folder)
+        look = next_step(message("to look at it"), "view", result.folder)
         print(
             message(
                 "{look}; to share it: copy the folder to a web host, and send the address",

@@ -95,7 +95,7 @@ class Render(JsonCommand):
             )
         for folder, count in rendered.items():
             print(message("{folder}: {count} images", folder=folder, count=count))
-        print(next_step("for a video", "render", self.scene.path(), "--path", "ellipse"))
+        print(next_step(message("for a video"), "render", self.scene.path(), "--path", "ellipse"))
         return {"images": rendered}
 
     def _render_video(self) -> dict[str, Any]:

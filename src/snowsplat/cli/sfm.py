@@ -85,7 +85,7 @@ class Sfm(JsonCommand):
         verdict = Verdict.from_json(outcomes["report"].result["verdict"])
         for line in [] if verdict is None else verdict.lines(message("the photos")):
             print(line)
-        print(next_step("train it with", "train", folder, "-o", "OUT", "--eval"))
+        print(next_step(message("train it with"), "train", folder, "-o", "OUT", "--eval"))
         results = {stage: outcome.result for stage, outcome in outcomes.items()}
         return {"dataset": folder, **results}
 

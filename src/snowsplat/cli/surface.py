@@ -12,7 +12,7 @@ from snowsplat.cli.observer import TerminalObserver
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options import common
 from snowsplat.pipeline.options.surface import MeshOptions
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.settings import group, needed
 
 if TYPE_CHECKING:
@@ -50,20 +50,21 @@ class SurfaceCommand(JsonCommand):
                 observer,
             )
 
-    def reported(self, surface: Surface, what: str, hint: str) -> dict[str, Any]:
+    def reported(self, surface: Surface, what: str, hint: Message) -> dict[str, Any]:
         """Print the lines of the result; returns it for --json."""
-        voxels = f"with voxels of {surface.voxel:.3g}"
         print(
             message(
-                "{output}: {what} from {photos} photos, {voxels}",
+                "{output}: {what} from {photos} photos, with voxels of {voxel:.3g}",
                 output=self.output,
                 what=what,
                 photos=surface.photos,
-                voxels=voxels,
+                voxel=surface.voxel,
             )
         )
         if surface.closer:
-            print("finer voxels do not fit into memory; a smaller --far makes room for them")
+            print(
+                message("finer voxels do not fit into memory; a smaller --far makes room for them")
+            )
         print(hint)
         told = {name: value for name, value in vars(surface).items() if name != "mesh"}
         mesh = surface.mesh

@@ -155,7 +155,7 @@ class Train(JsonCommand):
                 print(with_flags(str(stopped), Train))
                 if stopped.scene is None:
                     raise
-                print(next_step("resume with", "train", "-o", self.output, "--resume"))
+                print(next_step(message("resume with"), "train", "-o", self.output, "--resume"))
                 return Exit(130)
             if result.verdict is not None:
                 print("\n".join(result.verdict.lines(message("the scene"))), flush=True)

@@ -55,12 +55,9 @@ class View(Command):
             suppress(KeyboardInterrupt),
             self.server.open(static_app(scene.files), scene.headers) as server,
         ):
-            site = scene.gaussians is None
-            print(
-                message(
-                    "{file}: {value}",
-                    file=scene.file,
-                    value="a web site" if site else f"{scene.gaussians:,} Gaussians",
-                )
-            )
+            if scene.gaussians is None:
+                print(message("{file}: a web site", file=scene.file))
+            else:
+                count = scene.gaussians
+                print(message("{file}: {count:,} Gaussians", file=scene.file, count=count))
             self.server.serve(server)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from snowsplat.data.dataset import PosedImage
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import message
 from snowsplat.util.natural_order import natural_key
 from snowsplat.util.safe_json import is_file, quoted
 
@@ -73,9 +74,9 @@ def _names_in_list(
     for line in filter(None, (line.strip() for line in lines)):
         matches = {line} if line in names else known.get(line, set())
         if len({together[name] for name in matches}) != 1:
-            problem = (
-                "is the name of several images" if matches else "is not an image of the dataset"
-            )
+            problem = message("is the name of several images")
+            if not matches:
+                problem = message("is not an image of the dataset")
             raise UserError(
                 "the list of test images: {line} {problem}", line=quoted(line), problem=problem
             )

@@ -24,6 +24,7 @@ from snowsplat.formats.ply import is_ply, is_scene, read_ply
 from snowsplat.formats.sog import read_sog
 from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import parse_json, quoted
 
@@ -110,7 +111,7 @@ def _single(path: Path, members: ZipMembers, names: Sequence[str]) -> GaussianAr
     raise UserError(
         "{path}: a zip file without a scene; it contains {some}",
         path=path,
-        some=_some(names) or "nothing",
+        some=_some(names) or message("nothing"),
     )
 
 

@@ -33,7 +33,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity, rotation_from_quat
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import make_parent
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.viewer.web.html import write_html
 from snowsplat.viewer.web.panel import Description, made_on
 
@@ -172,11 +172,13 @@ def convert(
     return format
 
 
-def _noted(format: Format, target: Path) -> str:
+def _noted(format: Format, target: Path) -> Message:
     """Where the origin of a written scene is stored."""
     if format.read is None:
-        return "which the file cannot store"
-    return "which is noted in the file" if format.stores_origin else f"see {origin_file(target)}"
+        return message("which the file cannot store")
+    if format.stores_origin:
+        return message("which is noted in the file")
+    return message("see {file}", file=origin_file(target))
 
 
 def _decimation(

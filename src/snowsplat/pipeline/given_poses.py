@@ -15,7 +15,7 @@ from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 
 # With poses of a smaller share of the photos, a scene of all of them is not possible.
 _LEAST_SHARE = 0.5
@@ -33,7 +33,7 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
         without = _without_pose(sources.photos, views)
         reason = _why_not(dataset, len(without), len(sources.photos))
     except UserError as error:
-        reason = str(error)
+        reason = error.message
     if reason:
         observer.note(
             message(
@@ -43,11 +43,14 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
             )
         )
         return None
-    line = f"{name}: its camera poses are used ({dataset.description})"
+    line = message(
+        "{name}: its camera poses are used ({dataset})", name=name, dataset=dataset.description
+    )
     folders = [str(photo.path.parent) for photo in sources.photos]
     photos = os.path.commonpath(folders or [settings.path])
     if Path(photos) != Path(settings.path):  # there are no poses in this folder
-        line += f"; to estimate them again: snowsplat make {shown(photos)}"
+        again = "{line}; to estimate them again: snowsplat make {photos}"
+        line = message(again, line=line, photos=shown(photos))
     observer.note(line)
     if without:
         observer.note(
@@ -63,13 +66,13 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     return dataset
 
 
-def _why_not(dataset: Dataset, without: int, photos: int) -> str | None:
+def _why_not(dataset: Dataset, without: int, photos: int) -> Message | None:
     """The reason why the poses are not used; None if they are."""
     impossible = [finding.text for finding in judge(dataset) if finding.impossible]
     if impossible:
-        return impossible[0].rsplit(";", 1)[0]  # without the advice
+        return Message(impossible[0].rsplit(";", 1)[0])  # without the advice
     if without > (1 - _LEAST_SHARE) * photos:
-        return f"{without} of {photos} photos have no pose"
+        return message("{n} of {photos} photos have no pose", n=without, photos=photos)
     return None
 
 

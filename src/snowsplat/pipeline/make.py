@@ -161,7 +161,7 @@ def _check_inputs(out: Path, sources: Sources, stages: Stages, overwrite: bool) 
     # `make_dataset` compares the photos themselves, whose folder may have been renamed.
     compared = sources.posed is None and (out / DATASET).is_dir()
     if before != inputs and not (compared or overwrite):
-        what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
+        what = before if isinstance(before, list) else message("other inputs")
         raise UserError(
             "{out}: contains a scene made from {what}; use another folder, or set `overwrite`",
             out=out,

@@ -26,6 +26,7 @@ from snowsplat.pipeline.quality import PRESETS, Quality
 from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.cost import Photos, Speed, predicted_seconds
 from snowsplat.util.duration import duration
+from snowsplat.util.messages import Message, message
 
 #: The share of the time that everything before the training may take.
 _SHARE = 0.45
@@ -89,15 +90,19 @@ def _thinned(photos: Photos, count: int) -> Photos:
     return replace(photos, stills=count - frames, frames=frames)
 
 
-def described(plan: MakePlan, photos: Photos, seconds: float) -> str:
+def described(plan: MakePlan, photos: Photos, seconds: float) -> Message:
     """The plan in one line, such as "3 min 0 s: 60 of 300 photos, 1000 pixels, draft effort"."""
     parts = []
     if photos.stills:
-        few = "" if plan.photos is None else f"{plan.photos} of "
-        parts.append(f"{few}{photos.stills} photos")
+        used = photos.stills if plan.photos is None else plan.photos
+        parts.append(message("{used} of {all} photos", used=used, all=photos.stills))
     if photos.frames:
-        few = "" if plan.frames is None else f"{plan.frames * photos.videos} of "
-        parts.append(f"{few}{photos.frames} frames")
-    size = min(plan.size, max(photos.longest, photos.video))
-    what = " and ".join(parts)
-    return f"{duration(seconds)}: {what}, {size} pixels, {plan.quality} effort"
+        used = photos.frames if plan.frames is None else plan.frames * photos.videos
+        parts.append(message("{used} of {all} frames", used=used, all=photos.frames))
+    return message(
+        "{time}: {photos}, {size} pixels, {quality} effort",
+        time=duration(seconds),
+        photos=parts,
+        size=min(plan.size, max(photos.longest, photos.video)),
+        quality=plan.quality,
+    )

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 from snowsplat.sfm.progress import Report, silent
+from snowsplat.util.messages import Message
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,7 +36,7 @@ class Observer:
     training also reports its steps.
     """
 
-    def note(self, line: Message | str) -> None:
+    def note(self, line: Message) -> None:
         """A line of information for the user."""
 
     def begin(self, stage: str) -> Report:

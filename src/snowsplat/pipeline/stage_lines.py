@@ -2,104 +2,144 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
+
+from snowsplat.util.messages import Message, as_message, message, plural
 
 _NAMED = 5  # photos that are listed one by one
 
 
-def described(stage: str, result: dict[str, Any]) -> list[str]:
+def described(stage: str, result: dict[str, Any]) -> list[Message]:
     """One line about the result of a stage, and lines of details."""
     return _LINES[stage](result)
 
 
-def _photos(gathered: dict[str, Any]) -> list[str]:
+def _photos(gathered: dict[str, Any]) -> list[Message]:
     photos, left_out = gathered["photos"], gathered["left_out"]
-    masks = sum(bool(photo.get("mask")) for photo in photos)
-    line = f"{len(photos)} photos" + (f" ({masks} with masks)" if masks else "")
+    line = message("{photos} photos", photos=len(photos))
+    if masks := sum(bool(photo.get("mask")) for photo in photos):
+        line = message("{photos} ({masks} with masks)", photos=line, masks=masks)
     if left_out:
-        line += f", {len(left_out)} skipped"
-    notes = gathered.get("notes", [])
-    return [line, *notes, *_listed([f"{each['photo']}: {each['reason']}" for each in left_out])]
+        line = message("{photos}, {skipped} skipped", photos=line, skipped=len(left_out))
+    notes = map(as_message, gathered.get("notes", []))
+    return [line, *notes, *_listed((each["photo"], each["reason"]) for each in left_out)]
 
 
-def _poses(sfm: dict[str, Any]) -> list[str]:
+def _poses(sfm: dict[str, Any]) -> list[Message]:
     lost = sfm["unregistered"]
     placed = len(sfm["registered"])
-    line = (
-        f"{placed} of {placed + len(lost)} photos placed, {sfm['points']:,} points, "
-        f"reprojection error {sfm['reprojection_error']:.2f} px"
+    line = message(
+        "{placed} of {all} photos placed, {points:,} points, reprojection error {error:.2f} px",
+        placed=placed,
+        all=placed + len(lost),
+        points=sfm["points"],
+        error=sfm["reprojection_error"],
     )
     details = []
     if len(sfm["sub_models"]) > 1:
-        sizes = ", ".join(map(str, sfm["sub_models"]))
         details.append(
-            f"the photos form {len(sfm['sub_models'])} groups without common points ({sizes} "
-            "photos); the largest group is used"
+            message(
+                "the photos form {groups} groups without common points ({sizes} photos); the "
+                "largest group is used",
+                groups=len(sfm["sub_models"]),
+                sizes=sfm["sub_models"],
+            )
         )
     if sfm.get("zooms"):
-        details.append(f"the photos have {sfm['zooms']}: each group of them has its own lens")
+        zooms = sfm["zooms"]
+        details.append(
+            message("the photos have {zooms}: each group of them has its own lens", zooms=zooms)
+        )
     if sfm.get("fisheye"):
-        details.append(sfm["fisheye"])
+        details.append(as_message(sfm["fisheye"]))
     if len(sfm["attempts"]) > 1:
-        details.append("attempts: " + "; ".join(sfm["attempts"]))
-    return [line, *details, *_listed([f"{name}: {why}" for name, why in lost.items()])]
+        details.append(message("attempts: {attempts}", attempts="; ".join(sfm["attempts"])))
+    return [line, *details, *_listed(lost.items())]
 
 
-def _images(undistorted: dict[str, Any]) -> list[str]:
+def _images(undistorted: dict[str, Any]) -> list[Message]:
     sizes = sorted(undistorted["sizes"], key=lambda size: -size[2])
     width, height, _ = sizes[0]
-    others = f" and {len(sizes) - 1} other sizes" if len(sizes) > 1 else ""
-    line = f"{undistorted['images']} images of {width}x{height}{others}"
-    line += ", lens distortion removed" if undistorted["resampled"] else ""
-    return [line + (f", {undistorted['masks']} masks" if undistorted["masks"] else "")]
+    count = undistorted["images"]
+    line = message("{n} images of {width}x{height}", n=count, width=width, height=height)
+    if len(sizes) > 1:
+        line = message("{images} and {n} other sizes", images=line, n=len(sizes) - 1)
+    if undistorted["resampled"]:
+        line = message("{images}, lens distortion removed", images=line)
+    if undistorted["masks"]:
+        line = message("{images}, {masks} masks", images=line, masks=undistorted["masks"])
+    return [line]
 
 
-def _scene(trained: dict[str, Any]) -> list[str]:
-    known = trained["psnr"] is not None
-    quality = f", PSNR {trained['psnr']:.2f} dB at {trained['size']}" if known else ""
-    return [f"{trained['iteration']} steps{quality}"]
+def _scene(trained: dict[str, Any]) -> list[Message]:
+    steps = message("{steps} steps", steps=trained["iteration"])
+    if trained["psnr"] is None:
+        return [steps]
+    quality = "{steps}, PSNR {psnr:.2f} dB at {size}"
+    return [message(quality, steps=steps, psnr=trained["psnr"], size=trained["size"])]
 
 
-def _all(trained: dict[str, Any]) -> list[str]:
+def _all(trained: dict[str, Any]) -> list[Message]:
     if not trained["steps"]:
-        return [f"no last part with the held-out photos: {trained['why_not']}"]
+        why = as_message(trained["why_not"])
+        return [message("no last part with the held-out photos: {why}", why=why)]
     photos = photos_of_last_part(trained["photos"], trained.get("left_out", 0))
-    return [f"{trained['steps']} more steps with {photos}; the PSNR is that of the scene before"]
+    return [
+        message(
+            "{steps} more steps with {photos}; the PSNR is that of the scene before",
+            steps=trained["steps"],
+            photos=photos,
+        )
+    ]
 
 
-def photos_of_last_part(used: int, left_out: int) -> str:
+def photos_of_last_part(used: int, left_out: int) -> Message:
     """The photos of the last part of the training; photos that it leaves out are not explained."""
     if not left_out:
-        return f"all {used} photos"
-    others = "the other" if left_out == 1 else "the others"
-    return f"{used} of {used + left_out} photos (the scene does not explain {others})"
+        return message("all {used} photos", used=used)
+    return plural(
+        "{used} of {all} photos (the scene does not explain the other)",
+        "{used} of {all} photos (the scene does not explain the others)",
+        n=left_out,
+        used=used,
+        all=used + left_out,
+    )
 
 
-def _video(written: dict[str, Any]) -> list[str]:
-    files = " and ".join(written["files"])
+def _video(written: dict[str, Any]) -> list[Message]:
     width, height = written["size"]
-    return [f"{files}: {written['frames']} frames {width}x{height}"]
+    return [
+        message(
+            "{files}: {frames} frames {width}x{height}",
+            files=written["files"],
+            frames=written["frames"],
+            width=width,
+            height=height,
+        )
+    ]
 
 
-def _levels(written: dict[str, Any]) -> list[str]:
+def _levels(written: dict[str, Any]) -> list[Message]:
     counts = " > ".join(f"{count:,}" for count in written["gaussians"])
-    return [f"{counts} Gaussians, {written['bytes'] / 1e6:,.1f} MB"]
+    return [message("{counts} Gaussians, {mb:,.1f} MB", counts=counts, mb=written["bytes"] / 1e6)]
 
 
-def _listed(lines: list[str]) -> list[str]:
-    more = len(lines) - _NAMED
-    return lines[:_NAMED] + ([f"and {more} more, see dataset_report.html"] if more > 0 else [])
+def _listed(photos: Iterable[tuple[str, Any]]) -> list[Message]:
+    lines = [message("{photo}: {why}", photo=name, why=as_message(why)) for name, why in photos]
+    if (more := len(lines) - _NAMED) > 0:
+        lines[_NAMED:] = [message("and {more} more, see dataset_report.html", more=more)]
+    return lines
 
 
-_LINES: dict[str, Callable[[dict[str, Any]], list[str]]] = {
-    "demo": lambda taken: [f"{taken['photos']} photos of a synthetic scene"],
+_LINES: dict[str, Callable[[dict[str, Any]], list[Message]]] = {
+    "demo": lambda taken: [message("{n} photos of a synthetic scene", n=taken["photos"])],
     "photos": _photos,
     "poses": _poses,
     "images": _images,
-    "report": lambda written: [written["file"]],
+    "report": lambda written: [Message(written["file"])],
     "scene": _scene,
-    "pictures": lambda rendered: ["test views rendered"],
+    "pictures": lambda rendered: [message("test views rendered")],
     "all": _all,
     "video": _video,
     "levels": _levels,

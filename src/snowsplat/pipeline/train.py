@@ -42,7 +42,7 @@ from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json, config_to_json
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.process_memory import reset_peak, resident_bytes
 from snowsplat.util.run_lock import one_run
 
@@ -307,11 +307,11 @@ class _Job:
         )
         most = _BYTES_IN_FILE * (memory.plan.limit or len(trainer.gaussians))
         if (free := shutil.disk_usage(self.out.path).free) < most:
-            what = f"only {format_bytes(free)} are free on the disk"
             self.observer.note(
                 message(
-                    "{what}, and the scene may need {most}: free some space",
-                    what=what,
+                    "only {free} are free on the disk, and the scene may need {most}: free some "
+                    "space",
+                    free=format_bytes(free),
                     most=format_bytes(most),
                 )
             )
@@ -348,7 +348,7 @@ class _Job:
                 path=out.path,
             )
         if out.scenes() or checkpoint.exists(out.checkpoints):
-            what = "a scene" if out.scenes() else "checkpoints"
+            what = message("a scene") if out.scenes() else message("checkpoints")
             raise UserError(
                 "{path}: contains {what} but no complete checkpoint to resume; use `overwrite` "
                 "instead of `resume` to start from step 0",
@@ -420,12 +420,20 @@ def _gaussians_in(start: Checkpoint) -> int:
     return 0 if means is None else means.numel() // 3
 
 
-def _described(dataset: Dataset) -> str:
+def _described(dataset: Dataset) -> Message:
     camera = dataset.train[0].camera
-    points = "no points" if dataset.points is None else f"{len(dataset.points):,} points"
-    masks = sum(view.mask is not None for view in dataset.train)
-    with_masks = f" ({masks} with masks)" if masks else ""
-    return (
-        f"{dataset.description}: {len(dataset.train)} photos to train on{with_masks}, "
-        f"{len(dataset.test)} held out, {camera.width}x{camera.height}, {points}"
+    points = message("no points")
+    if dataset.points is not None:
+        points = message("{count:,} points", count=len(dataset.points))
+    photos = message("{count} photos to train on", count=len(dataset.train))
+    if masks := sum(view.mask is not None for view in dataset.train):
+        photos = message("{photos} ({masks} with masks)", photos=photos, masks=masks)
+    return message(
+        "{dataset}: {photos}, {held_out} held out, {width}x{height}, {points}",
+        dataset=dataset.description,
+        photos=photos,
+        held_out=len(dataset.test),
+        width=camera.width,
+        height=camera.height,
+        points=points,
     )

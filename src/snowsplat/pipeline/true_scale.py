@@ -13,7 +13,7 @@ from snowsplat.project.project import Project
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.length import metres_of
 from snowsplat.util.errors import SettingError
-from snowsplat.util.messages import as_message
+from snowsplat.util.messages import Message, as_message, message
 from snowsplat.util.safe_json import quoted
 
 _EXAMPLE = "0,0.5,2 for a point, or the name of a photo"
@@ -110,10 +110,14 @@ def _photo(name: str, photos: dict[str, np.ndarray]) -> np.ndarray:
     return found
 
 
-def compared(metres: float, before: float | None) -> str:
+def compared(metres: float, before: float | None) -> Message:
     """A line about the scale that a scene gets, beside the one that it had."""
-    line = f"true scale: 1 unit was {metres:.6g} m; 1 unit of the written scene is 1 m"
+    line = message(
+        "true scale: 1 unit was {metres:.6g} m; 1 unit of the written scene is 1 m", metres=metres
+    )
     if before is None:
         return line
     percent = 100 * abs(math.expm1(math.log(metres / before)))
-    return f"{line}; {percent:.2g}% {'more' if metres > before else 'less'} than it said before"
+    if metres > before:
+        return message("{line}; {percent:.2g}% more than before", line=line, percent=percent)
+    return message("{line}; {percent:.2g}% less than before", line=line, percent=percent)

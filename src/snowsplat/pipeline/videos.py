@@ -149,9 +149,12 @@ def cameras_along(
     """
     if path not in CAMERA_PATHS:
         if Path(path).suffix.lower() != ".json":
-            known = ", ".join(CAMERA_PATHS)
-            what = f"{path} is unknown; use {known} or a file of cameras (.json)"
-            raise SettingError("path", what)
+            raise SettingError(
+                "path",
+                "{path} is unknown; use {known} or a file of cameras (.json)",
+                path=path,
+                known=[*CAMERA_PATHS],
+            )
         _, keys = read_cameras(Path(path))
         keys = _in_frame_of(gaussians, keys)
         distance = trajectory.viewing_distance(keys, gaussians.means)

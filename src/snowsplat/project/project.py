@@ -24,6 +24,7 @@ from snowsplat.project.edit_record import EditRecord, read_record
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.training_folder import DATASET, SCENE, TrainingFolder
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import read_json
 
 #: The record of `make` in its folder. "title": the name of the scene for people; "file": its file;
@@ -94,7 +95,7 @@ class Project:
     def training_folder(self) -> TrainingFolder:
         """The training, of a folder. Raises: UserError: a file, or no such folder."""
         if self.training is None or not self.path.is_dir():
-            what = "is a file" if self.path.is_file() else "no such folder"
+            what = message("is a file") if self.path.is_file() else message("no such folder")
             raise UserError(
                 "{path}: {what}; give the output folder of a training run",
                 path=self.path,

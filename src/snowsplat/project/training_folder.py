@@ -340,15 +340,23 @@ class TrainingFolder:
         """
         scenes = self.scenes()
         if not scenes:
-            what = "contains no scene (no point_cloud/iteration_N in it)"
             if any(self.checkpoints.glob("step_*.safetensors")):
-                what = "contains no scene yet, but checkpoints; show it with watch, or continue it"
-            raise UserError("{path}: {what}", path=self.path, what=what)
+                raise UserError(
+                    "{path}: contains no scene yet, but checkpoints; show it with watch, or "
+                    "continue it",
+                    path=self.path,
+                )
+            raise UserError(
+                "{path}: contains no scene (no point_cloud/iteration_N in it)", path=self.path
+            )
         chosen = scenes[-1] if iteration in (None, -1) else iteration
         if chosen not in scenes:
-            there = ", ".join(map(str, scenes))
-            what = f"contains no scene of iteration {chosen}; there are {there}"
-            raise UserError("{path}: {what}", path=self.path, what=what)
+            raise UserError(
+                "{path}: contains no scene of iteration {chosen}; there are {there}",
+                path=self.path,
+                chosen=chosen,
+                there=scenes,
+            )
         return chosen, self.scene_path(chosen)
 
     def _remove_unwritten_scenes(self) -> None:

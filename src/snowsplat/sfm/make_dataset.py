@@ -58,7 +58,7 @@ class Watcher(Protocol):
     def end(self, stage: str, outcome: Outcome) -> None:
         """Called when the stage is finished, now or in an earlier run."""
 
-    def note(self, line: Message | str) -> None:
+    def note(self, line: Message) -> None:
         """Called with a line of information for the user."""
 
     def show_poses(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
@@ -255,7 +255,7 @@ def _check_free(
         # The photos may have been moved.
         same |= stages.settings("photos").get("input") == _fingerprint(sources.paths)
         if not same and not overwrite:
-            what = ", ".join(map(str, before)) if isinstance(before, list) else "other inputs"
+            what = before if isinstance(before, list) else message("other inputs")
             raise UserError(
                 "{folder}: contains a dataset made from {what}; use another folder, or set "
                 "`overwrite`",

@@ -443,7 +443,7 @@ def _answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request
             codes = {UnknownScene: 404, NoSpace: 507}
             return JSONResponse({"error": str(error)}, codes.get(type(error), 400))
         except OSError as error:
-            return JSONResponse({"error": printable(message_of(error))}, 500)
+            return JSONResponse({"error": printable(str(message_of(error)))}, 500)
 
     return endpoint
 

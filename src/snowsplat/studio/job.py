@@ -14,6 +14,7 @@ from typing import Any
 
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK, holder, is_locked
 
 _WORKER = [sys.executable, "-m", "snowsplat.studio"]
@@ -28,8 +29,9 @@ def start(scene: StudioScene, task: str = "make") -> None:
     Raises: UserError: it runs already.
     """
     if is_running(scene, task):
-        what = "this scene" if task == "make" else "a film of this scene"
-        raise UserError("{what} is being made already", what=what)
+        if task == "make":
+            raise UserError("this scene is being made already")
+        raise UserError("a film of this scene is being made already")
     with open(scene.log(task), "wb") as log:
         _started[scene.lock(task)] = subprocess.Popen(
             [*_WORKER, task, str(scene.folder)],
@@ -70,7 +72,7 @@ def stop(scene: StudioScene, task: str = "make") -> None:
     if other.host == socket.gethostname():
         os.kill(other.process, signal.SIGTERM)
     else:
-        where = other.host or "another computer"
+        where = other.host or message("another computer")
         raise UserError("this scene is being made on {where}; stop it there", where=where)
 
 
@@ -85,7 +87,8 @@ def work(*words: str | Path) -> dict[str, Any]:
     if answer is None:
         lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
         raise UserError(
-            "an unexpected fault: {lines}", lines=lines[-1] if lines else "the process was killed"
+            "an unexpected fault: {lines}",
+            lines=lines[-1] if lines else message("the process was killed"),
         )
     if "error" in answer:
         raise UserError(answer["error"])

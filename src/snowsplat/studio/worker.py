@@ -90,7 +90,7 @@ class _Recorder(Observer):
                 self._scene.write_state(self.state, self._task)
             self._written = time.monotonic()
 
-    def note(self, line: Message | str) -> None:
+    def note(self, line: Message) -> None:
         self.state["notes"].append(printable(str(line)))
         self.write()
 
@@ -105,7 +105,7 @@ class _Recorder(Observer):
         return report
 
     def end(self, stage: str, outcome: Outcome) -> None:
-        lines = [printable(line) for line in described(stage, outcome.result)]
+        lines = [printable(str(line)) for line in described(stage, outcome.result)]
         self.state["stages"].append(
             {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
         )
@@ -191,8 +191,8 @@ def _outcome(scene: StudioScene, task: str, recorder: _Recorder) -> tuple[int, d
 
 
 def _line(error: UserError | OSError) -> str:
-    message = message_of(error) if isinstance(error, OSError) else str(error)
-    return printable(" ".join(message.split()))
+    text = str(message_of(error) if isinstance(error, OSError) else error)
+    return printable(" ".join(text.split()))
 
 
 def _make(scene: StudioScene, recorder: _Recorder) -> dict[str, Any]:

@@ -164,8 +164,11 @@ def _acquired(file: Path, what: str, wait: float) -> int:
 
 
 def _in_use(what: str, file: Path) -> InUse:
-    advice = "wait until it ends, stop it, or use another folder"
-    return InUse("{what} {holder}; {advice}", what=what, holder=holder(file), advice=advice)
+    return InUse(
+        "{what} {holder}; wait until it ends, stop it, or use another folder",
+        what=what,
+        holder=holder(file),
+    )
 
 
 def _try(file: Path) -> tuple[int, bool] | None:

@@ -22,6 +22,7 @@ from snowsplat.data.readers import transforms_json
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
 from snowsplat.scene.length import stored_metres
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -126,15 +127,16 @@ def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
     folder, first = root / images, quoted(model.images[0].name)
     if not folder.is_dir():
         found = sorted(p.name for p in root.iterdir() if p.is_dir())
-        existing = f" (existing folders: {', '.join(found)})" if found else ""
-        return SettingError(
-            "images",
-            "no such folder: {folder}; use the right one{existing}",
-            folder=folder,
-            existing=existing,
-        )
+        missing = message("no such folder: {folder}; use the right one", folder=folder)
+        if found:
+            there = "{missing} (existing folders: {found})"
+            missing = message(there, missing=missing, found=found)
+        return SettingError("images", missing)
     names = photos_below(folder)
-    instead = f"; it has {len(names)} others, e.g. {quoted(names[0])}" if names else ""
+    instead = Message("")
+    if names:
+        there = "; it has {count} others, e.g. {name}"
+        instead = message(there, count=len(names), name=quoted(names[0]))
     return SettingError(
         "images",
         "{folder} has none of the {images} images of the model (the first is {first}){instead}; "

@@ -20,6 +20,7 @@ from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
 from snowsplat.data.readers import parse
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -250,7 +251,9 @@ def _report_missing(
 ) -> None:
     if not found.images:
         if not found.missing:
-            none = f"none of its {found.total} photos is aligned" if found.total else "no photos"
+            none = message("no photos")
+            if found.total:
+                none = message("none of its {count} photos is aligned", count=found.total)
             raise UserError(
                 "{cameras}: {none}; align them in {program}, or estimate the poses: snowsplat "
                 "sfm PHOTOS -o DATASET",

@@ -41,6 +41,7 @@ from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -103,13 +104,14 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
             posed[file] = _posed_image(frame.where, root, file, frame.values, split[file])
     missing = [frame.name for frame in frames if frame.name not in found]
     if not posed:
-        problem = f"all of its {len(frames)} images are missing" if frames else "it has no frames"
-        hint = f" (the first is {quoted(missing[0])})" if missing else ""
+        if not missing:
+            raise UserError("{file}: it has no frames; check where the images are", file=files[0])
         raise UserError(
-            "{files}: {problem}{hint}; check where the images are",
-            files=files[0],
-            problem=problem,
-            hint=hint,
+            "{file}: all of its {count} images are missing (the first is {first}); check where the "
+            "images are",
+            file=files[0],
+            count=len(frames),
+            first=quoted(missing[0]),
         )
     warn_of_missing(root / shown, missing, len(frames))
     return Reconstruction(list(posed.values()), _points(root, first_scene), shown)
@@ -117,7 +119,7 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
 
 @dataclass(frozen=True)
 class _Frame:
-    where: str  # the start of error messages
+    where: Message  # the start of error messages
     name: str  # its file_path
     values: ChainMap[str, Any]  # the entries of the frame, then those of the file
     split: _Split | None
@@ -136,7 +138,7 @@ def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
             split = "train" if index == 0 else "test"
         splits = _named_splits(scene)
         for number, frame in enumerate(scene["frames"]):
-            where = f"{path}: frame {number}"
+            where = message("{path}: frame {number}", path=path, number=number)
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise UserError("{where}: no file_path; export the file again", where=where)
             name = frame["file_path"]

@@ -106,7 +106,7 @@ class Lift(JsonCommand):
                 )
             )
         pixels, where = result.focal
-        hint = "; set it with --focal" if where == "assumed" else ""
+        hint = message("; set it with --focal") if where == "assumed" else ""
         print(
             message(
                 "focal length: {pixels:.0f} pixels, {where}{hint}",

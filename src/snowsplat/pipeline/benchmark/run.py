@@ -86,8 +86,9 @@ def find_scenes(folder: Path, only: Sequence[str] = ()) -> list[Path]:
             "{folder}: contains no dataset {missing}", folder=folder, missing=missing[0]
         )
     if not found:
-        hint = "; it is a dataset itself, use the folder above" if is_dataset(folder) else ""
-        raise UserError("{folder}: contains no folders of datasets{hint}", folder=folder, hint=hint)
+        if is_dataset(folder):
+            raise UserError("{folder}: is a dataset itself; use the folder above", folder=folder)
+        raise UserError("{folder}: contains no folders of datasets", folder=folder)
     return [found[name] for name in only] or list(found.values())
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from snowsplat.util.duration import duration
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     import torch
@@ -68,9 +69,9 @@ class TimeBudget:
         time_ratio = measure_time_ratio(dataset, config, device, resize=resize)
         return make_plan(dataset, config, self.left, time_ratio, **allowed)
 
-    def described(self, plan: Plan) -> str:
-        """The plan in one line, as text for users."""
-        return f"{duration(self.seconds)} on this machine: {plan}"
+    def described(self, plan: Plan) -> Message:
+        """The plan in one line."""
+        return message("{time} on this machine: {plan}", time=duration(self.seconds), plan=plan)
 
     def pace(self, trainer: Trainer, time_ratio: float) -> Pace:
         """The pace that keeps the training within the time that is left."""

@@ -35,6 +35,8 @@ from snowsplat.sfm.options import MIN_PHOTOS, GatherOptions
 from snowsplat.sfm.progress import Report
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message, message, plural
+from snowsplat.util.names import first_names
 from snowsplat.util.natural_order import natural_key
 
 logger = logging.getLogger(__name__)
@@ -247,11 +249,12 @@ def _too_few(usable: int, left_out: Sequence[LeftOut]) -> UserError:
     reasons = Counter(each.reason for each in left_out)
     reason, often = reasons.most_common(1)[0] if reasons else ("", 0)
     everything = usable == 0 and often == len(left_out)
-    who = f"all {often} images" if everything else f"{often} of {usable + len(left_out)} images"
+    who = message("all {n} images", n=often)
+    if not everything:
+        who = message("{n} of {all} images", n=often, all=usable + len(left_out))
     if often < 2 or often < len(left_out) / 2:
-        reasons_of_some = "".join(f"; {each.photo} {each.reason}" for each in left_out[:_NAMED])
-        if len(left_out) > _NAMED:
-            reasons_of_some += f"; and {len(left_out) - _NAMED} more"
+        some = [message("{photo} {why}", photo=each.photo, why=each.reason) for each in left_out]
+        reasons_of_some = message("; {reasons}", reasons=first_names(some, _NAMED)) if some else ""
         return UserError(
             "photos: {count}; use at least {min_photos}, preferably 20 or more, from different "
             "places around the scene{left_out}",
@@ -274,11 +277,15 @@ def _too_few(usable: int, left_out: Sequence[LeftOut]) -> UserError:
             who=who,
         )
     if reason in (BLACK, WHITE, FLAT):
-        what = {BLACK: "black", WHITE: "white", FLAT: "of one colour"}[reason]
+        colours = {
+            BLACK: message("black"),
+            WHITE: message("white"),
+            FLAT: message("of one colour"),
+        }
         return UserError(
             "photos: {who} are completely {what}; check the lens cap, the light and the files",
             who=who,
-            what=what,
+            what=colours[reason],
         )
     if reason == BLURRED:
         return UserError(
@@ -298,7 +305,7 @@ def _too_few(usable: int, left_out: Sequence[LeftOut]) -> UserError:
     )
 
 
-def _count(usable: int) -> str:
-    return {0: "no usable image", 1: "only 1 usable image"}.get(
-        usable, f"only {usable} usable images"
-    )
+def _count(usable: int) -> Message:
+    if usable == 0:
+        return message("no usable image")
+    return plural("only {n} usable image", "only {n} usable images", n=usable)

@@ -31,6 +31,7 @@ from snowsplat.training.step.losses import view_loss
 from snowsplat.training.step.optim import Adam
 from snowsplat.training.step.step_runner import StepRunner
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message
 from snowsplat.util.process import single_threaded
 
 #: There is one random generator for each kind of random choice, so that additional choices of one
@@ -120,7 +121,7 @@ class Run:
         *,
         parts: Sequence[Part] | None = None,
         loss: Loss | None = None,
-        note: Callable[[str], None] = lambda line: None,
+        note: Callable[[Message], None] = lambda line: None,
     ) -> None:
         """
         Args:

@@ -29,6 +29,7 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.step.batch import BatchView
 from snowsplat.training.step.step_runner import StepRunner, Summary
 from snowsplat.training.step.view_gradient import ViewGradient
+from snowsplat.util.messages import Message
 
 #: A recording keeps the memory of its splats and their gradient: 132 bytes per Gaussian.
 MOST_RECORDINGS = 4
@@ -124,7 +125,7 @@ class _Recording:
 class ViewGraphs:
     """The recordings of the present Gaussians. The least recently used one is replaced."""
 
-    def __init__(self, record: Recorder, note: Callable[[str], None]) -> None:
+    def __init__(self, record: Recorder, note: Callable[[Message], None]) -> None:
         """
         ``note``: takes a line for the user.
         """

@@ -39,7 +39,7 @@ from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_s
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.step.batch import BatchView
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
@@ -135,7 +135,9 @@ class NormalSupervision(Part):
         if wrong := contradicting(surfaces, stated):
             self.used[wrong] = False
             names = first_names([views[index].name for index in wrong], 5)
-            frame = "" if self.used.any() else "; normals must be in the frame of the camera"
+            frame = Message("")
+            if not self.used.any():
+                frame = message("; normals must be in the frame of the camera")
             run.note(
                 message(
                     "normal maps that contradict the photos are not used: {names}{frame}",

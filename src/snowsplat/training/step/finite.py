@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
     from snowsplat.data.photos.decode import LoadedImage
     from snowsplat.scene.gaussians import Gaussians
 
-_LOWER_RATES = "use lower learning rates"
-_FINITE_INIT = "start from finite values"
+_LOWER_RATES = message("use lower learning rates")
+_FINITE_INIT = message("start from finite values")
 
 
 class Diverged(UserError):
@@ -136,13 +137,17 @@ def check_loss(
     if math.isfinite(loss):
         return
     if found := rows_not_finite(gaussians.parameters()):
-        cause = f"from non-finite Gaussians, {listed(found)}; {_FINITE_INIT}"
+        cause = message(
+            "from non-finite Gaussians, {rows}; {advice}", rows=listed(found), advice=_FINITE_INIT
+        )
     elif photo is not None and (pixels := rows_not_finite({"": photo.planes.flatten(1).T})):
-        cause = f"from {pixels['']:,} non-finite pixels; fix or remove that photo"
+        cause = message(
+            "from {count:,} non-finite pixels; fix or remove that photo", count=pixels[""]
+        )
     elif not view.camera.is_finite():
-        cause = "from a non-finite camera; correct its pose or remove that photo"
+        cause = message("from a non-finite camera; correct its pose or remove that photo")
     else:
-        cause = f"training has diverged; {_LOWER_RATES}"
+        cause = message("training has diverged; {advice}", advice=_LOWER_RATES)
     raise Diverged(
         "step {step}, photo {name}: the loss is {loss}, {cause}",
         step=step,

@@ -10,6 +10,7 @@ from snowsplat.sfm.colmap.database import Pair, displacement_of, feature_counts,
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import MIN_PHOTOS
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 # A photo with fewer features is too dark, blurred or plain.
 _FEW_FEATURES = 60
@@ -138,7 +139,9 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
             count=count,
         )
     if len(paired) < MIN_PHOTOS:
-        matching = f"only {len(paired)} of them match" if paired else "no two of them match"
+        matching = message("no two of them match")
+        if paired:
+            matching = message("only {count} of them match", count=len(paired))
         return UserError(
             "photos: the {count} photos do not overlap ({matching}); take photos of one scene, "
             "so that each shows more than half of what the previous one shows",
@@ -161,7 +164,7 @@ def failure(evidence: Evidence, doubts: Sequence[str] = ()) -> UserError:
             "photos: no possible camera poses were found for the {count} photos: {doubts}; take "
             "more photos, with smaller steps between them, or set another camera_model",
             count=count,
-            doubts=", ".join(doubts),
+            doubts=doubts,
         )
     return UserError(
         "photos: no camera poses were found for the {count} photos, because their matches are "

@@ -23,6 +23,7 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import MIN_PHOTOS, SfmOptions
 from snowsplat.sfm.progress import Figures, Report, ShowPoses
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import as_message, message
 
 # Bytes by which the database may grow in one transaction.
 _DATABASE_GROWTH = 8_000_000
@@ -81,7 +82,9 @@ def estimate_poses(
     if options.camera_model not in ("auto", *CAMERA_MODELS):
         raise SettingError(
             "camera_model",
-            f"unknown value {options.camera_model!r}; use one of auto, " + ", ".join(CAMERA_MODELS),
+            "unknown value {model!r}; use one of auto, {known}",
+            model=options.camera_model,
+            known=CAMERA_MODELS,
         )
     distorted = DatasetFolder(dataset.absolute()).distorted
     distorted.mkdir(parents=True, exist_ok=True)
@@ -102,9 +105,9 @@ def estimate_poses(
         result = _run({**job, "reduced": True}, log, 1, watchers)
     except Crashed as crash:
         _check_disk(distorted)
-        advice = "report it"
+        advice = message("report it")
         if crash.code < 0:
-            advice = "use fewer or smaller photos, or a lower effort"
+            advice = message("use fewer or smaller photos, or a lower effort")
         raise UserError(
             "pose estimation: failed twice: {reason}; {advice} (last line of the log: {last_line})",
             reason=crash.reason,
@@ -151,7 +154,7 @@ def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> S
         finally:
             child.kill()
     if "user_error" in answer:
-        raise UserError(answer["user_error"])
+        raise UserError(as_message(answer["user_error"]))
     if "result" not in answer:
         raise Crashed(code)
     return SfmResult(**answer["result"])

@@ -65,7 +65,7 @@ def main() -> None:
         )
         send(result=asdict(_run(job, progress)))
     except UserError as error:
-        send(user_error=str(error))
+        send(user_error=error.message.as_json())
 
 
 def _redirected_stdout() -> TextIO:

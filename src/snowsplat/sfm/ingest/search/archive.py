@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import new_folder, shown
+from snowsplat.util.messages import message
 
 # Other archives, by their first bytes. They are named, not unpacked.
 _OTHERS = {b"Rar!": "RAR", b"7z\xbc\xaf": "7z", b"\x1f\x8b": "gzip", b"\xfd7zXZ": "xz"}
@@ -98,7 +99,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
         raise
     except Exception as error:  # zipfile raises many kinds of exceptions for damaged files
         system = error.strerror if isinstance(error, OSError) else None
-        reason = system or " ".join(str(error).split())[:80] or "it is damaged"
+        reason = system or " ".join(str(error).split())[:80] or message("it is damaged")
         raise UserError(
             "{path}: cannot be unpacked ({reason}); copy it again, or unpack it to a folder",
             path=shown(path),
