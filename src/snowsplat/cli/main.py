@@ -189,7 +189,7 @@ def _report_log_and_warnings_as_lines() -> None:
     def show(text: Warning | str, *_: Any, **__: Any) -> None:
         _print_error(message("warning: {text}", text=text))
 
-    warnings.showwarning = show
+    warnings.showwarning = show  # type: ignore[assignment]  # the name of its first argument
     # Pillow warns about each unreadable tag of a damaged photo; snowsplat reports its effect once.
     warnings.filterwarnings("ignore", module=r"PIL\.")
     logger = logging.getLogger("snowsplat")

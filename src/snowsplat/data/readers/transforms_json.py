@@ -41,7 +41,6 @@ from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -119,7 +118,7 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
 
 @dataclass(frozen=True)
 class _Frame:
-    where: Message  # the start of error messages
+    where: str  # the start of error messages
     name: str  # its file_path
     values: ChainMap[str, Any]  # the entries of the frame, then those of the file
     split: _Split | None
@@ -138,7 +137,7 @@ def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
             split = "train" if index == 0 else "test"
         splits = _named_splits(scene)
         for number, frame in enumerate(scene["frames"]):
-            where = message("{path}: frame {number}", path=path, number=number)
+            where = f"{path}: frame {number}"
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise UserError("{where}: no file_path; export the file again", where=where)
             name = frame["file_path"]

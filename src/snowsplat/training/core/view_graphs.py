@@ -29,7 +29,7 @@ from snowsplat.training.parts.part import Part
 from snowsplat.training.step.batch import BatchView
 from snowsplat.training.step.step_runner import StepRunner, Summary
 from snowsplat.training.step.view_gradient import ViewGradient
-from snowsplat.util.messages import Message
+from snowsplat.util.messages import Message, message
 
 #: A recording keeps the memory of its splats and their gradient: 132 bytes per Gaussian.
 MOST_RECORDINGS = 4
@@ -177,7 +177,12 @@ class ViewGraphs:
                 self._record = None
                 self._recordings.clear()
                 reason = (str(error).splitlines() or ["no reason is known"])[0]
-                self._note(f"training continues without CUDA graphs, more slowly: {reason}")
+                self._note(
+                    message(
+                        "training continues without CUDA graphs, more slowly: {reason}",
+                        reason=reason,
+                    )
+                )
                 return None
         self._recordings[key] = recording  # the most recently used one is the last
         recording.inputs.copy(view, photo)
