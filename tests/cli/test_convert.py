@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
+from snowsplat.pipeline.convert import transform_of
 from snowsplat.pipeline.options.convert import Edits, file_size
 from snowsplat.scene import edit
 from snowsplat.scene.camera import Camera
@@ -80,7 +81,7 @@ def test_edits_and_their_order(run, ply, tmp_path):
     x, y, z = smaller.means.T
     expected = 2 * torch.stack([-y, x, z], 1) + torch.tensor([10, 0, -1])
     torch.testing.assert_close(after.means, expected)
-    turn = Edits(rotate=(0, 0, 90), scale=2, translate=(10, 0, -1)).transform()
+    turn = transform_of(Edits(rotate=(0, 0, 90), scale=2, translate=(10, 0, -1)))
     torch.testing.assert_close(after.sh_rest, edit.transform(smaller, turn).sh_rest)
 
 

@@ -78,5 +78,5 @@ def test_after_ctrl_c_the_command_that_resumes_is_printed(run, tmp_path, monkeyp
     stopped = run("demo", "-o", tmp_path / "a b", "--open")
     assert stopped.code == 130
     assert stopped.out.splitlines()[-1] == (
-        f"resume with: snowsplat demo -o '{tmp_path / 'a b'}' --open"
+        f"resume with: snowsplat demo --output '{tmp_path / 'a b'}' --open"
     )

@@ -7,7 +7,7 @@ import pytest
 from snowsplat.data import load_dataset
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.formats import read_gaussians
-from snowsplat.pipeline.convert import convert
+from snowsplat.pipeline.convert import convert, transform_of
 from snowsplat.pipeline.options.convert import Edits
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import cameras_of
@@ -55,7 +55,7 @@ def test_the_cameras_of_an_output_folder_are_used(dataset, tmp_path):
         convert(source, tmp_path / "small.ply", edits, overwrite=True)
         found = read_gaussians(tmp_path / "small.ply")
         assert len(found) == len(whole) // 3
-        transform = edits.transform()
+        transform = transform_of(edits)
         if transform:
             found = edit.transform(found, transform.inverse())
         images = [render(found, camera).image for camera in cameras]

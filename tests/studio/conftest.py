@@ -118,10 +118,10 @@ def studio(library) -> Iterator[Studio]:
 def in_process(monkeypatch) -> None:
     """Short tasks of the worker run in this process: a new one needs seconds to import torch."""
 
-    def work(*words: str | Path) -> dict[str, Any]:
+    def work(scene: StudioScene, verb: str, **settings: Any) -> dict[str, Any]:
         printed = io.StringIO()
         with redirect_stdout(printed):
-            worker.main([str(word) for word in words])
+            worker.main([verb, str(scene.folder), json.dumps(settings)])
         answer = json.loads(printed.getvalue().splitlines()[-1])
         if "error" in answer:
             raise UserError(answer["error"])

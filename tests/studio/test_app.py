@@ -70,7 +70,7 @@ def test_start_and_stop(studio, holder):
     status, answer = studio.ask(f"scenes/{name}/start", "POST", {"quality": "draft"})
     assert (status, "no photos yet" in answer["error"]) == (400, True)
     studio.ask(f"scenes/{name}/uploads?path=a.jpg&size=1&modified=7000&start=0", "PUT", b"x")
-    for wanted in ({"quality": "great"}, {"minutes": 0}, {"minutes": -1}, {"minutes": 1e9}):
+    for wanted in ({"quality": "great"}, {"minutes": 0}, {"minutes": -1}):
         assert studio.ask(f"scenes/{name}/start", "POST", wanted)[0] == 400
     assert studio.ask(f"scenes/{name}/start", "POST", b"[]")[0] == 400
     assert studio.ask(f"scenes/{name}/start", "POST", {"minutes": 5, "title": "b"})[0] == 200

@@ -21,8 +21,8 @@ from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED
 from snowsplat.sfm.ingest.inputs import _too_few
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW
-from snowsplat.studio.app import _listing
 from snowsplat.studio.library import Library
+from snowsplat.studio.library_requests import listing
 from snowsplat.studio.uploads import Upload, safe_path, write_part
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.run_lock import Holder
@@ -99,7 +99,7 @@ def test_errors(tmp_path):
         error_of(lambda: safe_path("..")),
         error_of(lambda: write_part(scene, Upload("/1.jpg/2.jpg", 5, 0), b"12345")),
         error_of(lambda: write_part(scene, Upload("/2.jpg", 9, 0, received=5), b"1")),
-        error_of(lambda: _listing(tmp_path / "missing")),
+        error_of(lambda: listing(tmp_path / "missing")),
         str(failure(Evidence(plain, [], None, 36))),
         str(failure(Evidence(detailed, [], None, 36))),
         str(failure(Evidence(detailed, [], 0.0, 36))),

@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.sfm.report.scene_map import PlacedPhoto
-from snowsplat.studio import worker
+from snowsplat.studio.recorder import Recorder
 from snowsplat.util.stages import Outcome
 
 
@@ -22,7 +22,7 @@ def test_photos_are_placed_one_by_one(studio):
             Image.new("RGB", (30, 20)).save(scene.made / "dataset" / folder / f"{name}.jpg")
     address = f"scenes/{scene.name}"
     assert studio.ask(f"{address}/photos")[1] == [{"name": "z.jpg", "placed": True}]
-    recorder = worker._Recorder(scene)
+    recorder = Recorder(scene)
     recorder.begin("poses")
     cloud = np.random.default_rng(0).uniform((-1, 3, -1), (1, 5, 1), (50, 3))
     drawn = set()

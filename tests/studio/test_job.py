@@ -21,6 +21,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.sfm.cost import Speed
 from snowsplat.studio import job, worker
+from snowsplat.studio.recorder import Recorder
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
@@ -91,9 +92,9 @@ def test_errors_of_the_worker_are_one_line(library, forked, tmp_path):
     empty.mkdir()
     scene = library.new("a", [empty])
     with pytest.raises(UserError, match="empty"):
-        job.work("survey", scene.folder)
+        job.work(scene, "survey")
     with pytest.raises(UserError, match="the scene is not finished"):
-        job.work("export", scene.folder, "spz")
+        job.work(scene, "export", kind="spz")
     job.start(scene)
     wait_for(lambda: not job.is_running(scene), 60)
     state = scene.state()
@@ -113,7 +114,7 @@ def test_what_the_photos_are(library, request):
             Image.fromarray(colours).save(picture, "JPEG")
             archive.writestr(f"tour/{number}.jpg", picture.getvalue())
     for _ in range(2):
-        found = job.work("survey", scene.folder)
+        found = job.work(scene, "survey")
         assert (found["count"], found["facts"]["photos"]) == (3, 3)
         assert 0 < found["seconds"]["draft"] < found["seconds"]["best"]
         request.getfixturevalue("forked")
@@ -132,7 +133,7 @@ def test_poses_that_are_given_take_no_time(library, tmp_path, monkeypatch):
 def test_progress_is_bounded(library):
     """The curve has a limited number of points, over all steps; numbers are those of the steps."""
     scene = library.new("a", [])
-    recorder = worker._Recorder(scene)
+    recorder = Recorder(scene)
     for step in range(1, 5001):
         recorder.step(Progress(step, 1.0 / step, 100 + step, 5000, 1, seconds_left=7.0))
     recorder.note("a line\x1b[0m")
@@ -150,7 +151,7 @@ def test_progress_is_bounded(library):
 
 def test_given_cameras_have_a_map(library):
     scene = library.new("a", [])
-    recorder = worker._Recorder(scene)
+    recorder = Recorder(scene)
     pose = torch.eye(3, 4, dtype=torch.float64)
     (scene.made / "scene").mkdir(parents=True)
     cameras = [("one", Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose))]
@@ -163,4 +164,4 @@ def test_given_cameras_have_a_map(library):
 def test_a_worker_that_is_killed_is_an_error(library, monkeypatch):
     monkeypatch.setattr(job, "_WORKER", [sys.executable, "-c", "import os; os.abort()"])
     with pytest.raises(UserError, match="unexpected fault"):
-        job.work("survey", library.folder)
+        job.work(StudioScene(library.folder), "survey")

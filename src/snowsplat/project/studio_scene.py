@@ -61,6 +61,11 @@ class Job:
     quality: str | None = None
     minutes: float | None = None
 
+    def settings(self) -> dict[str, Any]:
+        """Those of `make` that are set: name -> value, see `MakeOptions`."""
+        given = {"quality": self.quality, "minutes": self.minutes, "title": self.title}
+        return {name: value for name, value in given.items() if value is not None}
+
 
 class StudioScene:
     """A scene of the library; its files need not exist.

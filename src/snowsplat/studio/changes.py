@@ -19,7 +19,7 @@ from snowsplat.pipeline.edit import OtherScene, edit, undo_edits
 from snowsplat.pipeline.film import moved_film, page_frames, write_keys
 from snowsplat.pipeline.options.publish import PublishOptions
 from snowsplat.pipeline.publish import publish
-from snowsplat.project.edit_record import edited_file
+from snowsplat.project.edit_record import PageEdit, edited_file
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import StudioScene
@@ -29,8 +29,30 @@ from snowsplat.studio.library import safe_title
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.safe_json import from_json, is_file, read_json
+from snowsplat.util.settings import Settings
 from snowsplat.viewer.web.publication import PAGE
 from snowsplat.viewer.web.publication import SCENE as SITE_SCENE
+
+
+@dataclass(frozen=True)
+class Export(Settings):
+    """The settings of `export`: a kind of file, see `FORMATS`."""
+
+    kind: str
+
+
+@dataclass(frozen=True)
+class Title(Settings):
+    """The settings of `rename`."""
+
+    title: str
+
+
+@dataclass(frozen=True)
+class Version(Settings):
+    """The settings of `edit_scene` and `undo_edit`: the scene that a page shows; "": any."""
+
+    version: str
 
 
 def finished(scene: StudioScene) -> Path:
@@ -41,11 +63,12 @@ def finished(scene: StudioScene) -> Path:
     return file
 
 
-def export(scene: StudioScene, kind: str) -> dict[str, Any]:
+def export(scene: StudioScene, settings: Export) -> dict[str, Any]:
     """Write the scene in another format, unless that is done; returns the name of the file.
 
     Raises: UserError: the scene is not finished.
     """
+    kind = settings.kind
     file, target = finished(scene), export_file(scene, kind)
     # It gets the time of the scene that is read, which may be replaced meanwhile.
     time = file.stat().st_mtime_ns
@@ -85,15 +108,20 @@ def _written_at(file: Path) -> int:
     return file.stat().st_mtime_ns if file.is_file() else 0
 
 
-def edit_scene(scene: StudioScene, version: str, undo: bool) -> dict[str, Any]:
-    """Write the edited scene and its page; or remove it, and write the page of the other one.
-
-    Args:
-        version: of the scene that was edited; "": as it is.
+def edit_scene(scene: StudioScene, settings: Version) -> dict[str, Any]:
+    """Write the edited scene and its page.
 
     Raises: UserError: the scene is not finished, is being made, or was changed since then.
     """
-    changes = None if undo else scene.page_edit()
+    return _edit(scene, settings.version, scene.page_edit())
+
+
+def undo_edit(scene: StudioScene, settings: Version) -> dict[str, Any]:
+    """Remove the edited scene, and write the page of the other one. Raises: see `edit_scene`."""
+    return _edit(scene, settings.version, None)
+
+
+def _edit(scene: StudioScene, version: str, changes: PageEdit | None) -> dict[str, Any]:
     if is_being_made(scene):
         raise UserError("the scene is being made; stop it, then edit it")
     scene.check_version(version)
@@ -138,7 +166,7 @@ def finish_edit(scene: StudioScene) -> None:
     scene.begun.unlink()
 
 
-def show_scene(scene: StudioScene) -> dict[str, Any]:
+def show_scene(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     """Write the site of a finished scene as it is now, and its figures.
 
     Raises: UserError: the scene is not finished.
@@ -159,17 +187,17 @@ def show_scene(scene: StudioScene) -> dict[str, Any]:
     return {"file": file.name}
 
 
-def rename(scene: StudioScene, title: str) -> dict[str, Any]:
+def rename(scene: StudioScene, settings: Title) -> dict[str, Any]:
     """Change the title, also in the site if there is one."""
     if scene.scene_file() is None:
-        scene.change(title=safe_title(title))
+        scene.change(title=safe_title(settings.title))
         return {}
     finish_edit(scene)  # which may have another title
-    scene.change(title=safe_title(title))
+    scene.change(title=safe_title(settings.title))
     return show_scene(scene)
 
 
-def show_whole(scene: StudioScene) -> dict[str, Any]:
+def show_whole(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     """Write the page that edits a scene whose site has levels of detail, unless it is there.
 
     Raises: UserError: the scene is not finished.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
+from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.video import VideoOptions
 from snowsplat.project.page_film import PageFilm
 from snowsplat.project.studio_scene import Job, StudioScene
 from snowsplat.studio.library import safe_name
+from snowsplat.util.flags import command_line, words
 from snowsplat.util.safe_json import is_file
 
 #: By kind: the end of the file's name.
@@ -40,21 +42,19 @@ def export_command(scene: StudioScene, kind: str) -> str:
     """The command line that writes it."""
     file = scene.scene_file() or scene.made
     if kind == "zip":
-        return shlex.join(["snowsplat", "publish", str(file), "-o", "site"])
-    return shlex.join(["snowsplat", "convert", str(file), export_file(scene, kind).name])
+        return command_line("publish", [file, "-o", "site"])
+    return command_line("convert", [file, export_file(scene, kind).name])
 
 
 def film_command(scene: StudioScene, plan: PageFilm) -> str:
     """The command line that renders the film again."""
-    words = ["snowsplat", "render", str(scene.scene_file() or scene.made), "--path"]
-    words += [str(scene.keys), "--seconds", f"{plan.seconds:g}", "--size", plan.size]
-    return shlex.join([*words, *["--ease"] * plan.ease, "--video", "film.mp4"])
+    settings = {"path": str(scene.keys), "seconds": plan.seconds, "size": plan.size}
+    given = words(VideoOptions, {**settings, "ease": plan.ease})
+    file = scene.scene_file() or scene.made
+    return command_line("render", [file], given, ["--video", "film.mp4"])
 
 
 def make_command(scene: StudioScene, job: Job) -> str:
     """The command line that makes the scene."""
-    inputs = job.inputs or [str(scene.photos)]
-    words = ["snowsplat", "make", *inputs, "-o", str(scene.made)]
-    words += ["--quality", job.quality] if job.quality else []
-    words += ["--minutes", f"{job.minutes:g}"] if job.minutes else []
-    return shlex.join(words)
+    inputs = job.inputs or [scene.photos]
+    return command_line("make", inputs, ["-o", scene.made], words(MakeOptions, job.settings()))

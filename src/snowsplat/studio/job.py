@@ -76,12 +76,14 @@ def stop(scene: StudioScene, task: str = "make") -> None:
         raise UserError("this scene is being made on {where}; stop it there", where=where)
 
 
-def work(*words: str | Path) -> dict[str, Any]:
+def work(scene: StudioScene, verb: str, **settings: Any) -> dict[str, Any]:
     """Run another task of the worker, and wait for its answer; see `snowsplat.studio.worker`.
+
+    ``verb``: one of its `VERBS`; ``settings``: those of the verb.
 
     Raises: UserError: what the worker has said.
     """
-    command = [*_WORKER, *map(str, words)]
+    command = [*_WORKER, verb, str(scene.folder), json.dumps(settings)]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True)
     answer = _last_line(done.stdout.decode("utf-8", "replace").splitlines())
     if answer is None:

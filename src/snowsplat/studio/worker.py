@@ -1,167 +1,53 @@
 """What the studio does in other processes: all that takes long, or needs torch.
 
-    python -m snowsplat.studio make FOLDER          the job of a scene of the library
-    python -m snowsplat.studio film FOLDER          its film, as film.json says
-    python -m snowsplat.studio preview FOLDER       the path of this film
-    python -m snowsplat.studio survey FOLDER        what its photos are, and the time needed
-    python -m snowsplat.studio export FOLDER KIND   a file in another format
-    python -m snowsplat.studio show FOLDER          the site of a scene, anew
-    python -m snowsplat.studio rename FOLDER TITLE  its title, also in the site
-    python -m snowsplat.studio whole FOLDER         the page that edits a scene with levels
-    python -m snowsplat.studio edit FOLDER VERSION  what was changed in the page of this version
-    python -m snowsplat.studio undo FOLDER VERSION  the scene as it was made
+    python -m snowsplat.studio VERB FOLDER [SETTINGS]
 
-The first two write their progress to a file in the folder. The others print one line of JSON; of
-those that change files, one at a time works on a scene, also if the studio was killed and started
-again meanwhile.
+FOLDER is that of a scene of the library, and SETTINGS is a JSON object. The verbs of `TASKS` make a
+scene or a film; they write their progress to a file in the folder. The others (`VERBS`) print one
+line of JSON; of those that change files, one at a time works on a scene, also if the studio was
+killed and started again meanwhile.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from snowsplat.pipeline.cameras_from_above import cameras_from_above, draw_level
 from snowsplat.pipeline.describe_photos import describe_photos
 from snowsplat.pipeline.film import film, film_preview
 from snowsplat.pipeline.make import make
 from snowsplat.pipeline.make_result import MakeResult
-from snowsplat.pipeline.observer import Observer, Page
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.options.publish import PublishOptions
 from snowsplat.pipeline.publish import publish
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.stage_lines import described
 from snowsplat.project.edit_record import shown_file
-from snowsplat.project.project import Project
 from snowsplat.project.studio_scene import TASKS, StudioScene, version_of
 from snowsplat.sfm.colmap.options import thread_count
 from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
-from snowsplat.sfm.progress import Report
-from snowsplat.sfm.report.dataset_report import draw_from_above
-from snowsplat.sfm.report.scene_map import PlacedPhoto
 from snowsplat.studio import changes
-from snowsplat.studio.changes import existing_reports, finished
-from snowsplat.training.core.progress import Progress
+from snowsplat.studio.recorder import Recorder
 from snowsplat.util.errors import UserError, message_of
-from snowsplat.util.files import write_text
+from snowsplat.util.flags import settings_from
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.messages import Message, message
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import locked
-from snowsplat.util.safe_json import printable
-from snowsplat.util.stages import Outcome
+from snowsplat.util.safe_json import from_json, printable
 
 # Seconds for an edit or export of a killed studio to end.
 _LONGEST_CHANGE = 600.0
-_PAUSE = 1.0  # seconds between two files of the state
-_CURVE = 400  # points of the curve of the loss
-
-
-class _Recorder(Observer):
-    """Writes the progress of a task to the state of its scene."""
-
-    def __init__(self, scene: StudioScene, task: str = "make") -> None:
-        self._scene, self._task = scene, task
-        self._written = 0.0
-        self._every = 1  # steps between two points of the curve
-        self._drawn = False  # the map
-        self.state: dict[str, Any] = {
-            "started": time.time(),
-            "stages": [],
-            "notes": [],
-            "curve": [],
-        }
-        self.write()
-
-    def write(self, now: bool = True) -> None:
-        """Write the state; unless ``now``, only if the last time is a moment ago."""
-        if now or time.monotonic() - self._written > _PAUSE:
-            with suppress(OSError):  # a full disk is for the job to tell
-                self._scene.write_state(self.state, self._task)
-            self._written = time.monotonic()
-
-    def note(self, line: Message) -> None:
-        self.state["notes"].append(printable(str(line)))
-        self.write()
-
-    def begin(self, stage: str) -> Report:
-        self.state["now"] = now = {"stage": stage, "began": time.time()}
-        self.write()
-
-        def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
-            now.update({"done": done, "total": total, "what": what, "left": left})
-            self.write(now=False)
-
-        return report
-
-    def end(self, stage: str, outcome: Outcome) -> None:
-        lines = [printable(str(line)) for line in described(stage, outcome.result)]
-        self.state["stages"].append(
-            {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
-        )
-        if stage == "images":
-            self._draw_map(lambda made: draw_from_above(made.dataset.path))
-        if stage == "poses":
-            self.state.pop("placed", None)
-        self.leave()
-
-    def show_poses(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None:
-        self.state["placed"] = [photo.name for photo in photos]
-        self._draw_map(lambda made: draw_level(photos, points))
-        self.write()
-
-    def leave(self) -> None:
-        self.state.pop("now", None)
-        self.write()
-
-    def step(self, progress: Progress) -> None:
-        if not self._drawn:  # the poses were given
-            self._draw_map(lambda made: cameras_from_above(made.training_folder()))
-        self.state["steps"] = {
-            "step": progress.step,
-            "iterations": progress.iterations,
-            "gaussians": progress.gaussians,
-            "left": progress.seconds_left,
-        }
-        if progress.metrics is not None:
-            self.state["steps"]["psnr"] = progress.metrics.psnr
-        curve = self.state["curve"]
-        if progress.step % self._every == 0:
-            curve.append([progress.step, progress.loss])
-            if len(curve) > _CURVE:
-                del curve[::2]
-                self._every *= 2
-        self.write(now=False)
-
-    def page_opened(self, page: Page) -> None:
-        self.state["page"] = page.url
-        self.write()
-
-    def steps_end(self) -> None:
-        self.state.pop("page", None)
-        self.write()
-
-    def _draw_map(self, draw: Callable[[Project], str]) -> None:
-        self._drawn = True
-        try:
-            write_text(self._scene.map, draw(Project.open(self._scene.made)))
-        except (UserError, OSError) as error:  # the job goes on without it
-            self.note(message("there is no map of the cameras: {error}", error=error))
 
 
 def run_job(scene: StudioScene, task: str) -> int:
     """Do one of the `TASKS`, or resume it, under its lock; returns the exit code."""
-    recorder = _Recorder(scene, task)
+    recorder = Recorder(scene, task)
     code, outcome = _outcome(scene, task, recorder)
     for name in ("now", "page", "placed"):
         recorder.state.pop(name, None)
@@ -170,17 +56,15 @@ def run_job(scene: StudioScene, task: str) -> int:
     return code
 
 
-def _outcome(scene: StudioScene, task: str, recorder: _Recorder) -> tuple[int, dict[str, Any]]:
+def _outcome(scene: StudioScene, task: str, recorder: Recorder) -> tuple[int, dict[str, Any]]:
     """The exit code of the job, and what it adds to the state."""
     try:
         with ended_by_signals():
-            result = _make(scene, recorder) if task == "make" else _film(scene, recorder)
-        return 0, {"outcome": "done", "result": result}
+            return 0, {"outcome": "done", "result": _JOBS[task](scene, recorder)}
     except KeyboardInterrupt:
         return 130, {"outcome": "stopped"}
     except MemoryError:
-        message = "out of memory; choose draft, or fewer photos"
-        return 2, {"outcome": "failed", "error": message}
+        return 2, {"outcome": "failed", "error": "out of memory; choose draft, or fewer photos"}
     except (UserError, OSError) as error:
         return 2, {"outcome": "failed", "error": _line(error)}
     except Exception as error:
@@ -191,18 +75,18 @@ def _outcome(scene: StudioScene, task: str, recorder: _Recorder) -> tuple[int, d
 
 
 def _line(error: UserError | OSError) -> str:
-    text = str(message_of(error) if isinstance(error, OSError) else error)
-    return printable(" ".join(text.split()))
+    text = message_of(error) if isinstance(error, OSError) else error
+    return printable(" ".join(str(text).split()))
 
 
-def _make(scene: StudioScene, recorder: _Recorder) -> dict[str, Any]:
+def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
     with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
         # An edit that has begun ends first; none begins while this job runs. What an edit that was
         # killed has left to do is not for the scene that is made now.
         scene.begun.unlink(missing_ok=True)
     job = scene.job
     scene.map.unlink(missing_ok=True)  # the photos may be others now
-    options = MakeOptions(quality=job.quality, minutes=job.minutes, title=job.title)  # type: ignore[arg-type]
+    options = settings_from(MakeOptions, job.settings())
     with LivePage(port=0) as page:
         made = make(
             scene.inputs(), scene.made, options, overwrite=True, observer=recorder, page=page
@@ -215,13 +99,16 @@ def _make(scene: StudioScene, recorder: _Recorder) -> dict[str, Any]:
     return _result(scene, made) | {"gaussians": site.gaussians, "shown": shown}
 
 
-def _film(scene: StudioScene, recorder: _Recorder) -> dict[str, Any]:
-    file = film(finished(scene), scene.film_plan(), scene.keys, scene.film, observer=recorder)
+def _film(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
+    file = film(
+        changes.finished(scene), scene.film_plan(), scene.keys, scene.film, observer=recorder
+    )
     return {"bytes": file.stat().st_size}
 
 
 def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
-    known = made.figures
+    known, verdict = made.figures, made.verdict
+    lines = [] if verdict is None else verdict.lines(message("the scene"))
     reports = {"training": made.training.report, "photos": made.dataset_report}
     return {
         "file": made.scene.name,
@@ -230,12 +117,12 @@ def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
         "psnr": known.psnr_aligned if known.exposures else known.psnr,
         "aligned": known.exposures,
         "seconds": made.seconds,
-        "verdict": [] if made.verdict is None else made.verdict.lines(message("the scene")),
-        "reports": existing_reports(scene, reports),
+        "verdict": [str(line) for line in lines],
+        "reports": changes.existing_reports(scene, reports),
     }
 
 
-def survey_photos(scene: StudioScene) -> dict[str, Any]:
+def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
     """What `make` would use of the inputs, and the seconds that it takes at each quality.
 
     Raises: UserError: there is nothing to use.
@@ -256,36 +143,56 @@ def survey_photos(scene: StudioScene) -> dict[str, Any]:
     }
 
 
-def _answer(scene: StudioScene, words: list[str]) -> dict[str, Any]:
-    if words[0] == "survey":
-        return survey_photos(scene)
-    if words[0] == "preview":
-        return {"path": film_preview(finished(scene), scene.film_plan())}
+def _preview(scene: StudioScene, settings: Any) -> dict[str, Any]:
+    return {"path": film_preview(changes.finished(scene), scene.film_plan())}
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A short task.
+
+    Attributes:
+        run: does it for a scene with its settings; returns the answer.
+        settings: the class of the settings; None: there are none.
+        changes: whether it changes files.
+    """
+
+    run: Callable[[StudioScene, Any], dict[str, Any]]
+    settings: type | None = None
+    changes: bool = True
+
+
+VERBS = {
+    "survey": Verb(survey_photos, changes=False),
+    "preview": Verb(_preview, changes=False),
+    "export": Verb(changes.export, changes.Export),
+    "show": Verb(changes.show_scene),
+    "rename": Verb(changes.rename, changes.Title),
+    "whole": Verb(changes.show_whole),
+    "edit": Verb(changes.edit_scene, changes.Version),
+    "undo": Verb(changes.undo_edit, changes.Version),
+}
+_JOBS = {"make": _make, "film": _film}
+
+
+def _answer(verb: Verb, scene: StudioScene, given: dict[str, Any]) -> dict[str, Any]:
+    settings = from_json(verb.settings, given) if verb.settings is not None else None
+    if not verb.changes:
+        return verb.run(scene, settings)
     scene.kept.mkdir(exist_ok=True, mode=0o700)
     with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
-        if words[0] == "export":
-            return changes.export(scene, words[1])
-        if words[0] == "show":
-            return changes.show_scene(scene)
-        if words[0] == "rename":
-            return changes.rename(scene, words[1])
-        if words[0] == "whole":
-            return changes.show_whole(scene)
-        return changes.edit_scene(scene, words[1], words[0] == "undo")
-
-
-def _printed(scene: StudioScene, words: list[str]) -> int:
-    try:
-        answer = _answer(scene, words)
-    except (UserError, OSError) as error:
-        answer = {"error": _line(error)}
-    print("\n" + json.dumps(answer))
-    return 0
+        return verb.run(scene, settings)
 
 
 def main(words: list[str]) -> int:
     logging.basicConfig(level=logging.WARNING)
-    scene = StudioScene(Path(words[1]))
-    if words[0] in TASKS:
-        return run_job(scene, words[0])
-    return _printed(scene, [words[0], *words[2:]])
+    name, folder, *settings = words
+    scene = StudioScene(Path(folder))
+    if name in TASKS:
+        return run_job(scene, name)
+    try:
+        answer = _answer(VERBS[name], scene, json.loads(settings[0]) if settings else {})
+    except (UserError, OSError) as error:
+        answer = {"error": _line(error)}
+    print("\n" + json.dumps(answer))
+    return 0

@@ -1,0 +1,116 @@
+"""Requests about the library: the page, its addresses, folders of this machine, all scenes."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import Awaitable, Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import segno
+from starlette.requests import Request
+
+from snowsplat.studio.picture_requests import SUFFIXES
+from snowsplat.studio.requests import File, Studio, json_object
+from snowsplat.studio.scene_requests import summary
+from snowsplat.util.errors import UserError
+from snowsplat.util.safe_json import printable
+from snowsplat.util.theme import THEME
+
+_PAGES = Path(__file__).parent / "pages"
+_FOLDERS = 500  # that are listed
+
+
+async def page(studio: Studio, request: Request) -> Any:
+    return File(page_files()[request.url.path.strip("/")])
+
+
+async def about(studio: Studio, request: Request) -> Any:
+    path = request.query_params.get("path", "")
+    urls = [f"{url}{path}" for url in studio.addresses()]
+    codes = [segno.make(url, error="m").svg_data_uri(scale=4, border=2) for url in urls]
+    return {
+        "folder": str(studio.library.folder),
+        "addresses": [{"url": u, "code": c} for u, c in zip(urls, codes, strict=True)],
+    }
+
+
+async def browse(studio: Studio, request: Request) -> Any:
+    path = request.query_params.get("path") or str(studio.library.folder.parent)
+    return listing(Path(os.path.expanduser(path)))
+
+
+async def scenes(studio: Studio, request: Request) -> Any:
+    # A lock of another computer takes seconds to judge.
+    scenes = studio.library.scenes()
+    return await asyncio.to_thread(lambda: [summary(scene) for scene in scenes])
+
+
+async def new(studio: Studio, request: Request) -> Any:
+    wanted = await json_object(request)
+    path = str(wanted.get("path") or "").strip()
+    inputs = [Path(os.path.expanduser(path))] if path else []
+    if inputs and not inputs[0].is_absolute():
+        raise UserError(
+            "{path}: write the whole path, such as /home/me/photos", path=printable(path)
+        )
+    names = [path.name if is_folder(path) else path.stem for path in inputs]
+    title = str(wanted.get("title") or "".join(names))
+    return {"name": studio.library.new(title, inputs).name}
+
+
+#: Path, method, and answer.
+ROUTES: tuple[tuple[str, str, Callable[[Studio, Request], Awaitable[Any]]], ...] = (
+    ("/about", "GET", about),  # addresses for other devices
+    ("/browse", "GET", browse),  # folders of this machine: ?path=
+    ("/scenes", "GET", scenes),
+    ("/scenes", "POST", new),
+)
+
+
+@cache
+def page_files() -> dict[str, Path]:
+    """The files of the page, by name; "" is the page itself."""
+    files = {path.name: path for path in (*_PAGES.iterdir(), THEME)}
+    return {"": files["index.html"], **files}
+
+
+def listing(path: Path) -> dict[str, Any]:
+    """The folders in a folder of this machine, and how many photos, videos and zip files it has."""
+    try:
+        entries = sorted(path.iterdir(), key=lambda entry: entry.name.casefold())
+    except (OSError, ValueError) as error:
+        raise UserError(
+            "{path}: {getattr}",
+            path=printable(str(path)),
+            getattr=getattr(error, "strerror", None) or "no such folder",
+        ) from None
+    shown = [entry for entry in entries if not entry.name.startswith(".")]
+    folders = [entry.name for entry in shown if is_folder(entry)]
+    return {
+        "path": str(path),
+        "parent": str(path.parent),
+        "folders": folders[:_FOLDERS],
+        "files": [e.name for e in shown if e.suffix.lower() in (".mp4", ".mov", ".zip")][:_FOLDERS],
+        "photos": sum(entry.suffix.lower() in SUFFIXES for entry in shown),
+    }
+
+
+def is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
+
+
+def own_address() -> str | None:
+    """The address of this machine in its network, for phones that do not know its name."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+            return str(probe.getsockname()[0])
+        except OSError:
+            return None
