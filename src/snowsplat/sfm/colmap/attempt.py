@@ -21,7 +21,7 @@ from snowsplat.sfm.colmap.database import (
     set_cameras,
 )
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress, extract_features
-from snowsplat.sfm.colmap.lenses.lens import Lens, Refine, misfit, settled, with_all_parameters
+from snowsplat.sfm.colmap.lenses.lens import Lens, Refine, misfit, settle_lens, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
 from snowsplat.sfm.colmap.options import Effort, detection_size
 from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
@@ -183,7 +183,7 @@ class AttemptRunner:
             excluded = repaired.excluded
             check = f"; {repaired.description}" if repaired.description else ""
             refine = _refine_with(mapping)
-            found = settled(repaired.model, self.photos, lens, refine)
+            found = settle_lens(repaired.model, self.photos, lens, refine)
             mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
             if found.model:
                 model = with_all_parameters(found.model, self.photos, lens, refine, found.held)

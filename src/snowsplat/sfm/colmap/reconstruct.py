@@ -276,7 +276,7 @@ class PoseEstimation:
         else:
             focals = camera_groups.own_focals(best.models[0], self.threads)
         for _ in range(_ZOOM_ATTEMPTS):
-            before, several = self.photos, camera_groups.grouped(one, focals)
+            before, several = self.photos, camera_groups.group_by_zoom(one, focals)
             if several is None or camera_ids(several) == camera_ids(before):
                 break
             self.runner.photos = several

@@ -23,8 +23,8 @@ from snowsplat.sfm.ingest.content.sharpness import BLACK, BLURRED, FLAT, WHITE
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photos.gather_photos import (
     Planned,
-    evenly_spread,
     plan_photos,
+    spread_evenly,
     write_photos,
 )
 from snowsplat.sfm.ingest.photos.set_aside import set_fixed_parts_aside
@@ -86,7 +86,7 @@ def gather(
         sources.photos, options.size, left_out, options.panoramas, options.as_stored
     )
     if options.photos is not None:
-        planned = evenly_spread(planned, options.photos)
+        planned = spread_evenly(planned, options.photos)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
     around = [_shows_all_around(clip, options) for _, clip in clips]
     if in_place:

@@ -22,7 +22,7 @@ from snowsplat.sfm.orient.marker import MarkerScale
 from snowsplat.sfm.orient.positions import Alignment, align
 from snowsplat.sfm.orient.up import (
     Evidence,
-    combined,
+    combine_evidence,
     of_cameras,
     of_sensors,
     robust_mean,
@@ -180,7 +180,7 @@ def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, lis
     if not measured:
         ground = of_ground(cameras, evidence[-1])
         evidence += [] if ground is None else [ground]
-    up, contradictions = combined(evidence)
+    up, contradictions = combine_evidence(evidence)
     return up, doubts + contradictions
 
 

@@ -153,7 +153,7 @@ def robust_mean(units: np.ndarray) -> tuple[np.ndarray, float]:
     return mean, float(np.median(angles))
 
 
-def combined(evidence: Sequence[Evidence]) -> tuple[Evidence, list[Message]]:
+def combine_evidence(evidence: Sequence[Evidence]) -> tuple[Evidence, list[Message]]:
     """The most likely direction, and contradictions as text for users.
 
     ``evidence`` begins with what is trusted most. What contradicts the direction found from the

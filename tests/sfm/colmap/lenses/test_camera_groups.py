@@ -16,7 +16,7 @@ from snowsplat.sfm.colmap.lenses.camera_groups import (
     better,
     describe,
     focals_of,
-    grouped,
+    group_by_zoom,
     own_focals,
     separate,
 )
@@ -51,7 +51,7 @@ def attempted(folder, walk, exif=None):
     dataset.distorted.mkdir()
     walk.write(dataset.database, exif, RADIAL)
     progress = WorkerProgress(silent)
-    job = PoseEstimation(dataset, photos, SfmOptions("SIMPLE_RADIAL"), 1, progress)
+    job = PoseEstimation(dataset, photos, SfmOptions(camera_model="SIMPLE_RADIAL"), 1, progress)
     matched = Matched(dataset.database, EFFORTS["draft"], PairChoice(list(walk.matches), ""), 1.0)
     job.matched, job.mapper, job.lens = matched, "incremental", RADIAL
     job.evidence = gather_evidence(dataset.database, photos, 100)
@@ -103,28 +103,28 @@ def test_each_photo_of_a_slow_zoom_gets_a_camera(tmp_path):
     focals = focals_of(mapped(tmp_path, walk, separate))
     found = [focals[i + 1] for i in range(12)]
     np.testing.assert_allclose(found, walks.FOCAL * zooms, rtol=0.03)
-    assert len(set(camera_ids(grouped(walk.photos(None), focals)))) == 12
+    assert len(set(camera_ids(group_by_zoom(walk.photos(None), focals)))) == 12
 
 
 def test_small_differences_make_no_groups():
     photos = WALK.photos(None)
     focals = {i + 1: 500 * (1 + 0.02 * (i % 3)) for i in range(12)}
-    assert grouped(photos, focals) is None
+    assert group_by_zoom(photos, focals) is None
 
 
 def test_a_photo_without_a_focal_length_gets_a_camera_of_its_own():
     photos = WALK.photos(None)
     focals = {i + 1: 500.0 if i < 6 else 800.0 for i in range(11)}
-    cameras = camera_ids(grouped(photos, focals))
+    cameras = camera_ids(group_by_zoom(photos, focals))
     assert [cameras.count(number) for number in cameras] == [6] * 6 + [5] * 5 + [1]
 
 
 def test_photos_with_exif_keep_their_camera():
     photos = WALK.photos(500.0)
     focals = {i + 1: 500.0 if i < 6 else 800.0 for i in range(12)}
-    assert grouped(photos, focals) is None
+    assert group_by_zoom(photos, focals) is None
     scans = [dataclasses.replace(photo, group="scan", focal=None) for photo in photos[6:]]
-    assert grouped([*photos[:6], *scans], focals) is None
+    assert group_by_zoom([*photos[:6], *scans], focals) is None
 
 
 def test_more_cameras_alone_are_not_better(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, settled
+from snowsplat.sfm.colmap.lenses.lens import Lens, cameras_of, findings_of, settle_lens
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.progress import silent
 
@@ -97,7 +97,7 @@ def test_a_walk_straight_ahead(tmp_path):
 def test_photos_that_do_not_determine_the_focal_length_keep_that_of_exif(tmp_path):
     walk = walks.forward()
     (model,), refine = mapped(tmp_path, walk, 500.0, Lens().fixed, forward=True)
-    found = settled(model, walk.photos(500.0), Lens().fixed, refine)
+    found = settle_lens(model, walk.photos(500.0), Lens().fixed, refine)
     assert found.held
     assert found.notes == []
     assert found.model.cameras[1].mean_focal_length() == 500.0
@@ -107,7 +107,7 @@ def test_photos_that_do_not_determine_two_focal_lengths_get_one(tmp_path):
     walk = walks.facing()
     (model,), refine = mapped(tmp_path, walk, 500.0, Lens())
     assert abs(model.cameras[1].focal_length_x / model.cameras[1].focal_length_y - 1) > 0.005
-    found = settled(model, walk.photos(500.0), Lens(), refine)
+    found = settle_lens(model, walk.photos(500.0), Lens(), refine)
     assert found.model.cameras[1].model_name == "RADIAL"
     assert not found.held
 
@@ -118,7 +118,7 @@ def test_pixels_that_are_not_square(tmp_path):
     for pixels in walk.pixels:
         pixels[:, 0] *= 1.2
     (model,), refine = mapped(tmp_path, walk, 500.0, Lens())
-    found = settled(model, walk.photos(500.0), Lens(), refine)
+    found = settle_lens(model, walk.photos(500.0), Lens(), refine)
     camera = found.model.cameras[1]
     assert camera.focal_length_x / camera.focal_length_y == pytest.approx(1.2, abs=0.01)
 
@@ -127,7 +127,7 @@ def test_pixels_that_are_not_square(tmp_path):
 def test_a_wrong_focal_length_in_exif_is_told(tmp_path, exif):
     walk = walks.sideways()
     (model,), refine = mapped(tmp_path, walk, exif, Lens())
-    found = settled(model, walk.photos(exif), Lens(), refine)
+    found = settle_lens(model, walk.photos(exif), Lens(), refine)
     assert not found.held
     assert found.model.cameras[1].mean_focal_length() == pytest.approx(walks.FOCAL, rel=0.01)
     (note,) = found.notes
@@ -137,7 +137,7 @@ def test_a_wrong_focal_length_in_exif_is_told(tmp_path, exif):
 def test_a_right_lens_is_kept_as_it_is(tmp_path):
     walk = walks.sideways()
     (model,), _ = mapped(tmp_path, walk, 505.0, Lens())
-    found = settled(model, walk.photos(505.0), Lens(), refine=None)
+    found = settle_lens(model, walk.photos(505.0), Lens(), refine=None)
     assert found.model is model
 
 
@@ -148,7 +148,7 @@ def test_a_panorama_is_kept_as_it_is(tmp_path):
     camera = model.cameras[1]
     camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
     camera.params = [camera.width, camera.height]
-    found = settled(model, walk.photos(None), Lens(), refine=None)
+    found = settle_lens(model, walk.photos(None), Lens(), refine=None)
     assert found.model is model
     assert (found.held, found.notes) == (False, [])
 
@@ -160,7 +160,7 @@ def test_an_impossible_lens_is_replaced(tmp_path):
     camera = model.cameras[1]
     camera.model = pycolmap.CameraModelId.OPENCV
     camera.params = [480.0, 460.0, 320.0, 240.0, 0.9, -1.2, 0.0, 0.0]
-    found = settled(model, walk.photos(None), Lens(), refine)
+    found = settle_lens(model, walk.photos(None), Lens(), refine)
     assert found.held
     assert found.model.cameras[1].params[0] == cameras_of(walk.photos(None), Lens())[0].params[0]
     assert all(not finding.impossible for finding in findings_of(found.model.cameras[1], None))

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from snowsplat.sfm.ingest.photos.exif import ExifInfo
-from snowsplat.sfm.ingest.photos.mask_files import read_mask, shrunk, write_mask
+from snowsplat.sfm.ingest.photos.mask_files import read_mask, shrink_mask, write_mask
 from snowsplat.sfm.ingest.photos.photo_files import Header
 from snowsplat.util.errors import UserError
 
@@ -58,10 +58,10 @@ def test_a_rotation_by_180_degrees_is_taken_as_stored(tmp_path):
 def test_a_pixel_of_a_smaller_mask_is_set_if_all_covered_pixels_are():
     counts = np.ones((40, 60), bool)
     counts[0, 0] = False
-    small = shrunk(counts, (30, 20))
+    small = shrink_mask(counts, (30, 20))
     assert not small[0, 0]
     assert small.sum() == 599
-    odd = shrunk(counts, (23, 17))
+    odd = shrink_mask(counts, (23, 17))
     assert (odd.shape, odd[0, 0], odd[5:, 5:].all()) == ((17, 23), False, True)
 
 

@@ -8,9 +8,9 @@ times as near, so neither its pose nor its reprojection error shows the mistake.
 Therefore each photo gets a focal length of its own, and bundle adjustment estimates all of them,
 together with poses and points (`own_focals`). These estimates agree within 1% if the photos have
 one focal length and determine it, also if the camera focuses while filming. If they form separate
-groups, `grouped` gives each group a camera of its own. The groups are only a proposal: a flat scene
-does not determine the focal length of each photo. Whether the groups are right is decided by the
-model that is estimated with them (`better`).
+groups, `group_by_zoom` gives each group a camera of its own. The groups are only a proposal: a flat
+scene does not determine the focal length of each photo. Whether the groups are right is decided by
+the model that is estimated with them (`better`).
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def focals_of(model: pycolmap.Reconstruction) -> dict[int, float]:
     }
 
 
-def grouped(photos: Sequence[Photo], focals: Mapping[int, float]) -> list[Photo] | None:
+def group_by_zoom(photos: Sequence[Photo], focals: Mapping[int, float]) -> list[Photo] | None:
     """``photos`` with a group for each zoom of their cameras; None: all cameras have one.
 
     Args:

@@ -5,10 +5,10 @@ photos are few, then several focal lengths explain the matches equally well, and
 arbitrary: the poses are bent, although the reprojection error is small. So an estimate is compared
 with what is known about lenses (`lens_findings`), and with the focal length in EXIF.
 
-An estimate in doubt is compared with a model whose focal length is held (`settled`). If this model
-agrees equally well with the matches, then the photos do not determine the focal length, and the
-held one is better. Otherwise the photos contradict it, and the estimate is right. In the same way,
-a lens with one focal length is tried if the two of OPENCV differ: pixels are square.
+An estimate in doubt is compared with a model whose focal length is held (`settle_lens`). If this
+model agrees equally well with the matches, then the photos do not determine the focal length, and
+the held one is better. Otherwise the photos contradict it, and the estimate is right. In the same
+way, a lens with one focal length is tried if the two of OPENCV differ: pixels are square.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Lens:
 
     @property
     def detailed(self) -> list[str]:
-        """The camera models that `settled` tries, the one with the most parameters first."""
+        """The camera models that `settle_lens` tries, the one with the most parameters first."""
         return ["auto", "SIMPLE_RADIAL", "SIMPLE_PINHOLE"] if self.model == "auto" else [self.model]
 
     @property
@@ -335,7 +335,7 @@ Refine = Callable[
 ]
 
 
-def settled(
+def settle_lens(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], lens: Lens, refine: Refine
 ) -> Settled:
     """Replace a lens in doubt by a possible one.

@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database, verified_pairs
-from snowsplat.sfm.colmap.pairs.choice import following, numbered_series
+from snowsplat.sfm.colmap.pairs.choice import numbered_series, pairs_following
 from snowsplat.util.components import components
 
 # Poses are not compared with pairs that have fewer verified matches: unrelated photos can have
@@ -124,7 +124,7 @@ def following_pairs(names: Mapping[int, str], max_step: int = _MAX_STEP) -> set[
     ``max_step``: the largest difference of their positions in the series of names.
     """
     steps = range(1, max_step + 1)
-    return set().union(*(following(series, steps) for series in numbered_series(names)))
+    return set().union(*(pairs_following(series, steps) for series in numbered_series(names)))
 
 
 def database_names(database: pycolmap.Database) -> dict[int, str]:

@@ -120,7 +120,7 @@ def choose_pairs(
         rules.append("frames of a video with the following frames")
     overlap = round(_NUMBERED_SHARE * effort.overlap)
     names = {i: photo.name for i, photo in enumerate(photos) if photo.sequence is None}
-    numbered = [following(series, range(1, overlap + 1)) for series in numbered_series(names)]
+    numbered = [pairs_following(series, range(1, overlap + 1)) for series in numbered_series(names)]
     if numbered:
         pairs |= set().union(*numbered)
         rules.append("photos with the next photos by name")
@@ -162,7 +162,7 @@ def numbered_series(names: Mapping[int, str]) -> list[list[int]]:
     return [[i for _, i in sorted(series)] for series in by_prefix.values() if len(series) > 1]
 
 
-def following(series: Sequence[int], steps: Sequence[int]) -> Pairs:
+def pairs_following(series: Sequence[int], steps: Sequence[int]) -> Pairs:
     """Pairs (i < j) of entries of ``series`` whose positions differ by one of ``steps``."""
     pairs = set()
     for position, i in enumerate(series):
@@ -187,7 +187,7 @@ def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
     steps = list(range(1, overlap + 1))
     while steps[-1] * 2 < len(sequence):
         steps.append(steps[-1] * 2)
-    return following(sequence, steps)
+    return pairs_following(sequence, steps)
 
 
 def _unlike_next_frames(

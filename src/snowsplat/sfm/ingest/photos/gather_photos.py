@@ -102,7 +102,7 @@ def _as_panorama(header: Header) -> Header:
     return replace(header, panorama=header.panorama or Panorama())
 
 
-def evenly_spread(planned: Sequence[Planned], count: int) -> list[Planned]:
+def spread_evenly(planned: Sequence[Planned], count: int) -> list[Planned]:
     """At most ``count`` of the photos, at equal distances in their order, and the last one."""
     if count >= len(planned):
         return list(planned)

@@ -10,7 +10,7 @@ from PIL.ExifTags import Base
 
 from snowsplat.data.maps.mask_pixels import has_shape, mask_levels
 from snowsplat.data.photos.image_file import reason_of
-from snowsplat.sfm.ingest.photos.photo_files import Header, made_upright, open_image
+from snowsplat.sfm.ingest.photos.photo_files import Header, open_image, turn_upright
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
 
@@ -43,7 +43,7 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
         ) from None
     stored, upright = (photo.width, photo.height), photo.size(None)
     if not has_orientation and has_shape(image.size, stored):
-        image = made_upright(image, photo.exif.orientation)
+        image = turn_upright(image, photo.exif.orientation)
     elif not has_shape(image.size, upright):
         raise UserError(
             "{path}: the mask is {width}x{height}, but its photo is {upright}x{upright2}; make a "
@@ -54,10 +54,10 @@ def read_mask(path: Path, photo: Header, size: tuple[int, int]) -> np.ndarray:
             upright=upright[0],
             upright2=upright[1],
         )
-    return shrunk(mask_levels(image) >= 128, size)
+    return shrink_mask(mask_levels(image) >= 128, size)
 
 
-def shrunk(used: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def shrink_mask(used: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(H, W) bool resized to ``size`` (width, height): True if all covered pixels are True."""
     if used.shape == size[::-1]:
         return used

@@ -192,7 +192,7 @@ def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Im
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:
         image = image.convert("RGB")
-    return resized(image, header.size(longest))
+    return resize_photo(image, header.size(longest))
 
 
 def decode_small(path: Path, side: int) -> Image.Image:
@@ -209,7 +209,7 @@ def decode_small(path: Path, side: int) -> Image.Image:
         raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
 
 
-def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
+def resize_photo(image: Image.Image, size: tuple[int, int]) -> Image.Image:
     """Resize with a Lanczos filter; colours of transparent pixels do not affect their neighbours.
 
     ``size``: width and height in pixels.
@@ -246,7 +246,7 @@ def link_or_copy(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
 
 
-def made_upright(image: Image.Image, orientation: int) -> Image.Image:
+def turn_upright(image: Image.Image, orientation: int) -> Image.Image:
     """Rotate and mirror an image as the EXIF ``orientation`` (1 to 8) says."""
     exif = image.getexif()
     exif[Base.Orientation] = orientation

@@ -37,7 +37,7 @@ from snowsplat.sfm.ingest.content.sharpness import (
     sharpness,
     why_unusable,
 )
-from snowsplat.sfm.ingest.photos.photo_files import resized, save
+from snowsplat.sfm.ingest.photos.photo_files import resize_photo, save
 from snowsplat.sfm.ingest.video.clip import (
     Clip,
     decoded_frames,
@@ -313,7 +313,7 @@ def _write(best: _Sharpest, clip: Clip, path: Path, size: int | None, crop: Crop
     if turns:  # counter-clockwise, as in Pillow
         image = image.transpose(Image.Transpose(1 + turns))
         width, height = (height, width) if turns % 2 else (width, height)
-    image = resized(image, scaled_size(width, height, size))
+    image = resize_photo(image, scaled_size(width, height, size))
     save(image, path)
     return Frame(path.name, best.seconds, image.width, image.height)
 
