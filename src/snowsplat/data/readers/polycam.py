@@ -70,15 +70,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         pose = parse.from_opengl(file, np.reshape(entries, (3, 4)))
         depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
         confidence = keyframes / "confidence" / f"{file.stem}.png"
-        found.add(
-            photos,
-            photo,
-            lens,
-            pose,
-            depth=depth,
-            depth_unit=_MILLIMETRE,
-            depth_confidence=confidence if is_file(confidence) else None,
-        )
+        known = confidence if is_file(confidence) else None
+        maps = {"depth": depth, "depth_unit": _MILLIMETRE, "depth_confidence": known}
+        found.add(photos, photo, lens, pose, **maps)
     return found
 
 

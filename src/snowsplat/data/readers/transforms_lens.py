@@ -19,7 +19,6 @@ from snowsplat.util.safe_json import quoted
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: The models that are read, by their names here.
 _MODELS = {name: model for model in models.MODELS.values() for name in model.in_transforms}
-_ARIA_COEFFICIENTS = 12
 
 
 def is_panorama(values: Mapping[str, Any]) -> bool:
@@ -48,7 +47,7 @@ def lens_of(
         model = "F-Theta"
     kind = _MODELS.get(model)
     if kind is not None and kind.equation is models.aria_fisheye:
-        numbers = _distortion_params(where, values, _ARIA_COEFFICIENTS)
+        numbers = _distortion_params(where, values, len(kind.parameters) - len(intrinsics))
         return Lens(kind, width, height, (*intrinsics, *numbers))
     if kind is None:
         raise UserError(
