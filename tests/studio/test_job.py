@@ -17,6 +17,7 @@ from PIL import Image
 
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.project.studio_scene import StudioScene
+from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.camera_json import write_cameras
 from snowsplat.sfm.cost import Speed
@@ -153,9 +154,10 @@ def test_given_cameras_have_a_map(library):
     scene = library.new("a", [])
     recorder = Recorder(scene)
     pose = torch.eye(3, 4, dtype=torch.float64)
-    (scene.made / "scene").mkdir(parents=True)
-    cameras = [("one", Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose))]
-    write_cameras(scene.made / "scene/cameras.json", cameras)
+    training = TrainingFolder(scene.made / "scene")
+    settings = {"sh_degree": 0, "background": "black"}
+    training.write_settings(DatasetSettings("photos"), settings)
+    write_cameras(training.cameras, [("one", Camera(60, 40, 50.0, 50.0, 30.0, 20.0, pose))])
     recorder.step(Progress(1, 1.0, 100, 5000, 1))
     assert scene.map.read_text("utf-8").startswith("<svg")
     assert not scene.state()["notes"]
