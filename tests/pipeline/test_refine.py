@@ -32,6 +32,7 @@ def test_the_photos_improve_a_decimated_scene(dataset, tmp_path, monkeypatch):
 
 
 def test_edits_that_hide_a_part_are_refused(dataset, tmp_path):
+    (tmp_path / "a.ply").touch()
     for edits in (
         Edits(),
         Edits(decimate=9, crop=(0, 0, 0, 1, 1, 1)),
