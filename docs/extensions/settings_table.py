@@ -66,7 +66,7 @@ def markdown() -> str:
             if declared.metavar is not None:
                 flags = ("--" + full.replace("_", "-"), *declared.aliases)
                 names += "".join(f" `{flag}`" for flag in flags)
-            valid = allowed(hint, declared).replace("|", "\\|")
+            valid = str(allowed(hint, declared)).replace("|", "\\|")
             cells = (names, valid, _values(full), declared.help.replace("|", "\\|"))
             lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
