@@ -76,5 +76,9 @@ nitpick_ignore_regex = [
     ),
     ("py:class", r".*\._\w+|Color|Depth|Split"),
     # types of snowsplat that are not public: the API pages describe the public names only
-    ("py:class", r"snowsplat\..*|Alignment|Batch|DatasetSettings|DepthKind|Gradients|LivePage|Moment|PlacedPhoto|Shards|Start"),
+    (
+        "py:class",
+        r"snowsplat\..*|Alignment|Batch|DatasetSettings|DepthKind|Gradients|LivePage|Moment",
+    ),
+    ("py:class", r"PlacedPhoto|Shards|Start"),
 ]

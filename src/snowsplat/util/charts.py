@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 from markupsafe import Markup
 
@@ -22,6 +23,9 @@ _BOTTOM = 40
 _TICKS_X = 6
 _TICKS_Y = 5
 
+#: CSS for pages and notebooks with charts; the colours are the variables of `theme.css`.
+STYLE = (Path(__file__).parent / "report" / "charts.css").read_text(encoding="utf-8")
+
 _Points = Sequence[tuple[float, float]]
 
 
@@ -34,7 +38,7 @@ def chart(
     dots: bool = False,
     from_zero: bool = True,
 ) -> Markup:
-    """An SVG element with a curve, for pages with `report/report.css`; "" if no point is finite.
+    """An SVG element with a curve, for pages with `STYLE`; "" if no point is finite.
 
     Args:
         points: (x, y) with ascending x. Points that are not finite are skipped.
