@@ -1,4 +1,5 @@
-"""The directive `settings`: tables of all settings of a training, from their declarations.
+"""The directive `settings`: tables of the settings of a training and of the options of functions,
+from their declarations.
 
 ```{settings}
 ```
@@ -11,6 +12,14 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from snowsplat.pipeline.options.benchmark import BenchmarkOptions, PlanOptions
+from snowsplat.pipeline.options.convert import Edits
+from snowsplat.pipeline.options.make import MakeOptions
+from snowsplat.pipeline.options.publish import PublishOptions
+from snowsplat.pipeline.options.surface import MeshOptions
+from snowsplat.pipeline.options.train import TrainOptions
+from snowsplat.pipeline.options.video import VideoOptions
+from snowsplat.sfm.options import DatasetOptions
 from snowsplat.training.settings import (
     RECIPES,
     AdaptiveDensity,
@@ -21,6 +30,7 @@ from snowsplat.training.settings import (
     recipe,
 )
 from snowsplat.training.settings.names import PARTS, setting_names
+from snowsplat.util.flags import flags_of
 from snowsplat.util.settings import allowed, declarations
 
 _TITLES = {
@@ -29,6 +39,18 @@ _TITLES = {
     McmcDensity: "MCMC density control (`McmcDensity`)",
     LearningRates: "Learning rates",
     DecayRates: "Decay",
+}
+# What is set by flags, and is not in the tables above.
+_OPTIONS = {
+    MakeOptions: "`make`: `MakeOptions`",
+    DatasetOptions: "`sfm`: `DatasetOptions`",
+    TrainOptions: "`train`, `resume`: `TrainOptions`",
+    VideoOptions: "`render_video`: `VideoOptions`",
+    Edits: "`convert`: `Edits`",
+    MeshOptions: "`write_mesh`, `write_points`: `MeshOptions`",
+    PublishOptions: "`publish`: `PublishOptions`",
+    BenchmarkOptions: "`benchmark`: `BenchmarkOptions`",
+    PlanOptions: "`plan_blocks`: `PlanOptions`",
 }
 
 
@@ -69,6 +91,15 @@ def markdown() -> str:
             valid = str(allowed(hint, declared)).replace("|", "\\|")
             cells = (names, valid, _values(full), declared.help.replace("|", "\\|"))
             lines.append(f"| {' | '.join(cells)} |")
+        lines.append("")
+    for kind, title in _OPTIONS.items():
+        lines += [f"## {title}", "", "| option | valid | default | |", "|---|---|---|---|"]
+        for flag in flags_of(kind):
+            if flag.path[0] != "settings":  # those of the training
+                names = " ".join(f"`{name}`" for name in (".".join(flag.path), *flag.spellings))
+                valid = str(allowed(flag.hint, flag.declared)).replace("|", "\\|")
+                cells = (names, valid, flag.default, flag.declared.help.replace("|", "\\|"))
+                lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
 

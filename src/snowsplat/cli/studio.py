@@ -61,7 +61,8 @@ class Studio(Command):
             self._open(library, running.address)
 
     def _serve(self, library: Library, killed: Address | None) -> None:
-        from snowsplat.studio.app import own_address, studio_app
+        from snowsplat.studio.app import studio_app
+        from snowsplat.studio.library_requests import own_address
         from snowsplat.studio.one_studio import Address, write_address
 
         servers: list[WebServer] = []

@@ -56,5 +56,5 @@ def film_command(scene: StudioScene, plan: PageFilm) -> str:
 
 def make_command(scene: StudioScene, job: Job) -> str:
     """The command line that makes the scene."""
-    inputs = job.inputs or [scene.photos]
+    inputs = job.inputs or [str(scene.photos)]
     return command_line("make", inputs, ["-o", scene.made], words(MakeOptions, job.settings()))

@@ -93,7 +93,7 @@ async def survey(studio: Studio, request: Request, scene: StudioScene) -> Any:
 async def start(studio: Studio, request: Request, scene: StudioScene) -> Any:
     wanted = await json_object(request)
     title = safe_title(str(wanted.get("title") or scene.job.title))
-    given = {name: wanted.get(name) for name in ("quality", "minutes")}
+    given: dict[str, Any] = {name: wanted.get(name) for name in ("quality", "minutes")}
     MakeOptions(**given)  # says what is wrong
     scene.inputs()
     if studio.locks[scene.name, "edit"].locked():

@@ -81,12 +81,16 @@ class Flag:
         return given == "on" if self.type == Optional[Literal["on", "off"]] else given  # noqa: UP045
 
 
-@cache
 def flags_of(kind: type) -> tuple[Flag, ...]:
     """The arguments and flags of a class of settings, in the order of its fields.
 
     Those of a base class come after those of the class itself.
     """
+    return _known_flags(kind)
+
+
+@cache
+def _known_flags(kind: type) -> tuple[Flag, ...]:
     own = {name for base in kind.__mro__[1:] for name in getattr(base, "__annotations__", ())}
     ordered = sorted(declarations(kind), key=lambda each: each[0] in own)
     values = {each.name: each.default for each in fields(kind)}
@@ -144,7 +148,8 @@ def settings_from(kind: type[_Settings], given: Mapping[str, Any]) -> _Settings:
 
 
 def _nested(kind: type[_Settings], values: dict[str, Any]) -> _Settings:
-    hints = {name: hint for name, hint, _ in declarations(kind)}
+    fields_of: type = kind
+    hints = {name: hint for name, hint, _ in declarations(fields_of)}
     made = {
         name: _nested(hints[name], value)
         if isinstance(value, dict) and get_origin(hints[name]) is None
