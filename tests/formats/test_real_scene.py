@@ -1,9 +1,9 @@
-"""A scene trained by the 3DGS reference implementation, rendered after a round trip per format."""
+"""Scenes rendered after a round trip: one of the 3DGS reference implementation, and random ones."""
 
 import pytest
 import torch
 
-from snowsplat.evaluation.metrics import psnr
+from snowsplat.evaluation import metrics
 from snowsplat.formats import FORMATS, read_gaussians, write_gaussians
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
@@ -28,4 +28,13 @@ def test_the_rendered_image_is_nearly_the_same(tmp_path, shared, format):
     write_gaussians(path, scene)
     before, after = (render(g, camera).image for g in (scene, read_gaussians(path)))
     assert before.std() > 0.1  # the image is not empty
-    assert psnr(after.clamp(0, 1), before.clamp(0, 1)) > LEAST.get(format.name, 38.0)
+    assert metrics.psnr(after.clamp(0, 1), before.clamp(0, 1)) > LEAST.get(format.name, 38.0)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "degree", "least"), [(".splat", 0, 40), (".compressed.ply", 3, 35), (".spz", 3, 40)]
+)
+def test_a_random_scene_looks_nearly_the_same(tmp_path, make_scene, psnr, suffix, degree, least):
+    scene, path = make_scene(500, degree), tmp_path / f"a{suffix}"
+    write_gaussians(path, scene)
+    assert psnr(scene, read_gaussians(path)) > least

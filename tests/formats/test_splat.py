@@ -63,12 +63,6 @@ def test_round_trip_is_as_precise_as_the_bytes_allow(
     assert read.sh_degree == 0  # the highest degree of the format
 
 
-def test_the_rendered_image_is_nearly_the_same(tmp_path, make_scene, psnr):
-    scene = make_scene(500, 0)
-    write_gaussians(tmp_path / "a.splat", scene)
-    assert psnr(scene, read_gaussians(tmp_path / "a.splat")) > 40
-
-
 def test_huge_and_tiny_scales_stay_finite(tmp_path, make_scene):
     scene = make_scene(3, 0)
     scene.log_scales[0], scene.log_scales[1] = 1000, -1000

@@ -170,12 +170,6 @@ def test_round_trip_is_as_precise_as_the_bytes_allow(
     torch.testing.assert_close(read.sh_rest[:, 3:], sh[:, 3:], rtol=0, atol=2.6 / 128)
 
 
-def test_the_rendered_image_is_nearly_the_same(tmp_path, make_scene, psnr):
-    scene = make_scene(500, 3)
-    write_gaussians(tmp_path / "a.spz", scene)
-    assert psnr(scene, read_gaussians(tmp_path / "a.spz")) > 40
-
-
 def test_a_second_round_trip_changes_nothing(tmp_path, make_scene):
     write_gaussians(tmp_path / "a.spz", make_scene(300, 3))
     once = read_gaussians(tmp_path / "a.spz")

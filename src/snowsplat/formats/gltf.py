@@ -264,6 +264,7 @@ def _coefficients(degree: int) -> list[str]:
     ]
 
 
+@np.errstate(over="ignore", under="ignore")
 def write_glb(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write one mesh of splats in one node, atomically.
 

@@ -130,8 +130,7 @@ def linear_values(cut: Cut, gaussians: GaussianArrays) -> tuple[np.ndarray, np.n
     """
     cut_scales(cut, gaussians.log_scales, *LOG_SCALES, step=0)
     scales = np.exp(np.clip(gaussians.log_scales, *LOG_SCALES))
-    with np.errstate(over="ignore", under="ignore"):
-        opacities = (1 / (1 + np.exp(-gaussians.opacity_logits))).astype(np.float32)
+    opacities = (1 / (1 + np.exp(-gaussians.opacity_logits))).astype(np.float32)
     return scales, opacities, np.concatenate([gaussians.sh_dc, gaussians.sh_rest], 1)
 
 

@@ -145,6 +145,7 @@ def _splats(prim: Any) -> GaussianArrays:
     )
 
 
+@np.errstate(over="ignore", under="ignore")
 def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
     """Write one prim of splats, atomically; the suffix selects the kind of file.
 
