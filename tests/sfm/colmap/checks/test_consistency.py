@@ -12,9 +12,8 @@ from snowsplat.sfm.colmap.checks.consistency import (
     _without_bridged_tears,
     agreement,
     agreement_of,
-    find_parts,
-    unconfirmed_photos,
 )
+from snowsplat.sfm.colmap.checks.parts import find_parts, unconfirmed_photos
 
 
 def chain(photos, share=0.7, matches=400, neighbours=3):

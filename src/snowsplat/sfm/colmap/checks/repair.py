@@ -13,9 +13,8 @@ from snowsplat.sfm.colmap.checks.consistency import (
     CheckedPair,
     agreement_of_model,
     check_pairs,
-    find_parts,
-    unconfirmed_photos,
 )
+from snowsplat.sfm.colmap.checks.parts import find_parts, unconfirmed_photos
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.options import MIN_PHOTOS
