@@ -27,6 +27,7 @@ from snowsplat.studio import job, worker
 from snowsplat.studio.app import POLICY, studio_app
 from snowsplat.studio.library import Library
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import as_message
 from snowsplat.viewer.http.server import WebServer
 
 from .. import fork_server
@@ -96,8 +97,12 @@ class Studio:
         response = connection.getresponse()
         answer = response.read()
         connection.close()
-        is_json = response.headers.get("Content-Type") == "application/json"
-        return response.status, json.loads(answer) if is_json else answer
+        if response.headers.get("Content-Type") != "application/json":
+            return response.status, answer
+        value = json.loads(answer)
+        if isinstance(value, dict) and isinstance(value.get("error"), dict):
+            value["error"] = value["error"]["en"]
+        return response.status, value
 
 
 @pytest.fixture
@@ -124,7 +129,7 @@ def in_process(monkeypatch) -> None:
             worker.main([verb, str(scene.folder), json.dumps(settings)])
         answer = json.loads(printed.getvalue().splitlines()[-1])
         if "error" in answer:
-            raise UserError(answer["error"])
+            raise UserError(as_message(answer["error"]))
         return answer
 
     monkeypatch.setattr(job, "work", work)
@@ -165,7 +170,7 @@ def finished(library) -> StudioScene:
     write_gaussians(file, gaussians)
     publish(file, scene.site)
     scene.change(quality="draft")
-    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": []}
+    facts = {"gaussians": N, "bytes": 1, "psnr": None, "seconds": 1.0, "verdict": None}
     result = {"file": file.name, "aligned": False, "reports": {}, **facts}
     result["shown"] = [str(file.stat().st_mtime_ns), scene.job.title]
     scene.write_state({"outcome": "done", "result": result})

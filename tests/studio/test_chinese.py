@@ -23,8 +23,10 @@ from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.ingest.video.video_frames import SAME_VIEW
 from snowsplat.studio.library import Library
 from snowsplat.studio.library_requests import listing
+from snowsplat.studio.texts import in_languages
 from snowsplat.studio.uploads import Upload, safe_path, write_part
 from snowsplat.util.errors import UserError, message_of
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import Holder
 
 _PAGES = Path(__file__).parents[2] / "src/snowsplat/studio/pages"
@@ -32,11 +34,12 @@ _PAGES = Path(__file__).parents[2] / "src/snowsplat/studio/pages"
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
 
 
-def translated(lines: list[str]) -> list[str]:
-    script = "".join(
-        file.read_text("utf-8") for file in (_PAGES / "chinese.js", _PAGES / "told.js")
-    )
-    script += f"console.log(JSON.stringify({json.dumps(lines)}.map(snowsplatChinese)))"
+def translated(texts: list[object]) -> list[str]:
+    """As `told` of text.js."""
+    script = "".join((_PAGES / name).read_text("utf-8") for name in ("chinese.js", "told.js"))
+    script += "const choose = (en, zh, known) => (known === en ? zh : known);"
+    script += "const told = ({ en, zh }) => choose(en, zh, snowsplatChinese(en));"
+    script += f"console.log(JSON.stringify({json.dumps([*map(in_languages, texts)])}.map(told)))"
     shown = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
     return json.loads(shown.stdout)
 
@@ -60,7 +63,7 @@ def test_progress_and_verdict():
         *described("all", {"steps": 90, "photos": 50}),
         *described("all", {"steps": 90, "photos": 50, "left_out": 2}),
         *described("all", {"steps": 0, "why_not": "something moves in the photos"}),
-        Verdict.of([reason]).lines("The scene")[0],
+        Verdict.of([reason]).head(message("the scene")),
         *("registered photos", "photos with features", "matched pairs", "verified pairs"),
     ]
     chinese = translated(lines)
@@ -69,11 +72,11 @@ def test_progress_and_verdict():
     assert chinese[0] == "3 张照片中有 3 张求出了位姿，22,445 个点，重投影误差 0.62 像素"
 
 
-def error_of(run: Callable[[], object]) -> str:
+def error_of(run: Callable[[], object]) -> object:
     with pytest.raises((UserError, OSError, ValueError)) as caught:
         run()
     error = caught.value
-    return message_of(error) if isinstance(error, OSError) else str(error)
+    return message_of(error) if isinstance(error, OSError) else error
 
 
 def test_errors(tmp_path):
@@ -100,14 +103,14 @@ def test_errors(tmp_path):
         error_of(lambda: write_part(scene, Upload("/1.jpg/2.jpg", 5, 0), b"12345")),
         error_of(lambda: write_part(scene, Upload("/2.jpg", 9, 0, received=5), b"1")),
         error_of(lambda: listing(tmp_path / "missing")),
-        str(failure(Evidence(plain, [], None, 36))),
-        str(failure(Evidence(detailed, [], None, 36))),
-        str(failure(Evidence(detailed, [], 0.0, 36))),
-        str(_too_few(2, [])),
-        str(_too_few(0, [LeftOut("/1.jpg", "photos", BLACK), LeftOut("/2.jpg", "photos", BLACK)])),
-        str(_too_few(1, [LeftOut("/1.jpg", "photos", BLURRED)] * 3)),
-        str(_too_few(1, [LeftOut("/1.mp4 at 1 s", "photos", SAME_VIEW)] * 3)),
-        str(_too_few(1, [LeftOut("/DSC.jpg", "photos", "has only 8x8 pixels")] * 3)),
+        failure(Evidence(plain, [], None, 36)),
+        failure(Evidence(detailed, [], None, 36)),
+        failure(Evidence(detailed, [], 0.0, 36)),
+        _too_few(2, []),
+        _too_few(0, [LeftOut("/1.jpg", "photos", BLACK), LeftOut("/2.jpg", "photos", BLACK)]),
+        _too_few(1, [LeftOut("/1.jpg", "photos", BLURRED)] * 3),
+        _too_few(1, [LeftOut("/1.mp4 at 1 s", "photos", SAME_VIEW)] * 3),
+        _too_few(1, [LeftOut("/DSC.jpg", "photos", "has only 8x8 pixels")] * 3),
         f"/scene: in use by {Holder()}; wait until it ends, stop it, or use another folder",
         f"no such film is possible: {error_of(lambda: PageFilm([]))}",
         *(

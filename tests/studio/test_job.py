@@ -100,8 +100,8 @@ def test_errors_of_the_worker_are_one_line(library, forked, tmp_path):
     wait_for(lambda: not job.is_running(scene), 60)
     state = scene.state()
     assert state["outcome"] == "failed"
-    assert "empty" in state["error"]
-    assert "\n" not in state["error"]
+    assert "empty" in state["error"]["en"]
+    assert "\n" not in state["error"]["en"]
 
 
 def test_what_the_photos_are(library, request):
@@ -145,7 +145,7 @@ def test_progress_is_bounded(library):
     assert steps == sorted(steps)
     assert steps[-1] > 4900
     assert steps[0] < 100
-    assert "\x1b" not in state["notes"][-1]
+    assert "\x1b" not in state["notes"][-1]["en"]
     # There is no map of cameras that are not there, and one note about it.
     assert len(state["notes"]) == 2
 

@@ -12,6 +12,7 @@ _STAGES = [
     {"stage": "photos", "lines": ["30 photos"], "seconds": 3.0, "again": False},
     {"stage": "poses", "lines": ["30 of 30 photos placed"], "seconds": 9.0, "again": True},
 ]
+KILLED = {"en": "the process was killed", "zh": "进程被终止"}
 _STEPS = {"step": 50, "iterations": 100, "gaussians": 1234, "left": 20.0, "psnr": 21.5}
 
 
@@ -22,7 +23,7 @@ def texts(page, selector: str) -> list[str]:
 def test_a_running_a_failed_and_a_finished_scene(studio, finished, monkeypatch):
     scene, address = finished, f"{studio.server.url}#Box"
     done = scene.state()
-    running = {"stages": _STAGES, "notes": ["out of memory; choose draft, or fewer photos"]}
+    running = {"stages": _STAGES, "notes": [{"en": "out of memory", "zh": "内存不足"}]}
     running |= {"curve": [[10, 0.5], [20, 0.3]], "steps": _STEPS, "now": {"stage": "scene"}}
     with Browser(1000, 800, frames=2.0) as browser:
         scene.write_state(running)
@@ -33,23 +34,23 @@ def test_a_running_a_failed_and_a_finished_scene(studio, finished, monkeypatch):
         assert ["30 photos (3 s)" in stages[0], "30 of 30" in stages[1]] == [True, True]
         assert "50 of 100" in texts(page, ".stages li[data-state=now]")[0]
         assert "21.50 dB" in texts(page, ".figures dd")
-        assert texts(page, ".notes li") == running["notes"]
+        assert texts(page, ".notes li") == ["out of memory"]
         assert page.evaluate("document.querySelector('polyline').points.length") == 2
         page.evaluate("document.querySelector('#language').click()")
         page.wait_for("document.querySelector('.status')?.textContent === '正在制作'")
-        assert texts(page, ".notes li") == ["内存不足，请选择“草稿”，或减少照片"]
+        assert texts(page, ".notes li") == ["内存不足"]
         page.evaluate("document.querySelector('#language').click()")
 
         monkeypatch.setattr(job, "is_running", lambda *_: False)
-        scene.write_state(running | {"outcome": "failed", "error": "the process was killed"})
+        scene.write_state(running | {"outcome": "failed", "error": KILLED})
         page.wait_for("document.querySelector('.status')?.dataset.status === 'failed'")
-        assert texts(page, "p.bad") == ["the process was killed"]
+        assert texts(page, "p.bad") == [KILLED["en"]]
         assert "Continue" in texts(page, "button")
 
-        done["result"]["verdict"] = ["The scene: good", "  - 30 photos", "  next time: more"]
+        done["result"]["verdict"] = {"head": KILLED, "why": [KILLED], "advice": []}
         scene.write_state(done)
         page.wait_for("document.querySelector('.status')?.dataset.status === 'done'")
-        assert texts(page, ".card ul li") == ["30 photos"]
+        assert texts(page, ".card ul li") == [KILLED["en"]]
         assert texts(page, ".card > h2")[0] == "Verdict"
         exports = studio.ask("scenes/Box")[1]["exports"]
         assert len(texts(page, ".export button")) == len(exports)

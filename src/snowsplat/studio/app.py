@@ -1,7 +1,7 @@
 """`studio_app`: the requests of the page of the studio.
 
-The tables `ROUTES` say what is answered where. Answers are JSON; an error is ``{"error": …}``, one
-line for people. A scene has the address /scenes/NAME.
+The tables `ROUTES` say what is answered where. Answers are JSON; an error is
+``{"error": {"en": …, "zh": …}}``, one line for people. A scene has the address /scenes/NAME.
 """
 
 from __future__ import annotations

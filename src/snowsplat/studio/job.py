@@ -14,7 +14,7 @@ from typing import Any
 
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import as_message, message
 from snowsplat.util.run_lock import LOCK, holder, is_locked
 
 _WORKER = [sys.executable, "-m", "snowsplat.studio"]
@@ -93,7 +93,7 @@ def work(scene: StudioScene, verb: str, **settings: Any) -> dict[str, Any]:
             lines=lines[-1] if lines else message("the process was killed"),
         )
     if "error" in answer:
-        raise UserError(answer["error"])
+        raise UserError(as_message(answer["error"]))
     return answer
 
 

@@ -17,11 +17,11 @@ from snowsplat.project.studio_scene import StudioScene
 from snowsplat.sfm.progress import Report
 from snowsplat.sfm.report.dataset_report import draw_from_above
 from snowsplat.sfm.report.scene_map import PlacedPhoto
+from snowsplat.studio.texts import in_languages
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_text
 from snowsplat.util.messages import Message, message
-from snowsplat.util.safe_json import printable
 from snowsplat.util.stages import Outcome
 
 _PAUSE = 1.0  # seconds between two files of the state
@@ -52,7 +52,7 @@ class Recorder(Observer):
             self._written = time.monotonic()
 
     def note(self, line: Message) -> None:
-        self.state["notes"].append(printable(str(line)))
+        self.state["notes"].append(in_languages(line))
         self.write()
 
     def begin(self, stage: str) -> Report:
@@ -60,13 +60,13 @@ class Recorder(Observer):
         self.write()
 
         def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
-            now.update({"done": done, "total": total, "what": what, "left": left})
+            now.update({"done": done, "total": total, "what": in_languages(what), "left": left})
             self.write(now=False)
 
         return report
 
     def end(self, stage: str, outcome: Outcome) -> None:
-        lines = [printable(str(line)) for line in described(stage, outcome.result)]
+        lines = [in_languages(line) for line in described(stage, outcome.result)]
         self.state["stages"].append(
             {"stage": stage, "lines": lines, "seconds": outcome.seconds, "again": outcome.again}
         )

@@ -16,9 +16,10 @@ from starlette.types import Receive, Scope, Send
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
 from snowsplat.studio.library import Library, UnknownScene
+from snowsplat.studio.texts import in_languages
 from snowsplat.studio.uploads import NoSpace, WrongPart
 from snowsplat.util.errors import UserError, message_of
-from snowsplat.util.safe_json import is_file, printable
+from snowsplat.util.safe_json import is_file
 from snowsplat.viewer.http.served_file import FileOnDisk, content_type
 from snowsplat.viewer.http.static import send_file
 
@@ -65,12 +66,12 @@ def answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request]
             fresh = {"Cache-Control": "no-store"}
             return value if callable(value) else JSONResponse(value, headers=fresh)
         except WrongPart as error:
-            return JSONResponse({"error": str(error), "received": error.received}, 409)
+            return JSONResponse({"error": in_languages(error), "received": error.received}, 409)
         except UserError as error:
             codes = {UnknownScene: 404, NoSpace: 507}
-            return JSONResponse({"error": str(error)}, codes.get(type(error), 400))
+            return JSONResponse({"error": in_languages(error)}, codes.get(type(error), 400))
         except OSError as error:
-            return JSONResponse({"error": printable(str(message_of(error)))}, 500)
+            return JSONResponse({"error": in_languages(message_of(error))}, 500)
 
     return endpoint
 

@@ -34,12 +34,13 @@ from snowsplat.sfm.cost import Step, measure_speed, predicted_seconds, survey
 from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.studio import changes
 from snowsplat.studio.recorder import Recorder
+from snowsplat.studio.texts import in_languages, verdict_in_languages
 from snowsplat.util.errors import UserError, message_of
 from snowsplat.util.flags import settings_from
 from snowsplat.util.interrupts import ended_by_signals
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.run_lock import locked
-from snowsplat.util.safe_json import from_json, printable
+from snowsplat.util.safe_json import from_json
 
 # Seconds for an edit or export of a killed studio to end.
 _LONGEST_CHANGE = 600.0
@@ -64,19 +65,21 @@ def _outcome(scene: StudioScene, task: str, recorder: Recorder) -> tuple[int, di
     except KeyboardInterrupt:
         return 130, {"outcome": "stopped"}
     except MemoryError:
-        return 2, {"outcome": "failed", "error": "out of memory; choose draft, or fewer photos"}
+        about = message("out of memory; choose draft, or fewer photos")
+        return 2, {"outcome": "failed", "error": in_languages(about)}
     except (UserError, OSError) as error:
-        return 2, {"outcome": "failed", "error": _line(error)}
+        return 2, {"outcome": "failed", "error": in_languages(_message(error))}
     except Exception as error:
         traceback.print_exc()
-        what, log = f"{type(error).__name__}: {error}", scene.log(task)
-        about = f"an unexpected fault: {what}; details are in {log}"
-        return 1, {"outcome": "failed", "error": printable(about)}
+        what = f"{type(error).__name__}: {error}"
+        about = message(
+            "an unexpected fault: {what}; details are in {log}", what=what, log=scene.log(task)
+        )
+        return 1, {"outcome": "failed", "error": in_languages(about)}
 
 
-def _line(error: UserError | OSError) -> str:
-    text = message_of(error) if isinstance(error, OSError) else error
-    return printable(" ".join(str(text).split()))
+def _message(error: UserError | OSError) -> Message:
+    return message_of(error) if isinstance(error, OSError) else error.message
 
 
 def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
@@ -107,8 +110,7 @@ def _film(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
 
 
 def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
-    known, verdict = made.figures, made.verdict
-    lines = [] if verdict is None else verdict.lines(message("the scene"))
+    known = made.figures
     reports = {"training": made.training.report, "photos": made.dataset_report}
     return {
         "file": made.scene.name,
@@ -117,7 +119,7 @@ def _result(scene: StudioScene, made: MakeResult) -> dict[str, Any]:
         "psnr": known.psnr_aligned if known.exposures else known.psnr,
         "aligned": known.exposures,
         "seconds": made.seconds,
-        "verdict": [str(line) for line in lines],
+        "verdict": made.verdict and verdict_in_languages(made.verdict),
         "reports": changes.existing_reports(scene, reports),
     }
 
@@ -193,6 +195,6 @@ def main(words: list[str]) -> int:
     try:
         answer = _answer(VERBS[name], scene, json.loads(settings[0]) if settings else {})
     except (UserError, OSError) as error:
-        answer = {"error": _line(error)}
+        answer = {"error": _message(error).as_json()}
     print("\n" + json.dumps(answer))
     return 0

@@ -55,7 +55,7 @@ export function resultPart(
                 : fact(result.aligned ? "psnr_aligned" : "psnr", `${result.psnr.toFixed(2)} dB`)),
             ...(result.seconds === null ? [] : fact("took", duration(result.seconds))),
         ),
-        result.verdict.length > 0 &&
+        result.verdict !== null &&
             make("section.card", {}, make("h2", {}, say("verdict")), ...verdictOf(result.verdict)),
         make(
             "section.card",
@@ -94,11 +94,13 @@ function download(/** @type {string} */ address, /** @type {string} */ kind) {
 }
 
 /** The judgement, its reasons as a list, and what would help. */
-function verdictOf(/** @type {import("./types.js").Told[]} */ lines) {
-    const trimmed = lines.map(line => told(line).trim());
-    const reasons = trimmed.filter(line => line.startsWith("- ")).map(line => make("li", {}, line.slice(2)));
-    const [judgement, ...advice] = trimmed.filter(line => !line.startsWith("- ")).map(line => make("p", {}, line));
-    return [judgement, reasons.length > 0 && make("ul", {}, ...reasons), ...advice];
+function verdictOf(/** @type {import("./types.js").Verdict} */ { head, why, advice }) {
+    const reasons = why.map(reason => make("li", {}, told(reason)));
+    return [
+        make("p", {}, told(head)),
+        reasons.length > 0 && make("ul", {}, ...reasons),
+        ...advice.map(line => make("p", {}, told(line))),
+    ];
 }
 
 /** The film of the scene; `made`: its time, 0 if there is none. */

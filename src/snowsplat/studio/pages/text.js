@@ -251,13 +251,15 @@ export function speak(language) {
 }
 
 /**
- * A text of the program in the chosen language; some lines remain English.
+ * A text of the program in the chosen language. Parts of some messages are English; `told.js` may know these.
  * @param {import("./types.js").Told} text
  * @returns {string}
  */
 export const told = text => {
-    if (typeof text !== "string") return column ? text.zh : text.en;
-    return column ? /** @type {any} */ (globalThis).snowsplatChinese(text) : text;
+    const { en, zh } = typeof text === "string" ? { en: text, zh: text } : text;
+    if (!column) return en;
+    const known = /** @type {any} */ (globalThis).snowsplatChinese(en);
+    return known === en ? zh : known;
 };
 
 /**

@@ -43,10 +43,11 @@
  * @property {number | null} psnr
  * @property {boolean} aligned whether the PSNR is colour-aligned
  * @property {number | null} seconds
- * @property {Told[]} verdict lines
+ * @property {Verdict | null} verdict
  * @property {Record<string, string>} reports addresses in the output folder, by kind
  */
 
+/** @typedef {{head: Told, why: Told[], advice: Told[]}} Verdict */
 /** @typedef {{name: string, title: string, status: string, created: string, picture: boolean}} Summary */
 /** @typedef {{path: string, size: number, modified: number, received: number}} Arrived */
 /** @typedef {{name: string, placed: boolean}} Photo */

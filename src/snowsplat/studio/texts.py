@@ -1,0 +1,41 @@
+"""Texts for the page, which shows them in the language that was chosen in the browser."""
+
+from __future__ import annotations
+
+from snowsplat.evaluation.verdict import Verdict
+from snowsplat.util.messages import Message, as_message, message
+from snowsplat.util.safe_json import printable
+
+#: What stages count, see `sfm.progress.Report`: `in_languages` finds their Chinese by the English.
+ITEMS = (
+    message("registered photos"),
+    message("photos with features"),
+    message("matched pairs"),
+    message("verified pairs"),
+    message("comparisons of photos"),
+    message("photos"),
+    message("frames"),
+    message("views"),
+    message("files"),
+)
+#: A text in each language.
+Texts = dict[str, str]
+
+
+def in_languages(text: object) -> Texts:
+    """A text of any origin in each language, in one line."""
+    told = as_message(text).in_all_languages()
+    return {language: printable(" ".join(words.split())) for language, words in told.items()}
+
+
+def verdict_in_languages(verdict: Verdict) -> dict[str, object]:
+    """A verdict on a scene: its head, its reasons and its advice."""
+    return {
+        "head": in_languages(verdict.head(message("the scene"))),
+        "why": [in_languages(why) for why in verdict.why()],
+        "advice": [in_languages(_next_time(advice)) for advice in verdict.advice],
+    }
+
+
+def _next_time(advice: Message) -> Message:
+    return message("next time: {advice}", advice=advice)
