@@ -29,7 +29,12 @@ from snowsplat import Dataset, Trainer, load_dataset, ops, recipe
 from snowsplat.data.dataset import View
 from snowsplat.evaluation.metrics import evaluate_views
 from snowsplat.scene.geometry import compose_rigid, invert_rigid
-from snowsplat.training.parts.pose_coordinates import gauge_motions, moved, pixel_hessian, whitening
+from snowsplat.training.parts.pose_coordinates import (
+    after_motion,
+    gauge_motions,
+    pixel_hessian,
+    whitening,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -73,7 +78,7 @@ def aligned(exact: Dataset, present: list[View]) -> tuple[list[View], float]:
     remaining = (errors - columns @ gauge).norm(dim=1).mean()
     held_out = [view.camera for view in exact.test]
     poses = [
-        moved(camera.cam_from_world.double(), motion).to(camera.cam_from_world.dtype)
+        after_motion(camera.cam_from_world.double(), motion).to(camera.cam_from_world.dtype)
         for camera, motion in zip(
             held_out, gauge_motions(held_out, centre, exact.extent) @ gauge, strict=True
         )

@@ -19,7 +19,7 @@ from snowsplat.surface.volume import (
     Volume,
     block_coordinates,
     block_keys,
-    fused,
+    fuse_maps,
     occupied_blocks,
 )
 
@@ -47,7 +47,7 @@ def sphere() -> tuple[list[DepthMap], Volume]:
     directions = [*np.eye(3), *-np.eye(3)]
     maps = [_of_sphere(_camera(tuple(3 * d + 0.01), 128), 0.6) for d in directions]
     keys = occupied_blocks(maps, 0.04)
-    return maps, fused(maps, 0.04, keys, lambda *_: None)
+    return maps, fuse_maps(maps, 0.04, keys, lambda *_: None)
 
 
 def test_a_sphere_is_accurate_and_nearly_closed(sphere: tuple[list[DepthMap], Volume]) -> None:

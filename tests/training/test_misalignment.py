@@ -15,7 +15,7 @@ from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import render
 from snowsplat.training.parts.misalignment import misalignment, shift_between
-from snowsplat.training.parts.pose_coordinates import moved
+from snowsplat.training.parts.pose_coordinates import after_motion
 
 from .test_trainer import camera_at, true_scene
 
@@ -69,7 +69,7 @@ def test_wrong_poses_are_found_and_exact_ones_are_not(tmp_path: Path) -> None:
     turn = torch.tensor([0.0, 0.02, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
     def turned(view: View) -> View:
-        pose = moved(view.camera.cam_from_world, turn)
+        pose = after_motion(view.camera.cam_from_world, turn)
         return replace(view, camera=replace(view.camera, cam_from_world=pose))
 
     wrong = [turned(view) for view in views]

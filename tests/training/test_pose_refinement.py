@@ -19,7 +19,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts import pose_refinement
-from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
+from snowsplat.training.parts.pose_coordinates import Gauge, after_motion, pixel_hessian, whitening
 from snowsplat.training.parts.pose_refinement import PoseRefinement
 from snowsplat.training.settings import TrainConfig, config_from_json, config_to_json
 from snowsplat.training.settings.recipes import recipe
@@ -55,7 +55,7 @@ def perturbed(dataset: Dataset, seed: int = 0) -> Dataset:
     views = []
     for view, (turn, shift) in zip(dataset.train, directions, strict=True):
         motion = torch.cat([sizes[0] * turn, sizes[1] * shift])
-        pose = moved(view.camera.cam_from_world, motion)
+        pose = after_motion(view.camera.cam_from_world, motion)
         views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
     return replace(dataset, train=views)
 
@@ -67,8 +67,8 @@ def test_a_motion_turns_the_camera_and_then_shifts_it() -> None:
     pose = camera().cam_from_world
     expected = torch.linalg.matrix_exp(cross) @ pose
     expected[:, 3] += motion[3:]
-    torch.testing.assert_close(moved(pose, motion), expected)
-    assert torch.equal(moved(pose, torch.zeros(6, dtype=torch.float64)), pose)
+    torch.testing.assert_close(after_motion(pose, motion), expected)
+    assert torch.equal(after_motion(pose, torch.zeros(6, dtype=torch.float64)), pose)
 
 
 def test_the_hessian_is_that_of_pixel_positions(dataset: Dataset) -> None:
@@ -83,7 +83,7 @@ def test_the_hessian_is_that_of_pixel_positions(dataset: Dataset) -> None:
 
     def pixels(numbers: Tensor) -> Tensor:
         factor = float(numbers[6].exp())
-        pose = moved(view.cam_from_world, numbers[:6])
+        pose = after_motion(view.cam_from_world, numbers[:6])
         other = replace(view, cam_from_world=pose, fx=factor * view.fx, fy=factor * view.fy)
         return other.project(seen)[0]
 
@@ -111,7 +111,7 @@ def test_the_gauge_is_that_of_similarity_transforms(dataset: Dataset) -> None:
     units = torch.stack([whitening(pixel_hessian(c, dataset)[:6, :6]) for c in cameras])
     gauge = Gauge(cameras, units, dataset.extent)
     eps = 1e-6
-    turn = moved(torch.eye(4, dtype=torch.float64)[:3], eps * noise(1, 6))
+    turn = after_motion(torch.eye(4, dtype=torch.float64)[:3], eps * noise(1, 6))
     similarity = Similarity(1.0 + 0.7 * eps, turn[:, :3], turn[:, 3])
     motions = []
     for each, unit in zip(cameras, units, strict=True):
@@ -150,7 +150,7 @@ def test_the_gradient_of_a_motion(dataset: Dataset) -> None:
     def value(numbers: Tensor) -> float:
         shown = poses.camera(0)
         motion = poses._units[0] @ poses.state()["motions"][0] + numbers[:6]
-        pose = moved(dataset.train[0].camera.cam_from_world, motion)
+        pose = after_motion(dataset.train[0].camera.cam_from_world, motion)
         factor = float(numbers[6].exp())
         other = replace(shown, cam_from_world=pose, fx=factor * shown.fx, fy=factor * shown.fy)
         seen = project(scene, other, 0)

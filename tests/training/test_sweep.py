@@ -27,7 +27,7 @@ from snowsplat.surface import depth as surface_depth
 from snowsplat.training.settings import TrainConfig, changed
 from snowsplat.training.starts import swept_points
 from snowsplat.training.starts.depth_map import DepthMap
-from snowsplat.training.starts.fusion import consistent, thinned
+from snowsplat.training.starts.fusion import confirmed_pixels, merge_points
 from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.training.starts.plane_sweep import depth_maps
 from snowsplat.training.starts.source_views import source_views
@@ -234,14 +234,14 @@ def test_masked_and_transparent_pixels_are_unknown(dataset: Dataset, tmp_path: P
 
 def test_only_depths_that_another_map_confirms_are_used(dataset: Dataset) -> None:
     maps, sources = maps_of(dataset)
-    confirmed = consistent(maps, sources)
+    confirmed = confirmed_pixels(maps, sources)
     assert all(float(chosen.float().mean()) > 0.5 for chosen in confirmed)
     wrong = maps[2]
     assert wrong is not None
     inverse = wrong.inverse_depth.clone()
     inverse[:30] *= 1.1
     maps[2] = replace(wrong, inverse_depth=inverse)
-    confirmed = consistent(maps, sources)
+    confirmed = confirmed_pixels(maps, sources)
     assert float(confirmed[2][:30].float().mean()) < 0.1
     assert float(confirmed[2][32:].float().mean()) > 0.5
 
@@ -260,15 +260,15 @@ def test_thinned_points_are_the_means_of_their_voxels() -> None:
     points = torch.cat([near + 0.1 * torch.rand(30, 3, generator=random), far.expand(20, 3)])
     colors = torch.arange(50, dtype=torch.uint8)[:, None].repeat(1, 3)
     widths = torch.cat([torch.full((30,), 0.01), torch.full((20,), 0.3)])
-    two = thinned(points, colors, widths, 2)
+    two = merge_points(points, colors, widths, 2)
     order = two.xyz[:, 0].argsort()
     torch.testing.assert_close(two.xyz[order], torch.stack([points[:30].mean(0), far]))
     assert two.rgb[order, 0].tolist() == [14, 40]  # 14.5 is rounded to the even number; 39.5 too
-    some = thinned(points, colors, widths, 20)
+    some = merge_points(points, colors, widths, 20)
     assert 5 < len(some) <= 20
-    all_of_them = thinned(points, colors, widths, 50)
+    all_of_them = merge_points(points, colors, widths, 50)
     assert 20 < len(all_of_them) <= 31
-    assert len(thinned(points[:0], colors[:0], widths[:0], 9)) == 0
+    assert len(merge_points(points[:0], colors[:0], widths[:0], 9)) == 0
 
 
 def test_dense_points_lie_on_the_surface(dataset: Dataset) -> None:

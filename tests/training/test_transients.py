@@ -18,7 +18,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.render import render
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
-from snowsplat.training.parts.densification import delayed
+from snowsplat.training.parts.densification import delay_growth
 from snowsplat.training.parts.transients import (
     MOMENTS,
     Transients,
@@ -374,6 +374,6 @@ def test_with_few_photos_or_steps_nothing_is_masked(busy, mode, views, steps):
 
 def test_growth_waits_for_the_masks():
     for name in ("default", "paper", "mcmc"):
-        assert delayed(recipe(name).density).densify_from == MOMENTS[1]
+        assert delay_growth(recipe(name).density).densify_from == MOMENTS[1]
     later = replace(recipe("default").density, densify_from=0.4)
-    assert delayed(later) is later
+    assert delay_growth(later) is later

@@ -13,7 +13,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.trainer import Trainer
-from snowsplat.training.parts.unexplained import Unexplained, fitted, standing_out
+from snowsplat.training.parts.unexplained import Unexplained, explanation_of, standing_out
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.util.errors import UserError
@@ -32,7 +32,7 @@ def photo(height: int = 12, width: int = 16) -> torch.Tensor:
 def test_exposure_and_white_balance_do_not_count():
     image = photo()
     other = image * torch.tensor([0.5, 0.9, 1.3]) + torch.tensor([0.2, 0.0, -0.1])
-    psnr, explained = fitted(image, other)
+    psnr, explained = explanation_of(image, other)
     assert psnr > 59
     assert explained > 0.999999
 
@@ -40,10 +40,10 @@ def test_exposure_and_white_balance_do_not_count():
 def test_an_unrelated_or_negative_image_explains_nothing():
     image = photo()
     other = torch.rand(12, 16, 3, generator=torch.Generator().manual_seed(4))
-    psnr, explained = fitted(image, other)
+    psnr, explained = explanation_of(image, other)
     assert explained < 0.05
     assert psnr == pytest.approx(-10 * math.log10(float(other.var((0, 1)).mean())), abs=0.5)
-    assert fitted(image, 1 - image)[1] == 0.0
+    assert explanation_of(image, 1 - image)[1] == 0.0
 
 
 def test_half_of_the_variance():
@@ -51,7 +51,7 @@ def test_half_of_the_variance():
     generator = torch.Generator().manual_seed(5)
     image = torch.randn(200, 200, 3, generator=generator)
     noise = torch.randn(200, 200, 3, generator=generator)
-    assert fitted(image, 0.1 * (image + noise) + 0.5)[1] == pytest.approx(0.5, abs=0.01)
+    assert explanation_of(image, 0.1 * (image + noise) + 0.5)[1] == pytest.approx(0.5, abs=0.01)
 
 
 def test_masked_pixels_do_not_count():
@@ -59,13 +59,13 @@ def test_masked_pixels_do_not_count():
     mask[:6] = True
     other = image.clone()
     other[6:] = 0.0
-    assert fitted(image, other)[1] < 0.9
-    assert fitted(image, other, mask) == pytest.approx((60.0, 1.0))
+    assert explanation_of(image, other)[1] < 0.9
+    assert explanation_of(image, other, mask) == pytest.approx((60.0, 1.0))
 
 
 def test_a_photo_of_one_colour_is_explained():
-    assert fitted(photo(), torch.full((12, 16, 3), 0.5)) == (60.0, 1.0)
-    assert fitted(photo(), photo(), torch.zeros(12, 16, dtype=torch.bool)) == (60.0, 1.0)
+    assert explanation_of(photo(), torch.full((12, 16, 3), 0.5)) == (60.0, 1.0)
+    assert explanation_of(photo(), photo(), torch.zeros(12, 16, dtype=torch.bool)) == (60.0, 1.0)
 
 
 # The rule

@@ -26,7 +26,7 @@ from snowsplat.data import ImageLoader, View
 from snowsplat.surface.depth import DepthMap
 from snowsplat.surface.volume import Report
 from snowsplat.training.starts.depth_map import LONGER_SIDE, map_size
-from snowsplat.training.starts.fusion import consistent
+from snowsplat.training.starts.fusion import confirmed_pixels
 from snowsplat.training.starts.photos import decoded_ahead
 from snowsplat.training.starts.plane_sweep import Picture, depth_ranges, swept_maps
 from snowsplat.training.starts.source_views import source_views
@@ -81,7 +81,7 @@ def confirm_by_photos(
     for number in range(_SWEEPS):
         report(number, _SWEEPS, "comparisons of photos")
         swept = swept_maps(pictures, ranges, sources)
-        for i, known in enumerate(consistent(swept, sources)):
+        for i, known in enumerate(confirmed_pixels(swept, sources)):
             each, finer = swept[i], found[i]
             if each is not None:
                 inverse = each.inverse_depth.masked_fill_(~known, 0.0)  # not used again

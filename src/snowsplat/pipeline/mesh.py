@@ -24,7 +24,7 @@ from snowsplat.scene.orientation import scene_up
 from snowsplat.surface.colors import vertex_colors
 from snowsplat.surface.depth import DepthMap, SurfaceRenderer
 from snowsplat.surface.isosurface import zero_level
-from snowsplat.surface.volume import Report, fused, occupied_blocks
+from snowsplat.surface.volume import Report, fuse_maps, occupied_blocks
 from snowsplat.training.starts.photos import decoded_ahead, reduced_photo, usable_pixels
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import make_parent
@@ -153,7 +153,7 @@ def surface_of(scene: TrainedScene, options: MeshOptions, observer: Observer = S
                     "no surface is shown by two photos; train longer, or use a larger `far` or "
                     "`voxel`"
                 )
-            volume = fused(maps, voxel, keys, report)
+            volume = fuse_maps(maps, voxel, keys, report)
         return_unused()
         with observer.waiting("triangles"):
             vertices, faces = zero_level(volume)

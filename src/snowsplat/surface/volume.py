@@ -93,7 +93,7 @@ def _blocks_of(depth_map: DepthMap, voxel: float) -> np.ndarray:
     return np.unique(block_keys(cell[(np.abs(cell) < _OFFSET).all(1)]))
 
 
-def fused(maps: Sequence[DepthMap], voxel: float, keys: np.ndarray, report: Report) -> Volume:
+def fuse_maps(maps: Sequence[DepthMap], voxel: float, keys: np.ndarray, report: Report) -> Volume:
     """The field of all depth maps in these blocks."""
     device = maps[0].depth.device
     sums = torch.zeros(len(keys), SIDE, SIDE, SIDE, 2, device=device)

@@ -20,6 +20,7 @@ from torch import Tensor
 from snowsplat.training.core import checkpoint_file
 from snowsplat.training.step.finite import check_finite
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 _NAME = re.compile(r"step_(\d+)\.safetensors")
 
@@ -54,7 +55,11 @@ def save(
 
     Older checkpoints are unchanged after an error.
     """
-    check_finite(f"the state of step {step}", tensors, "older checkpoints are unchanged")
+    check_finite(
+        message("the state of step {step}", step=step),
+        tensors,
+        message("older checkpoints are unchanged"),
+    )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step_{step:06d}.safetensors"

@@ -19,7 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from snowsplat.training.step.finite import listed
+from snowsplat.training.step.finite import rows_text
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.safe_json import check_header, parse_json
@@ -115,7 +115,7 @@ def read(path: Path) -> CheckpointFile:
         raise UserError(
             "{path}: non-finite values in {listed}; remove it and resume from an earlier one",
             path=path,
-            listed=listed(found),
+            listed=rows_text(found),
         )
     return content
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _GROWTH = 0.2
 
 
-def delayed(density: DensityConfig) -> DensityConfig:
+def delay_growth(density: DensityConfig) -> DensityConfig:
     """The density control that adds no Gaussians before that moment."""
     begin = density.densify_from
     # A number of steps is that of a long schedule, whose first masks are later.
@@ -46,7 +46,7 @@ class Densification(Part):
 
     def prepare(self, run: Run) -> None:
         """Read the settings, which are those of the configuration."""
-        self.settings = delayed(run.config.density) if self.late else run.config.density
+        self.settings = delay_growth(run.config.density) if self.late else run.config.density
         self.abs_grad = self.settings.abs_grad
 
     def begin(self, run: Run) -> None:

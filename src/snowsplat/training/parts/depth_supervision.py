@@ -94,16 +94,18 @@ class DepthSupervision(Part):
         self.idle = not self._maps
         if given:
             unused = given - len(self._maps)
-            reason = f"; {unused} contradict the points or show too few of them" if unused else ""
-            reason = f"; {damaged}" if damaged else reason
-            run.note(
-                message(
-                    "depth maps: {maps} of {views} photos{reason}",
-                    maps=len(self._maps),
-                    views=len(views),
-                    reason=reason,
-                )
+            note = message(
+                "depth maps: {maps} of {views} photos", maps=len(self._maps), views=len(views)
             )
+            if damaged:
+                note = message("{note}; {damaged}", note=note, damaged=damaged)
+            elif unused:
+                note = message(
+                    "{note}; {unused} contradict the points or show too few of them",
+                    note=note,
+                    unused=unused,
+                )
+            run.note(note)
         elif not any(view.normals for view in views):
             run.note(
                 message(

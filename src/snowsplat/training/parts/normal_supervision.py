@@ -39,7 +39,7 @@ from snowsplat.training.starts.depth_map import LONGER_SIDE, check_aspect, map_s
 from snowsplat.training.starts.photos import usable_pixels
 from snowsplat.training.step.batch import BatchView
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import Message, message
+from snowsplat.util.messages import message
 from snowsplat.util.names import first_names
 
 if TYPE_CHECKING:
@@ -98,15 +98,10 @@ class NormalSupervision(Part):
         self.with_depth = bool(self._maps)
         self.idle = not self._maps
         if given:
-            reason = f"; {damaged}" if damaged else ""
-            run.note(
-                message(
-                    "normal maps: {maps} of {views} photos{reason}",
-                    maps=len(self._maps),
-                    views=len(views),
-                    reason=reason,
-                )
+            note = message(
+                "normal maps: {maps} of {views} photos", maps=len(self._maps), views=len(views)
             )
+            run.note(message("{note}; {damaged}", note=note, damaged=damaged) if damaged else note)
 
     def between(self, run: Run) -> None:
         """Compare the maps with the scene, once."""
@@ -135,16 +130,12 @@ class NormalSupervision(Part):
         if wrong := contradicting(surfaces, stated):
             self.used[wrong] = False
             names = first_names([views[index].name for index in wrong], 5)
-            frame = Message("")
-            if not self.used.any():
-                frame = message("; normals must be in the frame of the camera")
-            run.note(
-                message(
-                    "normal maps that contradict the photos are not used: {names}{frame}",
-                    names=names,
-                    frame=frame,
-                )
+            note = message(
+                "normal maps that contradict the photos are not used: {names}", names=names
             )
+            if not self.used.any():
+                note = message("{note}; normals must be in the frame of the camera", note=note)
+            run.note(note)
 
     def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
         """See the module. Each rendering has at most as many pixels as the map."""

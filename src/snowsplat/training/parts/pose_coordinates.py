@@ -33,7 +33,7 @@ _FEWEST_POINTS = 20
 _DAMPING = 0.1
 
 
-def moved(cam_from_world: Tensor, motion: Tensor) -> Tensor:
+def after_motion(cam_from_world: Tensor, motion: Tensor) -> Tensor:
     """(3, 4) float64: a pose [R | t] (3, 4) after a motion (ω, τ) (6,): see the module."""
     x, y, z = motion[:3].unbind()
     zero = torch.zeros_like(x)

@@ -35,7 +35,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.parts.misalignment import shift_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.part_report import PartReport
-from snowsplat.training.parts.pose_coordinates import Gauge, moved, pixel_hessian, whitening
+from snowsplat.training.parts.pose_coordinates import Gauge, after_motion, pixel_hessian, whitening
 from snowsplat.training.step.batch import Batch, Gradients
 from snowsplat.training.step.view_gradient import ViewGradient
 from snowsplat.util.messages import Message, message
@@ -107,7 +107,7 @@ class PoseRefinement(Part):
         first = self._first[view]
         motion = self._units[view] @ self._state["motions"][view]
         factor = self._factors[self._group[view]]
-        pose = moved(first.cam_from_world, motion)
+        pose = after_motion(first.cam_from_world, motion)
         return replace(first, cam_from_world=pose, fx=factor * first.fx, fy=factor * first.fy)
 
     def views(self) -> list[View]:

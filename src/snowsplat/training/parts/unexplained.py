@@ -58,7 +58,7 @@ _WORSE_PSNR = 3.0
 #: The PSNR is at most this number, in dB.
 _LOW_PSNR = 20.0
 
-#: `fitted` returns at most this PSNR.
+#: `explanation_of` returns at most this PSNR.
 _HIGHEST_PSNR = 60.0
 #: If more than this share of the views stand out, the scene is unsuitable for this comparison.
 _MOST = 0.25
@@ -186,7 +186,7 @@ def unexplained_views(
         return ()
     fits = np.array(
         [
-            fitted(each.image, each.photo, each.mask)
+            explanation_of(each.image, each.photo, each.mask)
             for each in renderings(
                 gaussians,
                 views,
@@ -203,7 +203,7 @@ def unexplained_views(
     return standing_out(fits[:, 0], fits[:, 1], positions.numpy(), poses[:, 2, :3].numpy())
 
 
-def fitted(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[float, float]:
+def explanation_of(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> tuple[float, float]:
     """How well an image explains a photo, apart from a gain and an offset of each channel.
 
     For each channel, a gain and an offset of the image are fitted by least squares, so that the
@@ -245,8 +245,8 @@ def standing_out(
     therefore does not stand out.
 
     Args:
-        psnr: (V,) in dB, see `fitted`.
-        explained: (V,) in 0..1, see `fitted`.
+        psnr: (V,) in dB, see `explanation_of`.
+        explained: (V,) in 0..1, see `explanation_of`.
         positions: (V, 3), the camera centres in world units.
         directions: (V, 3), the viewing directions, of length 1.
 

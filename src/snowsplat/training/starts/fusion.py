@@ -30,13 +30,13 @@ def fused_points(
     count: int,
     generator: torch.Generator,
 ) -> Points:
-    """At most ``count`` points: those of the pixels that are `consistent`, `thinned`.
+    """At most ``count`` points: those of the `confirmed_pixels`, merged by `merge_points`.
 
     Args:
         maps: the depth map of each view; None if it has none.
         generator: a random generator on the CPU.
     """
-    confirmed = consistent(maps, chosen.sources)
+    confirmed = confirmed_pixels(maps, chosen.sources)
     share = _PIXELS_PER_POINT * count / max(1, sum(int(pixels.sum()) for pixels in confirmed))
     used = [
         pixels & (torch.rand(pixels.shape, generator=generator) < share) for pixels in confirmed
@@ -52,10 +52,12 @@ def fused_points(
         return depth_map.points(pixels), photo.rgb[pixels], width
 
     points, colors, widths = zip(*in_threads(points_of, range(len(maps))), strict=True)
-    return thinned(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
+    return merge_points(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
 
 
-def consistent(maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]) -> list[Tensor]:
+def confirmed_pixels(
+    maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]
+) -> list[Tensor]:
     """For each map, (H, W) bool: the pixels whose depth the map of a source view confirms.
 
     A depth is confirmed if its point, projected into the source view, has the depth of the map
@@ -88,7 +90,7 @@ def _agrees(points: Tensor, depth_map: DepthMap) -> Tensor:
     return inside & (found > 0) & ((found * depth - 1.0).abs() <= _TOLERANCE)
 
 
-def thinned(points: Tensor, colors: Tensor, widths: Tensor, count: int) -> Points:
+def merge_points(points: Tensor, colors: Tensor, widths: Tensor, count: int) -> Points:
     """At most ``count`` points that represent many points.
 
     Space is divided into voxels, whose side is a power of two near a multiple of the width of a

@@ -14,6 +14,7 @@ from snowsplat.scene.geometry import morton_order
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.starts import start_of
 from snowsplat.training.step.finite import check_finite
+from snowsplat.util.messages import message
 
 #: The sky has at most this share of the points of a start, a twentieth of the limit of Gaussians.
 _SHARE_OF_SKY = 0.125
@@ -77,9 +78,9 @@ def initial_gaussians(
     gaussians = Gaussians.from_points(points.to(device), config.sh_degree, config.initial_opacity)
     gaussians.log_scales += math.log(config.initial_scale)
     check_finite(
-        "the points of the dataset",
+        message("the points of the dataset"),
         gaussians.parameters(),
-        "remove points that are extremely far from the others",
+        message("remove points that are extremely far from the others"),
     )
     return gaussians.select(morton_order(gaussians.means))
 

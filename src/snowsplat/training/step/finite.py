@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message, plural
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,13 +42,13 @@ def rows_not_finite(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     return found
 
 
-def check_finite(what: str, tensors: Mapping[str, Tensor], advice: str) -> None:
+def check_finite(what: Message, tensors: Mapping[str, Tensor], advice: Message) -> None:
     """Raises UserError ``"<what>: non-finite values in …; <advice>"`` unless all are finite."""
     if found := rows_not_finite(tensors):
         raise UserError(
             "{what}: non-finite values in {listed}; {advice}",
             what=what,
-            listed=listed(found),
+            listed=rows_text(found),
             advice=advice,
         )
 
@@ -91,7 +91,7 @@ def check_state(
         raise UserError(
             "the checkpoint: made with another dataset or recipe; resume with the original ones"
         )
-    check_finite("the checkpoint", given, "resume from an earlier one")
+    check_finite(message("the checkpoint"), given, message("resume from an earlier one"))
 
 
 def check_parameters(step: int, gaussians: Gaussians) -> None:
@@ -100,7 +100,7 @@ def check_parameters(step: int, gaussians: Gaussians) -> None:
         raise Diverged(
             "step {step}: non-finite Gaussians, {listed}; {finite_init}",
             step=step,
-            listed=listed(found),
+            listed=rows_text(found),
             finite_init=_FINITE_INIT,
         )
 
@@ -120,7 +120,7 @@ def check_updates(step: int, nonfinite_rows: Sequence[float], gaussians: Gaussia
     raise Diverged(
         "step {step}: non-finite gradient or update in {listed}, skipped; {lower_rates}",
         step=step,
-        listed=listed(found),
+        listed=rows_text(found),
         lower_rates=_LOWER_RATES,
     )
 
@@ -138,7 +138,9 @@ def check_loss(
         return
     if found := rows_not_finite(gaussians.parameters()):
         cause = message(
-            "from non-finite Gaussians, {rows}; {advice}", rows=listed(found), advice=_FINITE_INIT
+            "from non-finite Gaussians, {rows}; {advice}",
+            rows=rows_text(found),
+            advice=_FINITE_INIT,
         )
     elif photo is not None and (pixels := rows_not_finite({"": photo.planes.flatten(1).T})):
         cause = message(
@@ -157,8 +159,10 @@ def check_loss(
     )
 
 
-def listed(counts: Mapping[str, int]) -> str:
+def rows_text(counts: Mapping[str, int]) -> Message:
     """Text such as "means (3 rows), quats (1 row)"."""
-    return ", ".join(
-        f"{name} ({count:,} {'row' if count == 1 else 'rows'})" for name, count in counts.items()
-    )
+    rows = [
+        plural("{name} ({n:,} row)", "{name} ({n:,} rows)", n=count, name=name)
+        for name, count in counts.items()
+    ]
+    return message("{rows}", rows=rows)
