@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.search.sources import find_sources, free_names, kind_of_file
+from snowsplat.sfm.ingest.search.names import free_names
+from snowsplat.sfm.ingest.search.sources import find_sources, kind_of_file
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
 

@@ -35,7 +35,8 @@ from snowsplat.sfm.ingest.photos.photo_files import (
     read_header,
     save,
 )
-from snowsplat.sfm.ingest.search.sources import Source, free_names
+from snowsplat.sfm.ingest.search.names import free_names
+from snowsplat.sfm.ingest.search.sources import Source
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
 from snowsplat.util.natural_order import natural_key

@@ -18,6 +18,7 @@ from snowsplat.project.project import is_output
 from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
+from snowsplat.sfm.ingest.search.names import free_name
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
 from snowsplat.sfm.ingest.video.clip import ONLY_SOUND, why_no_video
 from snowsplat.util.errors import UserError
@@ -45,8 +46,6 @@ _UNREAD_SUFFIXES = frozenset(
 )
 # Folders in a dataset in which programs keep models of all its images.
 _MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
-_LONGEST_NAME = 200  # bytes of a name in input/
-_KEPT_END = 12  # characters at the end of a longer name
 # The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
 _MAP = re.compile(
     r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
@@ -146,7 +145,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
                 mask = find_masks(path.parent, [path.name]).of.get(path.name)
                 add(Source(path, kind, shown(path.name), mask))
             else:
-                add(Source(path, kind, "" if len(inputs) == 1 else _free(path.stem, folders)))
+                add(Source(path, kind, "" if len(inputs) == 1 else free_name(path.stem, folders)))
             continue
         if (poses := poses_in(path)) is not None:
             posed = path if len(inputs) == 1 else None
@@ -163,7 +162,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         photos_in = _photos_of_dataset(path)
         found = _search(photos_in)
         chosen = photos_or_films(photos_in, found.photos, found.videos)
-        prefix = "" if len(inputs) == 1 else _free(path.resolve().name, folders)
+        prefix = "" if len(inputs) == 1 else free_name(path.resolve().name, folders)
         left_out += found.left_out + chosen.left_out
         for relative in chosen.photos:
             name = str(PurePosixPath(prefix) / shown(relative))
@@ -171,7 +170,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         unused += found.masks.unused
         for relative in chosen.videos:
             stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
-            video = prefix if len(chosen.videos) == 1 else _free(stem, folders)
+            video = prefix if len(chosen.videos) == 1 else free_name(stem, folders)
             add(Source(photos_in / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
@@ -387,36 +386,3 @@ def _nothing_in(inputs: Sequence[Path]) -> UserError:
         "that contains them",
         names=names,
     )
-
-
-def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names, made unique and not too long: a name that equals an earlier one except for case
-    gets a suffix.
-
-    "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on.
-    """
-    taken: set[str] = set()
-    for name in names:
-        yield _free(name, taken)
-
-
-def _shortened(part: str) -> str:
-    """A name of at most 200 bytes, so that ".NAME.png.tmp" fits into the 255 of a file system."""
-    if len(part.encode()) <= _LONGEST_NAME:
-        return part
-    path = PurePosixPath(part)
-    end = path.stem[-_KEPT_END:] + path.suffix  # with the number of the photo
-    room = max(0, _LONGEST_NAME - len(end.encode()))
-    return path.stem.encode()[:room].decode(errors="ignore") + end
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """``name``, or a variant of it that is not in ``taken``; the result is added to ``taken``."""
-    name = "/".join(_shortened(part) for part in shown(name).split("/"))
-    path = PurePosixPath(name)
-    candidate, n = name, 1
-    while candidate.casefold() in taken:
-        n += 1
-        candidate = str(path.with_name(f"{path.stem}_{n}{path.suffix}"))
-    taken.add(candidate.casefold())
-    return candidate
