@@ -80,5 +80,5 @@ nitpick_ignore_regex = [
         "py:class",
         r"snowsplat\..*|Alignment|Batch|DatasetSettings|DepthKind|Gradients|LivePage|Moment",
     ),
-    ("py:class", r"PlacedPhoto|Shards|Start"),
+    ("py:class", r"Message|PartSection|PlacedPhoto|Reason|Section|Shards|Start"),
 ]
