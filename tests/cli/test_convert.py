@@ -163,7 +163,7 @@ def test_invalid_input(refused, ply, tmp_path):
     assert "name of a file" in refused("convert", ply)
     assert "selects no scene format" in refused("convert", ply, tmp_path / "b.obj")
     assert "selects no scene format" in refused("convert", ply, tmp_path / "b.ksplat")
-    assert "cannot be read" in refused("convert", tmp_path / "absent.ply", out)
+    assert "no such file" in refused("convert", tmp_path / "absent.ply", out)
     assert "is a folder" in refused("convert", ply, tmp_path)
     assert "0 to 3" in refused("convert", ply, out, "--sh-degree", 4)
     assert "above 0" in refused("convert", ply, out, "--scale", 0)

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from snowsplat.data import load
-from snowsplat.pipeline.describe import describe
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
@@ -18,7 +17,6 @@ from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.pipeline.train import resume, train
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core import checkpoint
 from snowsplat.training.parts import unexplained
 from snowsplat.training.parts.unexplained import excluded_line
 from snowsplat.util.errors import SettingError, UserError
@@ -113,24 +111,6 @@ def test_ctrl_c_and_resume_give_the_same_scene(dataset, tmp_path):
     assert result.scene.read_bytes() == whole.scene.read_bytes()
     with pytest.raises(UserError, match="other settings"):
         resume(tmp_path / "out", TrainOptions(settings={"seed": 3}))
-
-
-def test_a_run_of_version_0_1_is_opened_and_resumed(dataset, tmp_path):
-    """There, the key "dataset" of the settings and of the checkpoints was "capture"."""
-    whole = train(dataset, tmp_path / "whole", options(12))
-    with pytest.raises(TrainingStopped):
-        train(dataset, tmp_path / "out", options(12), observer=Recorder(interrupt_at=7))
-    config = json.loads((tmp_path / "out/config.json").read_text())
-    config["capture"] = config.pop("dataset")
-    (tmp_path / "out/config.json").write_text(json.dumps(config))
-    folder = tmp_path / "out/checkpoints"
-    saved = checkpoint.load(folder / "step_000007.safetensors")
-    saved.meta["capture"] = saved.meta.pop("dataset")
-    checkpoint.save(folder, 7, saved.tensors, saved.meta)
-    assert describe(tmp_path / "out")["dataset"] == str(dataset)
-    assert len(load_trained(tmp_path / "out").dataset.train) == 9
-    assert resume(tmp_path / "out").scene.read_bytes() == whole.scene.read_bytes()
-    assert "capture" not in json.loads((tmp_path / "out/config.json").read_text())
 
 
 def test_photos_that_are_left_out_are_named_also_by_a_resumed_run(dataset, tmp_path, monkeypatch):
@@ -252,13 +232,13 @@ def test_the_error_of_a_nonempty_folder_names_the_settings(dataset, tmp_path):
 def test_a_time_budget_reads_the_dataset_once(tmp_path, monkeypatch):
     """The photos are downscaled, so there are two datasets; files are read only for the first."""
     dataset = write_toy_dataset(tmp_path / "dataset", "colmap-bin", 4, 480, 40, n_points=300)
-    calls, read = [], load._read
+    calls, read = [], load.read_poses
 
     def counted(*arguments):
         calls.append(arguments)
         return read(*arguments)
 
-    monkeypatch.setattr(load, "_read", counted)
+    monkeypatch.setattr(load, "read_poses", counted)
     result = train(dataset, tmp_path / "out", TrainOptions(minutes=0.02))
     assert len(calls) == 1
     assert result.time is not None
