@@ -85,7 +85,7 @@ class Evaluate(JsonCommand):
         show(evaluation, "mean")
         if network is None:
             print(message("LPIPS was not measured; to measure it: --lpips vgg"))
-        where = scene.folder.path / "metrics.json"
+        where = scene.folder.metrics
         which = message(
             "{count} {split} views of {size}: {where}",
             count=len(views),

@@ -200,17 +200,21 @@ def _gather(
 ) -> dict[str, Any]:
     """Gather the photos into a temporary folder, then replace `input/` and the masks by them. If
     the photos are in `input/` already (``in_place``), only the masks are written."""
-    masks = Path("distorted") / "masks"
+    old = DatasetFolder(folder)
     if in_place:
-        shutil.rmtree(folder / masks, ignore_errors=True)
+        shutil.rmtree(old.distorted_masks, ignore_errors=True)
         return asdict(gather(sources, folder, options, report))
     with new_folder(folder / ".new") as new:
         gathered = gather(sources, new, options, report)
-        for part in (Path("input"), masks):
-            shutil.rmtree(folder / part, ignore_errors=True)
-            if (new / part).exists():
-                (folder / part).parent.mkdir(parents=True, exist_ok=True)
-                (new / part).rename(folder / part)
+        made = DatasetFolder(new)
+        for source, target in (
+            (made.photos, old.photos),
+            (made.distorted_masks, old.distorted_masks),
+        ):
+            shutil.rmtree(target, ignore_errors=True)
+            if source.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                source.rename(target)
     return asdict(gathered)
 
 
@@ -265,7 +269,9 @@ def _check_free(
         return
     allowed = {LOCK, ".new"}  # .new: left by a run that was killed in its first stage
     if in_place:
-        allowed |= {"input"} | ({"distorted"} if options.skip_matching else set())
+        kept = DatasetFolder(folder)
+        allowed |= {kept.photos.name}
+        allowed |= {kept.distorted.name} if options.skip_matching else set()
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in allowed)
     if others:
         raise UserError(

@@ -24,7 +24,7 @@ from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.camera_check import check_cameras
 from snowsplat.pipeline.run.training_files import read_dataset_files, write_beginning
-from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
+from snowsplat.project.training_folder import DATASET, DatasetSettings, TrainingFolder
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.parts.found_sky import sky_distance
 from snowsplat.training.settings.recipes import recipe
@@ -177,7 +177,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         name = f"block_{number:0{digits}d}"
         names = {view.name for view in content.views}
         own = [image for image in posed if image.name in names]
-        write_block_dataset(folder / name / "dataset", own, content.points, whole.origin)
+        write_block_dataset(folder / name / DATASET, own, content.points, whole.origin)
         own_limit = max(1, round(limit * content.share)) if limit else 0
         points = 0 if content.points is None else len(content.points)
         blocks.append(Block(name, content.cell, len(content.views), points, own_limit))

@@ -11,7 +11,7 @@ from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.train import resume, train
-from snowsplat.project.training_folder import TrainingFolder
+from snowsplat.project.training_folder import DATASET, SCENE, TrainingFolder
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.run_lock import InUse, one_run
 
@@ -20,7 +20,7 @@ _CHECKPOINT_SECONDS = 60.0
 
 def scene_folder(folder: Path, block: Block) -> TrainingFolder:
     """The output folder of the training of a block."""
-    return TrainingFolder(folder / block.name / "scene")
+    return TrainingFolder(folder / block.name / SCENE)
 
 
 def is_finished(out: TrainingFolder) -> bool:
@@ -105,7 +105,7 @@ def _train(
     memory: int | str | None,
     observer: Observer,
 ) -> TrainResult:
-    dataset, out = folder / block.name / "dataset", scene_folder(folder, block)
+    dataset, out = folder / block.name / DATASET, scene_folder(folder, block)
     options = TrainOptions(
         recipe=plan.recipe,
         settings={**plan.settings, "max_gaussians": block.max_gaussians},
