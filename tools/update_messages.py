@@ -40,6 +40,7 @@ def messages_of(source: Path = SOURCE) -> Iterator[tuple[str, Key]]:
         if not is_word or file.endswith(".j2") or key in _words(source / file):
             parts = Path(file).parts
             yield parts[0] if len(parts) > 1 else "snowsplat", key
+    yield from _allowed(source)
 
 
 @cache
@@ -53,6 +54,16 @@ def _words(file: Path) -> set[str]:
         and getattr(call.func, "id", "") == "message"
         and isinstance(call.args[0], ast.Constant)
     }
+
+
+def _allowed(source: Path) -> Iterator[tuple[str, Key]]:
+    """What settings allow, in words: the argument ``allowed`` of their declarations."""
+    for file in sorted(source.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            for each in node.keywords if isinstance(node, ast.Call) else ():
+                value = getattr(each.value, "value", None)
+                if each.arg == "allowed" and isinstance(value, str):
+                    yield file.relative_to(source).parts[0], value
 
 
 def translations(folder: Path) -> Catalog:
