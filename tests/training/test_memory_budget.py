@@ -80,7 +80,7 @@ def test_without_a_limit_a_million_gaussians_are_estimated() -> None:
     assert config.density.max_gaussians == 0
     plan = plan_memory(dataset_of(9, 100, 100), config, DEVICE, available=10**10)
     assert plan.limit is None
-    assert "for each million Gaussians" in str(plan)
+    assert "for each million Gaussians" in str(plan.summary())
 
 
 def test_photos_have_half_of_the_available_memory_and_masks_a_byte_per_pixel() -> None:

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from snowsplat.cli.step_progress import print_above
 from snowsplat.util.duration import duration
+from snowsplat.util.messages import message
 
 if TYPE_CHECKING:
     from snowsplat.sfm.progress import Report
@@ -63,7 +64,7 @@ class StageProgress:
     def end(self, line: str, seconds: float, again: bool = False) -> None:
         """The stage is finished; ``again``: it was finished in an earlier run."""
         self.hide()
-        took = "done before" if again else duration(seconds)
+        took = message("done before") if again else duration(seconds)
         self.say(f"{self._stage:<{_WIDTH}}{line}  ({took})")
 
     def say(self, line: str) -> None:
@@ -84,7 +85,7 @@ class StageProgress:
         if left is None and self._first < done < total and elapsed > 1.0:
             left = elapsed / (done - self._first) * (total - done)
         if left is not None:
-            text = f"  {duration(left)} left"
+            text = f"  {message('{time} left', time=duration(left))}"
         if self._bar is not None:
             self._bar.update(
                 self._task, completed=done, total=total or None, text=f"{counted.strip()}{text}"

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
 from snowsplat.util.duration import duration
+from snowsplat.util.messages import Message, message
 from snowsplat.util.process_memory import resident_bytes
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class StepProgress:
         self._last_step = start
         self._rate = 0.0  # steps per second
         self._loss = math.nan
-        self._psnr = ""
+        self._psnr = Message("")
         self._bar: Progress | None = None
         self._task = TaskID(0)
         if self.stream.isatty():
@@ -72,8 +73,9 @@ class StepProgress:
         self._update_rate(progress.step, now)
         done = progress.step >= self.total
         if progress.metrics is not None and progress.metrics.views:
-            self._psnr = f"  PSNR {progress.metrics.psnr:.2f} at {progress.metrics.size}"
-            self.say(held_out_line(progress.step, progress.metrics))
+            means = progress.metrics
+            self._psnr = message("  PSNR {psnr:.2f} at {size}", psnr=means.psnr, size=means.size)
+            self.say(str(held_out_line(progress.step, progress.metrics)))
         if self._bar is not None:
             text = self._text(progress)
             self._bar.update(
@@ -82,8 +84,17 @@ class StepProgress:
         elif done or now - self._last_line >= _LINE_SECONDS:
             self._last_line = now
             percent = 100 * progress.step // self.total
-            counted = f"step {progress.step}/{self.total} ({percent}%)"
-            self.say(f"{counted}  {self._text(progress)}")
+            self.say(
+                str(
+                    message(
+                        "step {step}/{total} ({percent}%)  {text}",
+                        step=progress.step,
+                        total=self.total,
+                        percent=percent,
+                        text=self._text(progress),
+                    )
+                )
+            )
 
     def say(self, line: str) -> None:
         """Print a line, above the bar."""
@@ -102,12 +113,22 @@ class StepProgress:
         rate = self._rate or (progress.step - self._start_step) / max(self.seconds, 1e-9)
         left = progress.seconds_left
         if progress.step >= self.total:
-            remaining = f"done in {duration(self.seconds)}"
+            remaining = message("done in {time}", time=duration(self.seconds))
         else:
-            remaining = "" if left is None else f"{duration(left)} left"
-        return (
-            f"{rate:.1f} it/s  loss {self._loss:.4f}  {progress.gaussians:,} Gaussians"
-            f"{self._psnr}  {resident_bytes() / 1e6:.0f} MB  {remaining}"
+            remaining = Message("")
+            if left is not None:
+                remaining = message("{time} left", time=duration(left))
+        return str(
+            message(
+                "{rate:.1f} it/s  loss {loss:.4f}  {gaussians:,} Gaussians{psnr}  {memory:.0f} MB  "
+                "{remaining}",
+                rate=rate,
+                loss=self._loss,
+                gaussians=progress.gaussians,
+                psnr=self._psnr,
+                memory=resident_bytes() / 1e6,
+                remaining=remaining,
+            )
         )
 
 
@@ -119,11 +140,18 @@ def print_above(bar: Progress | None, line: str, stream: TextIO) -> None:
         print(line, file=stream, flush=True)
 
 
-def held_out_line(step: int, evaluation: Evaluation) -> str:
+def held_out_line(step: int, evaluation: Evaluation) -> Message:
     """Step, number and size of the views, and the mean figures."""
-    count = len(evaluation.views)
-    figures = f"PSNR {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.3f}"
-    figures += f"  colour-aligned PSNR {evaluation.psnr_aligned:.2f} dB"
-    if evaluation.lpips is not None:
-        figures += f"  LPIPS {evaluation.lpips:.3f}"
-    return f"step {step}: {count} views of {evaluation.size}  {figures}"
+    line = message(
+        "step {step}: {count} views of {size}  PSNR {psnr:.2f} dB  SSIM {ssim:.3f}  colour-aligned "
+        "PSNR {aligned:.2f} dB",
+        step=step,
+        count=len(evaluation.views),
+        size=evaluation.size,
+        psnr=evaluation.psnr,
+        ssim=evaluation.ssim,
+        aligned=evaluation.psnr_aligned,
+    )
+    if evaluation.lpips is None:
+        return line
+    return message("{line}  LPIPS {lpips:.3f}", line=line, lpips=evaluation.lpips)

@@ -49,8 +49,11 @@ def given_poses(sources: Sources, settings: DatasetSettings, observer: Observer)
     folders = [str(photo.path.parent) for photo in sources.photos]
     photos = os.path.commonpath(folders or [settings.path])
     if Path(photos) != Path(settings.path):  # there are no poses in this folder
-        again = "{line}; to estimate them again: snowsplat make {photos}"
-        line = message(again, line=line, photos=shown(photos))
+        line = message(
+            "{line}; to estimate them again: snowsplat make {photos}",
+            line=line,
+            photos=shown(photos),
+        )
     observer.note(line)
     if without:
         observer.note(

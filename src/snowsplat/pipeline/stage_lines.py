@@ -76,8 +76,8 @@ def _scene(trained: dict[str, Any]) -> list[Message]:
     steps = message("{steps} steps", steps=trained["iteration"])
     if trained["psnr"] is None:
         return [steps]
-    quality = "{steps}, PSNR {psnr:.2f} dB at {size}"
-    return [message(quality, steps=steps, psnr=trained["psnr"], size=trained["size"])]
+    psnr, size = trained["psnr"], trained["size"]
+    return [message("{steps}, PSNR {psnr:.2f} dB at {size}", steps=steps, psnr=psnr, size=size)]
 
 
 def _all(trained: dict[str, Any]) -> list[Message]:

@@ -302,7 +302,7 @@ class _Job:
             message(
                 "training on {device_name}; {memory}",
                 device_name=device_name(self.device),
-                memory=memory,
+                memory=memory.summary(),
             )
         )
         most = _BYTES_IN_FILE * (memory.plan.limit or len(trainer.gaussians))

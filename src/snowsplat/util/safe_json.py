@@ -13,7 +13,7 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from snowsplat.util.errors import Problem
-from snowsplat.util.messages import Message
+from snowsplat.util.messages import Message, as_message
 
 _Kind = TypeVar("_Kind")
 
@@ -145,7 +145,7 @@ def from_json(kind: type[_Kind], values: Any) -> _Kind:
     try:
         return kind(**{name: _as(hints[name], value) for name, value in values.items()})
     except TypeError as error:  # a field is missing
-        raise Problem(str(error)) from None
+        raise Problem(as_message(error)) from None
 
 
 @functools.cache

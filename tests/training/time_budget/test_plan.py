@@ -130,12 +130,12 @@ def test_other_recipes():
     for name in ("paper", "mcmc"):
         plan = make_plan(dataset(552, 986), recipe(name), 600, 1.0)
         assert plan.config.iterations > 1500
-    assert "no limit" in str(make_plan(dataset(552, 986), recipe("paper"), 600, 1.0))
+    assert "no limit" in str(make_plan(dataset(552, 986), recipe("paper"), 600, 1.0).summary())
 
 
 def test_plans_as_text():
     plan = replace(planned(60, 552, 986), config=recipe("default", iterations=8964))
-    assert str(plan) == "552x986, at most 200,000 Gaussians, about 9,000 steps"
+    assert str(plan.summary()) == "552x986, at most 200,000 Gaussians, about 9,000 steps"
     assert str(planned(1, 200, 150)).startswith("200x150, at most 18,000 Gaussians")
     assert str(planned(1, 552, 986)).startswith("photos reduced to 112x200, at most 13,440")
 

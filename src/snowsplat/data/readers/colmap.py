@@ -129,14 +129,13 @@ def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:
         found = sorted(p.name for p in root.iterdir() if p.is_dir())
         missing = message("no such folder: {folder}; use the right one", folder=folder)
         if found:
-            there = "{missing} (existing folders: {found})"
-            missing = message(there, missing=missing, found=found)
+            missing = message("{missing} (existing folders: {found})", missing=missing, found=found)
         return SettingError("images", missing)
     names = photos_below(folder)
     instead = Message("")
     if names:
-        there = "; it has {count} others, e.g. {name}"
-        instead = message(there, count=len(names), name=quoted(names[0]))
+        one = quoted(names[0])
+        instead = message("; it has {count} others, e.g. {name}", count=len(names), name=one)
     return SettingError(
         "images",
         "{folder} has none of the {images} images of the model (the first is {first}){instead}; "

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from snowsplat.util.messages import Message, message
 from snowsplat.util.process_memory import peak_bytes
 
 if TYPE_CHECKING:
@@ -54,16 +55,22 @@ class MemoryUse:
         plan = plan_memory(dataset, config, device, available, budget, present)
         return cls(device, plan, before)
 
-    def __str__(self) -> str:
-        where = "memory of the GPU" if self.device.type == "cuda" else "memory"
-        return f"{where}: {self.plan}"
+    def summary(self) -> Message:
+        """The plan in a few words."""
+        plan = self.plan.summary()
+        if self.device.type == "cuda":
+            return message("memory of the GPU: {plan}", plan=plan)
+        return message("memory: {plan}", plan=plan)
 
-    def peak(self) -> str:
-        """The peak memory so far, as text for users."""
+    def peak(self) -> Message:
+        """The peak memory so far, in a few words."""
         if self.device.type == "cuda":
             import torch
 
             peak = torch.cuda.max_memory_allocated(self.device)
-            return f"at most {peak / 1e6:.0f} MB of the GPU"
-        peak, before = peak_bytes(), self.before
-        return f"at most {peak / 1e6:.0f} MB, {before / 1e6:.0f} of them Python and its libraries"
+            return message("at most {peak:.0f} MB of the GPU", peak=peak / 1e6)
+        return message(
+            "at most {peak:.0f} MB, {before:.0f} of them Python and its libraries",
+            peak=peak_bytes() / 1e6,
+            before=self.before / 1e6,
+        )

@@ -71,7 +71,9 @@ class TimeBudget:
 
     def described(self, plan: Plan) -> Message:
         """The plan in one line."""
-        return message("{time} on this machine: {plan}", time=duration(self.seconds), plan=plan)
+        return message(
+            "{time} on this machine: {plan}", time=duration(self.seconds), plan=plan.summary()
+        )
 
     def pace(self, trainer: Trainer, time_ratio: float) -> Pace:
         """The pace that keeps the training within the time that is left."""

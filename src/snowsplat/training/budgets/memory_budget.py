@@ -17,6 +17,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import SettingError
+from snowsplat.util.messages import Message, message
 
 #: Bytes per pixel of a decoded photo, and of its mask.
 _RGB = 3
@@ -92,12 +93,23 @@ class MemoryPlan:
         """Bytes."""
         return self.scene + self.images + self.photos
 
-    def __str__(self) -> str:
-        parts = f"images {format_bytes(self.images)}, photos {format_bytes(self.photos)}"
+    def summary(self) -> Message:
+        """The plan in a few words."""
+        values = {
+            "scene": format_bytes(self.scene),
+            "images": format_bytes(self.images),
+            "photos": format_bytes(self.photos),
+        }
         if self.limit is None:
-            return f"{format_bytes(self.scene)} for each million Gaussians, {parts}"
-        scene = f"{self.limit:,} Gaussians {format_bytes(self.scene)}"
-        return f"{format_bytes(self.total)} at most ({scene}, {parts})"
+            return message(
+                "{scene} for each million Gaussians, images {images}, photos {photos}", **values
+            )
+        return message(
+            "{total} at most ({limit:,} Gaussians {scene}, images {images}, photos {photos})",
+            total=format_bytes(self.total),
+            limit=self.limit,
+            **values,
+        )
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.starts import map_pixels
 from snowsplat.training.starts.init import initial_count
+from snowsplat.util.messages import Message, message
 
 # The size of the photos is reduced until there is time for both of these minimum numbers of steps.
 #: Minimum number of steps, per square root of the number of pixels of a photo. Larger photos show
@@ -92,13 +93,20 @@ class Plan:
     time_ratio: float
     seconds: float
 
-    def __str__(self) -> str:
-        cap = self.config.density.max_gaussians
-        gaussians = f"at most {cap:,} Gaussians" if cap else "no limit on the number of Gaussians"
-        size = f"{self.width}x{self.height}"
+    def summary(self) -> Message:
+        """The plan in a few words."""
+        gaussians = message("no limit on the number of Gaussians")
+        if cap := self.config.density.max_gaussians:
+            gaussians = message("at most {cap:,} Gaussians", cap=cap)
+        size = message("{width}x{height}", width=self.width, height=self.height)
         if self.resolution is not None:
-            size = f"photos reduced to {size}"
-        return f"{size}, {gaussians}, about {_rounded(self.config.iterations):,} steps"
+            size = message("photos reduced to {size}", size=size)
+        return message(
+            "{size}, {gaussians}, about {steps:,} steps",
+            size=size,
+            gaussians=gaussians,
+            steps=_rounded(self.config.iterations),
+        )
 
 
 def make_plan(
