@@ -136,8 +136,10 @@ def test_other_recipes():
 def test_plans_as_text():
     plan = replace(planned(60, 552, 986), config=recipe("default", iterations=8964))
     assert str(plan.summary()) == "552x986, at most 200,000 Gaussians, about 9,000 steps"
-    assert str(planned(1, 200, 150)).startswith("200x150, at most 18,000 Gaussians")
-    assert str(planned(1, 552, 986)).startswith("photos reduced to 112x200, at most 13,440")
+    assert str(planned(1, 200, 150).summary()).startswith("200x150, at most 18,000 Gaussians")
+    assert str(planned(1, 552, 986).summary()).startswith(
+        "photos reduced to 112x200, at most 13,440"
+    )
 
 
 @pytest.mark.slow
