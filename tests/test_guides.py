@@ -151,47 +151,6 @@ def test_command_is_valid(command):
         assert program in {"snowsplat", *TOOLS}
 
 
-def test_named_flags_exist(capsys):
-    for name in cli.SUBCOMMANDS:
-        with pytest.raises(SystemExit):
-            cli.parse([name, "--help"])
-    known = capsys.readouterr().out
-    for page, text in TEXTS.items():
-        for flag in set(re.findall(r"`(-[-a-zA-Z_]+)", text)) - OTHERS.get(page, set()):
-            assert flag.replace("_", "-") in known, f"{page}: {flag}"
-
-
-# Flags of the other programs.
-OTHERS = {
-    "docs/guides/gsplat.md": {
-        "--ckpt",
-        "--data_factor",
-        "--max_steps",
-        "--save_ply",
-        "--strategy",
-        "--app_opt",
-        "--no-normalize-world-space",
-        "--pose_opt",
-    },
-    "docs/guides/nerfstudio.md": {
-        "--downscale-factor",
-        "--max-num-iterations",
-        "--output-dir",
-        "--pipeline",
-        "--ply-color-mode",
-    },
-}
-
-
-@pytest.mark.parametrize("page", ["README.md", "README.zh-CN.md"])
-def test_linked_files_exist(page):
-    """`make docs` checks the links of the pages of the site, which the READMEs are not part of."""
-    links = re.findall(r"\]\(([^):#]+)[#)]", (ROOT / page).read_text(encoding="utf-8"))
-    assert len(links) > 20
-    for link in links:
-        assert (ROOT / link).exists(), link
-
-
 def test_environment_variables_are_used():
     source = "".join(file.read_text() for file in (ROOT / "src" / "snowsplat").rglob("*.py"))
     names = re.findall(r"`(SNOWSPLAT_\w+)=", TEXTS["docs/environment-variables.md"])
