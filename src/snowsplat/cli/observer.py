@@ -95,8 +95,8 @@ class TerminalObserver(Observer):
         if result.evaluation is not None:
             print(held_out_line(*result.evaluation))
         for part in result.parts.values():
-            for line in part.lines:
-                print(line)
+            for each in part.lines:
+                print(each)
         if result.time is not None:
             spent, given = map(duration, result.time)
             print(message("{spent} in total, of {given}", spent=spent, given=given))

@@ -59,11 +59,9 @@ def _field(flag: Flag) -> tuple[str, Any, Any]:
         # a second.
         kind = Optional[kind]  # noqa: UP045
     help = with_flags(declared.help)
-    return (
-        flag.key,
-        Annotated.__class_getitem__((kind, *marks)),
-        field(default=value, metadata={"help": help}),
-    )
+    parts = (kind, *marks)
+    annotated: Any = Annotated[parts]
+    return flag.key, annotated, field(default=value, metadata={"help": help})
 
 
 def _not_given(flag: Flag) -> Any:
