@@ -163,11 +163,6 @@ class _ArrayPointer:
         return int(self.array.ctypes.data)
 
 
-def layout_of(name: str) -> Layout:
-    """The layout of the struct of a function. Raises: Mismatch: the library does not have it."""
-    return (_functions.get(name) or _function(name)).layout
-
-
 def _function(name: str) -> _Function:
     try:
         describe = getattr(library()[1], f"{name}_fields")

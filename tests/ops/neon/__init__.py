@@ -38,7 +38,7 @@ def launch(name: str, fields: Fields) -> int:
 
     The struct is packed for the library of this machine. The program compares both descriptions.
     """
-    layout = native_library.layout_of(name)
+    layout = native_library._function(name).layout
     words = ctypes.create_string_buffer(layout.size)
     layout.pack_into(words, name, fields)
     values = [fields[field] for field in layout.names]
