@@ -57,7 +57,7 @@ def test_errors(refused, scene, tmp_path):
     assert "add --video" in refused("globe", scene, "--size", "64")
     video = ("globe", scene, "--video", tmp_path / "a.mp4")
     assert "use e.g. 1280x720" in refused(*video, "--size", "large")
-    assert "--fps: 0 is too small; use 1 to 120" in refused(*video, "--fps", 0)
+    assert "--fps: 0.0 is too small; use 1 to 120" in refused(*video, "--fps", 0)
     assert "use at most 60" in refused("globe", scene, "--name", 61 * "a")
     assert "--threads: 0 is too small" in refused("globe", scene, "--threads", 0)
     assert "`iteration`" not in refused("globe", scene, "--iteration", 3)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import reduce
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
@@ -39,9 +40,13 @@ def explained(command: type[Command], arguments: Sequence[str], printed: str) ->
         for name, spelling in unknown.items()
         if spelling not in flags
     }
-    for name, use in advised.items():
-        if use:
-            return message("{name}: {use}", name=printable(name), use=use)
+    told = [
+        message("{name}: {use}", name=printable(name), use=use)
+        for name, use in advised.items()
+        if use
+    ]
+    if told:
+        return reduce(lambda one, other: message("{one}; {other}", one=one, other=other), told)
     for number, argument in enumerate(arguments):
         if not _FLAG.match(argument):
             continue
