@@ -204,7 +204,7 @@ def wrong_name(code: str) -> Iterator[str]:
             parts = rest if first == "snowsplat" else [first, *rest]
             if not resolves(parts):
                 yield f"no name {dotted}"
-    for word in WORD.findall(re.sub(r"\"[^\"]*\"|'[^']*'", "", code)):
+    for word in WORD.findall(re.sub(r"--[\w-]+|\"[^\"]*\"|'[^']*'", "", code)):
         looks = "_" in word.strip("_") or re.search(r"[a-z][A-Z]", word) or f"{word}(" in code
         if looks and word not in words():
             yield f"no name {word}: {code}"
