@@ -15,8 +15,8 @@ from snowsplat.data.photos.image_loader import Photos
 from snowsplat.training.settings.starts import STARTS
 from snowsplat.training.starts.depth import depth_points
 from snowsplat.training.starts.map_views import map_pixels
+from snowsplat.training.starts.plane_sweep import swept_points
 from snowsplat.training.starts.random_rays import random_points
-from snowsplat.training.starts.sweep import swept_points
 
 if TYPE_CHECKING:
     from snowsplat.training.settings.starts import Start

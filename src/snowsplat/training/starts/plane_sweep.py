@@ -1,4 +1,7 @@
-"""Depth maps of the training views, by plane sweep, from coarse to fine."""
+"""`swept_points`: points on the surfaces, from depth maps that a plane sweep computes.
+
+The sweep goes from coarse to fine.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,13 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from snowsplat import ops
-from snowsplat.data.dataset import View
+from snowsplat.data.dataset import Dataset, Points, View
 from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import compose_rigid
 from snowsplat.training.starts.depth_map import LONGER_SIDE, DepthMap, photo_for_map
+from snowsplat.training.starts.fusion import fused_points
+from snowsplat.training.starts.map_views import choose_views
 from snowsplat.training.starts.photos import in_threads, usable_pixels
 
 #: Windows have (2 r + 1)² pixels.
@@ -35,6 +40,28 @@ _OUTLIERS, _MARGIN = 0.01, 1.2
 _FEWEST_POINTS = 8
 
 _LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
+
+
+def swept_points(
+    dataset: Dataset,
+    images: Photos,
+    count: int,
+    generator: torch.Generator,
+    longer_side: int = LONGER_SIDE,
+) -> Points:
+    """At most ``count`` points on the surfaces that several photos show, in the world frame, on the
+    CPU.
+
+    The depth maps of the training views are computed by plane sweep. The map of each view is
+    checked with those of its source views; see `depth_maps` and `fused_points`.
+
+    Args:
+        generator: a random generator on the CPU.
+        longer_side: the maximum size of the maps, in pixels.
+    """
+    chosen = choose_views(dataset, images, generator, longer_side)
+    maps = depth_maps(chosen.views, chosen.sources, images, chosen.points, longer_side)
+    return fused_points(chosen, maps, images, count, generator)
 
 
 def depth_maps(
