@@ -29,7 +29,8 @@ PARENT = """
 import json, os, signal, sys
 from pathlib import Path
 from snowsplat.sfm.ingest.photo import Photo
-from snowsplat.sfm.colmap import SfmOptions, estimate_poses
+from snowsplat.sfm.colmap import estimate_poses
+from snowsplat.sfm.options import SfmOptions
 
 def report(done, total, what):
     if what == sys.argv[3]:
