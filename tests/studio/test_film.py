@@ -41,7 +41,7 @@ def test_a_film_is_rendered_and_sent(studio, monkeypatch):
     assert worker.run_job(scene, "film") == 0
     about = studio.ask(address)[1]
     assert (about["running"], about["outcome"], about["plan"]) == (False, "done", plan)
-    assert about["command"].endswith("--seconds 0.1 --size 64x36 --ease --video film.mp4")
+    assert about["command"].endswith("--seconds 0.1 --ease --size 64x36 --video film.mp4")
     status, film = studio.ask(f"{address}/file")
     assert (status, len(film)) == (200, about["bytes"])
     with av.open(str(scene.film)) as video:
