@@ -11,6 +11,7 @@ from snowsplat.cli.main import SUBCOMMANDS
 from snowsplat.cli.next_steps import next_step, see_and_share
 from snowsplat.cli.subcommands import _WORDS
 from snowsplat.formats import write_gaussians
+from snowsplat.util.messages import message
 
 
 @pytest.fixture
@@ -21,12 +22,14 @@ def scene(tmp_path) -> Path:
 
 
 def test_commands_are_quoted():
-    assert next_step("or", "info", Path("my garden")) == "or: snowsplat info 'my garden'"
-    assert see_and_share(Path("walk_scene")) == (
+    assert (
+        str(next_step(message("or"), "info", Path("my garden"))) == "or: snowsplat info 'my garden'"
+    )
+    assert str(see_and_share(Path("walk_scene"))) == (
         "to see it: snowsplat view walk_scene; "
         "to share it: snowsplat publish walk_scene -o walk_site"
     )
-    assert see_and_share(Path("out/a.compressed.ply")).endswith("-o a_site")
+    assert str(see_and_share(Path("out/a.compressed.ply"))).endswith("-o a_site")
 
 
 def test_words_that_are_no_subcommand(refused, scene, monkeypatch):

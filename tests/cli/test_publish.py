@@ -122,7 +122,7 @@ def test_errors(refused, scene, tmp_path):
     assert "is a file" in refused("publish", scene, "-o", scene)
     assert "contains other files" in refused("publish", scene, "-o", scene.parent)
     site = ("publish", scene, "-o", tmp_path / "a")
-    assert "--url: example.org is no address" in refused(*site, "--url", "example.org")
+    assert "--url: 'example.org' is no address" in refused(*site, "--url", "example.org")
     assert "`iteration`" not in refused(*site, "--iteration", 3)
     empty = tmp_path / "empty.ply"
     box = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from snowsplat.cli import view
+from snowsplat.cli import page_flags
 from snowsplat.cli.main import main
 from snowsplat.cli.pages import for_other_computers
 from snowsplat.formats import read_gaussians, write_gaussians
@@ -86,7 +86,7 @@ def served(run, monkeypatch):
         monkeypatch.setattr(
             ViewableScene, "ready", lambda self: (shown.append(self), ready(self))[1]
         )
-        monkeypatch.setattr(view, "wait", lambda: done.wait(0.3))
+        monkeypatch.setattr(page_flags, "wait", lambda: done.wait(0.3))
         result = run("view", *arguments)
         assert result.code == 0, result.err
         return result, opened, shown[:2]
@@ -139,8 +139,11 @@ def test_which_scene_and_which_cameras(served, out, tmp_path):
     )  # the output folder is found from the scene file
     shutil.copy(scene(out), tmp_path / "garden.ply")
     assert served(tmp_path / "garden.ply")[2][0].cameras == []
-    # The output of `snowsplat make`: OUT/garden.ply is a copy of the scene in OUT/scene.
+    # The output of `snowsplat make`: OUT/garden.ply is a copy of the scene in OUT/scene, and the
+    # record names it.
     shutil.copytree(out, tmp_path / "scene")
+    assert served(tmp_path / "garden.ply")[2][0].cameras == []
+    (tmp_path / "make.json").write_text('{"file": "garden.ply"}')
     assert len(served(tmp_path / "garden.ply")[2][0].cameras) == 9
     assert len(served(tmp_path)[2][0].cameras) == 9
     shutil.copy(out / "point_cloud/iteration_30/point_cloud.ply", tmp_path / "other.ply")

@@ -17,7 +17,7 @@ class Lines(Observer):
         self.lines = []
 
     def note(self, line):
-        self.lines.append(line)
+        self.lines.append(str(line))
 
 
 @pytest.fixture

@@ -70,7 +70,7 @@ def test_fewer_frames_of_each_video_and_fewer_photos():
     assert plan.photos is not None
     assert plan.frames is not None
     assert plan.photos == pytest.approx(plan.frames, abs=1)  # 1/3 of the count, in both videos
-    assert described(plan, found, 100) == (
+    assert str(described(plan, found, 100)) == (
         f"1 min 40 s: {plan.photos} of 100 photos and {2 * plan.frames} of 200 frames, "
         "1000 pixels, draft effort"
     )
@@ -86,9 +86,9 @@ def test_a_single_photo_beside_a_long_video_is_kept():
 
 def test_the_description_names_what_was_chosen():
     found = of_photos(300)
-    assert described(MakePlan("draft", 1000, photos=60), found, 180) == (
+    assert str(described(MakePlan("draft", 1000, photos=60), found, 180)) == (
         "3 min 0 s: 60 of 300 photos, 1000 pixels, draft effort"
     )
-    assert described(MakePlan("best", 3200), of_photos(40, 3000), 3600) == (
+    assert str(described(MakePlan("best", 3200), of_photos(40, 3000), 3600)) == (
         "1 h 0 min: 40 photos, 3000 pixels, best effort"
     )

@@ -18,6 +18,7 @@ from snowsplat.pipeline.output.scene_source import load_trained
 from snowsplat.pipeline.run.refined_cameras import with_refined, write_refined
 from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.train import train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.training.parts import pose_refinement
 from snowsplat.util.errors import UserError
 
@@ -93,9 +94,9 @@ def test_a_run_without_refinement_removes_them(dataset: Path, tmp_path: Path) ->
 
 def test_a_photo_that_is_not_in_the_model(dataset: Path, tmp_path: Path) -> None:
     whole = load_dataset(dataset, hold_out=4)
-    write_refined(tmp_path, whole.train, whole)
+    write_refined(TrainingFolder(tmp_path), whole.train, whole)
     with pytest.raises(UserError, match=r"no camera for view_00\.png"):
-        with_refined(tmp_path, whole)
-    same = with_refined(tmp_path, replace(whole, test=[]))
+        with_refined(TrainingFolder(tmp_path), whole)
+    same = with_refined(TrainingFolder(tmp_path), replace(whole, test=[]))
     for a, b in zip(whole.train, same.train, strict=True):
         torch.testing.assert_close(a.camera.cam_from_world, b.camera.cam_from_world)

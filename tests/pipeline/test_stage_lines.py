@@ -1,6 +1,10 @@
 """The lines about finished stages."""
 
-from snowsplat.pipeline.stage_lines import described
+from snowsplat.pipeline import stage_lines
+
+
+def described(stage: str, result: dict) -> list[str]:
+    return [str(line) for line in stage_lines.described(stage, result)]
 
 
 def test_what_is_fixed_to_the_frame_follows_the_number_of_photos():

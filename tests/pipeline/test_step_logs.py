@@ -11,6 +11,7 @@ from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.train_result import TrainingStopped
 from snowsplat.pipeline.step_logs import COLUMNS, LOGS, CsvLog
 from snowsplat.pipeline.train import resume, train
+from snowsplat.project.training_folder import TrainingFolder
 from snowsplat.util.errors import UserError
 
 SETTINGS = {"iterations": 12, "initial_points": 200, "init": "points", "checkpoint_every": 5}
@@ -35,8 +36,8 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 def test_csv_has_a_row_for_each_step_also_after_a_resume(dataset, tmp_path):
     whole, out = tmp_path / "whole", tmp_path / "out"
-    train(dataset, whole, OPTIONS, observer=LOGS["csv"](whole))
-    log = LOGS["csv"](out)
+    train(dataset, whole, OPTIONS, observer=LOGS["csv"](TrainingFolder(whole)))
+    log = LOGS["csv"](TrainingFolder(out))
     with pytest.raises(TrainingStopped):
         train(dataset, out, OPTIONS, observer=Observers(log, StopAfter(8)))
     assert [row["step"] for row in rows_of(out / "log.csv")] == [str(i) for i in range(1, 9)]
@@ -62,14 +63,14 @@ def test_a_training_without_a_step_leaves_nothing(dataset, tmp_path):
 
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        train(dataset, out, OPTIONS, observer=Observers(LOGS["csv"](out), Never()))
+        train(dataset, out, OPTIONS, observer=Observers(LOGS["csv"](TrainingFolder(out)), Never()))
     assert not out.exists()
 
 
 def test_a_missing_tensorboard_is_one_line(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(UserError, match=r"pip install .snowsplat\[tensorboard\]"):
-        LOGS["tensorboard"](tmp_path)
+        LOGS["tensorboard"](TrainingFolder(tmp_path))
 
 
 def test_tensorboard_gets_the_same_figures(dataset, tmp_path):
@@ -77,10 +78,15 @@ def test_tensorboard_gets_the_same_figures(dataset, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     out = tmp_path / "out"
-    logs = Observers(LOGS["csv"](out), LOGS["tensorboard"](out))
+    logs = Observers(LOGS["csv"](TrainingFolder(out)), LOGS["tensorboard"](TrainingFolder(out)))
     with pytest.raises(TrainingStopped):
         train(dataset, out, OPTIONS, observer=Observers(logs, StopAfter(8)))
-    resume(out, observer=Observers(LOGS["csv"](out), LOGS["tensorboard"](out)))
+    resume(
+        out,
+        observer=Observers(
+            LOGS["csv"](TrainingFolder(out)), LOGS["tensorboard"](TrainingFolder(out))
+        ),
+    )
     events = EventAccumulator(str(out / "tensorboard"))
     events.Reload()
     losses = [(event.step, event.value) for event in events.Scalars("loss")]

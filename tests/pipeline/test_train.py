@@ -72,7 +72,7 @@ def test_learnt_exposures_are_written(dataset, tmp_path):
     names = [view.name for view in load.load_dataset(dataset, hold_out=8).train]
     assert list(written["photos"]) == names
     assert abs(sum(red for red, _, _ in written["photos"].values())) < 1e-4
-    assert "<h2>Exposures of the photos" in (out / "report.html").read_text(encoding="utf-8")
+    assert "Exposures of the photos" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_from_a_dataset_to_metrics_and_images_without_printing(dataset, tmp_path, capfd):
@@ -172,7 +172,7 @@ def test_what_moves_is_masked_and_shown(tmp_path):
             assert mask.size == (128, 96)
             assert mask.histogram()[0] == round(moving[name] * 128 * 96)
     report = result.report.read_text()
-    assert "<h2>What moves</h2>" in report
+    assert "What moves" in report
     assert report.count(": masked parts") == count * 2  # alt and title
 
     recorder = Recorder()
@@ -199,7 +199,7 @@ def test_without_photos_that_are_left_out_nothing_is_said(dataset, tmp_path):
     assert result.left_out == ()
     assert not any("not explained" in note for note in recorder.notes)
     assert "left_out" not in json.loads((tmp_path / "metrics.json").read_text())
-    assert "<h2>Photos that the scene does not explain" not in result.report.read_text()
+    assert "Photos that the scene does not explain" not in result.report.read_text()
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.initial_view import overview
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message
 from snowsplat.viewer.http.served_file import FileOnDisk
 
 
@@ -34,8 +35,8 @@ class Notes(Observer):
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def note(self, line: str) -> None:
-        self.lines.append(line)
+    def note(self, line: Message) -> None:
+        self.lines.append(str(line))
 
 
 def test_a_small_scene_is_one_file(scene):

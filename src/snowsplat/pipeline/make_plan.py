@@ -92,17 +92,18 @@ def _thinned(photos: Photos, count: int) -> Photos:
 
 def described(plan: MakePlan, photos: Photos, seconds: float) -> Message:
     """The plan in one line, such as "3 min 0 s: 60 of 300 photos, 1000 pixels, draft effort"."""
-    parts = []
-    if photos.stills:
-        used = photos.stills if plan.photos is None else plan.photos
-        parts.append(message("{used} of {all} photos", used=used, all=photos.stills))
-    if photos.frames:
-        used = photos.frames if plan.frames is None else plan.frames * photos.videos
-        parts.append(message("{used} of {all} frames", used=used, all=photos.frames))
+    stills = message("{photos} photos", photos=photos.stills)
+    if plan.photos is not None:
+        stills = message("{used} of {all} photos", used=plan.photos, all=photos.stills)
+    frames = message("{frames} frames", frames=photos.frames)
+    if plan.frames is not None:
+        used = plan.frames * photos.videos
+        frames = message("{used} of {all} frames", used=used, all=photos.frames)
+    both = message("{photos} and {frames}", photos=stills, frames=frames)
     return message(
         "{time}: {photos}, {size} pixels, {quality} effort",
         time=duration(seconds),
-        photos=parts,
+        photos=both if photos.stills and photos.frames else stills if photos.stills else frames,
         size=min(plan.size, max(photos.longest, photos.video)),
         quality=plan.quality,
     )
