@@ -10,6 +10,8 @@ import pytest
 from snowsplat.cli.command import plain
 from snowsplat.cli.subcommands import SUBCOMMANDS, load_subcommand
 from snowsplat.evaluation.metrics import Evaluation
+from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.util.messages import message
 
 #: They serve pages, or run others of these commands.
 WITHOUT = {"studio", "view", "watch", "demo", "blocks"}
@@ -64,3 +66,10 @@ def test_an_error_prints_nothing_on_stdout(run, tmp_path):
 def test_values():
     assert plain({"a": (Path("x"), math.nan, None, True)}) == {"a": ["x", None, None, True]}
     assert plain(Evaluation([]))["psnr"] is None
+
+
+def test_messages_are_texts_in_json():
+    verdict = Verdict.of([Reason("poor", message("{n} photos are few", n=3))])
+    (reason,) = plain({"verdict": verdict})["verdict"]["reasons"]
+    assert reason["text"] == "3 photos are few"
+    assert plain(message("at most {peak} MB", peak=5)) == "at most 5 MB"

@@ -12,7 +12,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from snowsplat.util.flags import settings_from
+from snowsplat.util.messages import Message
 from snowsplat.util.settings import Settings, switch
+
+_OF_MESSAGE = {each.name for each in fields(Message)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +75,12 @@ def run(command: Command) -> int:
 
 
 def plain(value: Any) -> Any:
-    """A value of JSON: dataclasses are objects, paths are texts, and numbers that are not finite
-    are null."""
+    """A value of JSON: dataclasses are objects, paths and messages are texts, and numbers that are
+    not finite are null."""
+    if isinstance(value, Mapping) and value.keys() == _OF_MESSAGE:
+        value = Message.from_json(value)
+    if isinstance(value, Message):
+        return str(value)
     if hasattr(value, "as_json"):
         return plain(value.as_json())
     if is_dataclass(value):

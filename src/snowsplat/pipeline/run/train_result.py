@@ -10,6 +10,7 @@ from snowsplat.evaluation.metrics import Evaluation
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.project.left_out import LeftOut
 from snowsplat.training.parts.part_report import PartReport
+from snowsplat.util.messages import Message
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class TrainResult:
     first_step: int
     gaussians: int
     seconds: float
-    memory: str
+    memory: Message
     reductions: tuple[str, ...]
     evaluation: tuple[int, Evaluation] | None
     left_out: tuple[LeftOut, ...]
