@@ -75,7 +75,7 @@ class Demo(Command):
         scene = result.made.project.path
         if not self.open:
             print(message("\n{see_and_share}", see_and_share=see_and_share(scene)))
-            print("with your own photos: snowsplat make PHOTOS")
+            print(message("with your own photos: snowsplat make PHOTOS"))
             return None
         View(path=scene).run()
         return None
