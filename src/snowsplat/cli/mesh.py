@@ -37,7 +37,8 @@ class Mesh(SurfaceCommand):
         from snowsplat.pipeline.mesh import write_mesh
 
         surface = self.written(write_mesh)
-        count = f"{len(surface.mesh.faces):,} of {surface.found:,} triangles"
+        faces = len(surface.mesh.faces)
+        count = message("{kept:,} of {found:,} triangles", kept=faces, found=surface.found)
         points = self.output.with_suffix(".ply")
         return self.reported(
             surface,

@@ -33,7 +33,7 @@ class Points(SurfaceCommand):
         from snowsplat.pipeline.mesh import write_points
 
         surface = self.written(write_points)
-        count = f"{len(surface.mesh.vertices):,} points"
+        count = message("{count:,} points", count=len(surface.mesh.vertices))
         mesh = self.output.with_suffix(".glb")
         return self.reported(
             surface,

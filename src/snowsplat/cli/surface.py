@@ -50,7 +50,7 @@ class SurfaceCommand(JsonCommand):
                 observer,
             )
 
-    def reported(self, surface: Surface, what: str, hint: Message) -> dict[str, Any]:
+    def reported(self, surface: Surface, what: Message, hint: Message) -> dict[str, Any]:
         """Print the lines of the result; returns it for --json."""
         print(
             message(

@@ -19,7 +19,7 @@ def main(words: list[str]) -> int:
         return _work(words)
     scene = StudioScene(Path(words[1]))
     try:
-        with locked(scene.lock(words[0]), f"{scene.folder}: in use by"):
+        with locked(scene.lock(words[0]), str(scene.folder)):
             return _work(words)
     except InUse as error:
         print(error, file=sys.stderr)

@@ -99,7 +99,7 @@ def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None
     with ExitStack() as stack:
         for seconds in (0.0, wait):
             try:
-                stack.enter_context(locked(folder / _LOCK, f"{folder}: in use by", seconds))
+                stack.enter_context(locked(folder / _LOCK, str(folder), seconds))
                 break
             except InUse:
                 # Only now: another program may have the port of a studio that was killed, and it

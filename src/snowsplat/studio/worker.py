@@ -83,7 +83,7 @@ def _message(error: UserError | OSError) -> Message:
 
 
 def _make(scene: StudioScene, recorder: Recorder) -> dict[str, Any]:
-    with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
+    with locked(scene.edit_lock, str(scene.folder), _LONGEST_CHANGE):
         # An edit that has begun ends first; none begins while this job runs. What an edit that was
         # killed has left to do is not for the scene that is made now.
         scene.begun.unlink(missing_ok=True)
@@ -182,7 +182,7 @@ def _answer(verb: Verb, scene: StudioScene, given: dict[str, Any]) -> dict[str, 
     if not verb.changes:
         return verb.run(scene, settings)
     scene.kept.mkdir(exist_ok=True, mode=0o700)
-    with locked(scene.edit_lock, f"{scene.folder}: in use by", _LONGEST_CHANGE):
+    with locked(scene.edit_lock, str(scene.folder), _LONGEST_CHANGE):
         return verb.run(scene, settings)
 
 

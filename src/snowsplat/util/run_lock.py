@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import from_json, parse_json, printable
 
 try:
@@ -62,10 +63,19 @@ class Holder:
         return cls(socket.gethostname(), os.getpid(), now, printable(short))
 
     def __str__(self) -> str:
+        return str(self.description())
+
+    def description(self) -> Message:
+        """Which process it is, and what it runs."""
         if not self.host:
-            return "another process"
-        who = f"process {self.process} on {self.host}, since {self.since}: {self.command}"
-        return printable(who)
+            return message("another process")
+        return message(
+            "process {process} on {host}, since {since}: {command}",
+            process=self.process,
+            host=printable(self.host),
+            since=printable(self.since),
+            command=printable(self.command),
+        )
 
 
 @contextmanager
@@ -85,7 +95,7 @@ def one_run(folder: Path, wait: float = _WAIT_SECONDS) -> Iterator[None]:
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            handle = _acquired(folder / LOCK, f"{folder}: in use by", wait)
+            handle = _acquired(folder / LOCK, str(folder), wait)
             break
         except FileNotFoundError:  # another run has just removed the empty folder
             continue
@@ -106,7 +116,7 @@ def locked(file: Path, what: str, wait: float = _WAIT_SECONDS) -> Iterator[None]
     """Hold a lock during the block. The file is created, and removed at the end.
 
     Args:
-        what: the begin of the message if another process holds it, such as "garden: in use by".
+        what: what is in use if another process holds it, for the message: "garden".
         wait: seconds to wait for a process that is just ending.
 
     Raises:
@@ -165,9 +175,9 @@ def _acquired(file: Path, what: str, wait: float) -> int:
 
 def _in_use(what: str, file: Path) -> InUse:
     return InUse(
-        "{what} {holder}; wait until it ends, stop it, or use another folder",
+        "{what}: in use by {holder}; wait until it ends, stop it, or use another folder",
         what=what,
-        holder=holder(file),
+        holder=holder(file).description(),
     )
 
 

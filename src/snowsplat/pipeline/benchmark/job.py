@@ -212,7 +212,7 @@ def main() -> int:
     job = from_json(Job, request["job"])
     sys.argv = ["snowsplat", "benchmark", "-o", str(Path(job.output).parent)]  # for `Holder`
     try:
-        with locked(Path(f"{job.output}.lock"), f"{job.scene}: in use by", _WAIT_SECONDS):
+        with locked(Path(f"{job.output}.lock"), job.scene, _WAIT_SECONDS):
             if SceneResult.read(job) is None:
                 with ended_by_signals():
                     work(job, request["device"], request["threads"])
