@@ -4,8 +4,9 @@
     python benchmarks/gpu.py --out OUT --only device stages        some of the parts
 
 The parts are: tests that need a GPU; compute-sanitizer over every op; the stages of a training step
-with their lower bounds, its memory, and the cost of sums in a fixed order; training runs compared
-with the CPU; and the same step with gsplat. benchmarks/README.md explains the measurements.
+with their lower bounds, its memory, and the cost of sums in a fixed order; the same step with
+gsplat; whole runs of `snowsplat train`; and training runs compared with the CPU.
+benchmarks/README.md explains the measurements.
 
 Each part is a process with a time limit, so a part that crashes or hangs does not affect others.
 The page OUT/gpu.md is rewritten after each finding, and printed at the end. OUT/gpu.json has all
@@ -32,9 +33,15 @@ from gpu_jobs import MARK, Finding, Job, Runner  # noqa: E402
 from gpu_table import Findings, page  # noqa: E402
 
 PARTS = Path(__file__).with_name("gpu_parts.py")
-GROUPS = ("device", "tests", "sanitizer", "stages", "peer", "train", "cpu")
+GROUPS = ("device", "tests", "sanitizer", "stages", "peer", "runs", "train", "cpu")
 SIZES = ("200k", "1m", "3m")
 DATASETS = ("fox", "lego400")
+#: Whole runs: dataset, arguments of `snowsplat train`.
+RUNS = {
+    "fox": "",
+    "lego400": "--background white",
+    "garden648": "--recipe mcmc --iterations 10000 --densify-until 0.8 --max-gaussians 1000000",
+}
 TRAINING_TESTS = ("finite", "trainer_gpu", "view_graphs")
 
 
@@ -96,6 +103,10 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
         found["peer"] = [
             job(f"peer {size}", ["peer", size, *folder], 50, alone=True) for size in ("1m", "200k")
         ]
+    found["runs"] = [
+        job(f"run {name}", ["run", str(flags.datasets / name), *more.split()], 120, alone=True)
+        for name, more in RUNS.items()
+    ]
     part = ["train", *datasets, "--seeds", *map(str, flags.seeds)]
     found["train"] = [job("train on the GPU", part, 100, alone=True)]
     late = []
@@ -107,7 +118,7 @@ def jobs(flags: argparse.Namespace, scratch: Path) -> list[Job]:
     wanted = {group: found[group] if group in flags.only else [] for group in GROUPS}
     # The sanitizers start first, because they take longest. The tests follow; there are many.
     parallel = [*found["untimed"], *wanted["sanitizer"], *wanted["tests"]]
-    timed = [*wanted["stages"], *wanted["peer"], *wanted["train"]]
+    timed = [*wanted["stages"], *wanted["peer"], *wanted["runs"], *wanted["train"]]
     return [*wanted["device"], *parallel, *timed, *late]
 
 
@@ -197,7 +208,7 @@ def _flags() -> argparse.Namespace:
         "--captures",
         type=Path,
         default=ROOT.parent / "shared" / "captures",
-        help=f"a folder with {', '.join(DATASETS)} and garden_points.npz, or some of them",
+        help="a folder with fox, lego400, garden648 and garden_points.npz, or some of them",
     )
     parser.add_argument("--only", nargs="+", default=list(GROUPS), choices=GROUPS)
     parser.add_argument("--minutes", type=float, default=8.8, help="time limit of the run")

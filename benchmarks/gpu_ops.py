@@ -24,6 +24,7 @@ from snowsplat.scene.render import view_of
 
 #: Gaussians, width, height: from one of each to a few thousand, not multiples of block sizes.
 SIZES = ((0, 1, 1), (1, 5, 3), (33, 17, 31), (999, 95, 53), (4099, 161, 99))
+MEDIUM = SIZES[:-1]
 SMALL = ((0, 1, 1), (1, 5, 3), (41, 19, 33))
 WIDE = 16 * (1 << 16) + 5
 #: Nothing can be recorded while torch allocates each tensor separately.

@@ -7,6 +7,7 @@ and cuda-bindings.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import resource
@@ -14,6 +15,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -263,12 +265,17 @@ def tests(path: str, marker: str, done: Path, attempt: int) -> None:
 # ---------------------------------------------------------------------------------- the sanitizer
 
 
-def ops() -> None:
-    """The program that runs under the sanitizer."""
+def ops(small: bool) -> None:
+    """The program that runs under the sanitizer. ``small``: without the largest scenes."""
     import torch
-    from gpu_ops import every_op
+    from gpu_ops import MEDIUM, SIZES, every_op
 
-    every_op(torch.device("cuda"), say=lambda line: print(line, flush=True))
+    every_op(
+        torch.device("cuda"),
+        MEDIUM if small else SIZES,
+        wide=not small,
+        say=lambda line: print(line, flush=True),
+    )
     torch.cuda.synchronize()
     print(OPS_DONE, flush=True)
 
@@ -343,19 +350,20 @@ class SanitizerLog:
 
 
 def sanitize(tool: str) -> None:
-    program = find_tool("compute-sanitizer")
-    if program is None:
+    sanitizer = find_tool("compute-sanitizer")
+    if sanitizer is None:
         raise SystemExit("compute-sanitizer is missing")
     environment = dict(os.environ)
     if tool in ("memcheck", "initcheck"):
         # Allocate each tensor separately, so that accesses beyond its end are detected.
         environment["PYTORCH_NO_CUDA_MEMORY_CACHING"] = "1"
-    command = [program, "--tool", tool, "--print-limit", "20"]
+    command = [sanitizer, "--tool", tool, "--print-limit", "20"]
     if tool == "memcheck":
         command += ["--report-api-errors", "no"]  # torch makes calls that may fail
+    program = ["ops", *(["--small"] if tool == "racecheck" else [])]  # it is 100 times slower
     log = SanitizerLog()
     with subprocess.Popen(
-        [*command, sys.executable, __file__, "ops"],
+        [*command, sys.executable, __file__, *program],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -437,7 +445,10 @@ def stages(size: str, folder: Path, repeats: int) -> None:
             with step.without_graphs():
                 step.run()
                 plain = step_times(step, repeats)
-            finding("step", **found, **times, plain=plain)
+            with step.visible_only():
+                step.run()
+                visible = step_times(step, repeats)
+            finding("step", **found, **times, plain=plain, visible=visible)
             kernels = stage_times(step, driver.run, repeats)
             finding("stages", size=size, in_order=in_order, kernels=kernels)
 
@@ -509,14 +520,48 @@ def _train(path: Path, seed: int, name: str, iterations: int | None) -> None:
     )
 
 
+def whole_run(path: Path, arguments: list[str]) -> None:
+    """Time and result of a whole `snowsplat train`, from the start of its process to its end."""
+    if not path.is_dir():
+        finding("absent", dataset=path.name)
+        return
+    with tempfile.TemporaryDirectory(prefix="snowsplat-run-") as folder:
+        command = [sys.executable, "-m", "snowsplat", "train", str(path), "-o", f"{folder}/out"]
+        command += ["--eval", "--device", "cuda", *arguments]
+        begin = time.perf_counter()
+        run = subprocess.run(command, capture_output=True, text=True)
+        seconds = time.perf_counter() - begin
+        print(run.stdout + run.stderr)
+        if run.returncode != 0:
+            raise SystemExit(f"{' '.join(command)} returned {run.returncode}")
+        metrics = json.loads(Path(folder, "out", "metrics.json").read_text(encoding="utf-8"))
+        (scene,) = Path(folder, "out").glob("point_cloud/*/point_cloud.ply")
+        with scene.open("rb") as file:
+            header = file.read(4096).partition(b"end_header")[0].decode()
+    # "… 2,000 steps in 4.1 s, at most …": without the start and the evaluation
+    steps = re.search(r"([\d,]+) steps in ([\d.]+) s", run.stdout)
+    finding(
+        "run",
+        dataset=path.name,
+        arguments=" ".join(arguments),
+        seconds=seconds,
+        steps=int(steps[1].replace(",", "")) if steps else None,
+        training=float(steps[2]) if steps else None,
+        gaussians=int(header.partition("element vertex ")[2].split()[0]),
+        **{name: metrics[name] for name in ("psnr", "ssim", "size")},
+    )
+
+
 # ------------------------------------------------------------------------------------------- main
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parts = parser.add_subparsers(dest="part", required=True)
-    for name in ("probe", "device", "ops", "peer-build"):
+    for name in ("probe", "device", "peer-build"):
         parts.add_parser(name)
+    part = parts.add_parser("ops")
+    part.add_argument("--small", action="store_true")
     part = parts.add_parser("tests")
     part.add_argument("path")
     part.add_argument("--marker", default="gpu")
@@ -540,6 +585,9 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     part.add_argument("--seeds", nargs="+", type=int, default=[0])
     part.add_argument("--device", default="cuda")
     part.add_argument("--iterations", type=int)
+    part = parts.add_parser("run")
+    part.add_argument("dataset", type=Path)
+    part.add_argument("arguments", nargs=argparse.REMAINDER, help="of snowsplat train")
     return parser.parse_args(arguments)
 
 
@@ -551,7 +599,7 @@ def main() -> None:
         case "device":
             device()
         case "ops":
-            ops()
+            ops(flags.small)
         case "tests":
             tests(flags.path, flags.marker, flags.done, flags.attempt)
         case "sanitize":
@@ -562,6 +610,8 @@ def main() -> None:
             stages(flags.size, flags.folder, flags.repeats)
         case "train":
             train(flags.datasets, flags.seeds, flags.device, flags.iterations)
+        case "run":
+            whole_run(flags.dataset, flags.arguments)
         case "peer-build":
             import gpu_peer
 

@@ -119,6 +119,16 @@ class Step:
         finally:
             self.trainer.graphs = graphs
 
+    @contextmanager
+    def visible_only(self) -> Iterator[None]:
+        """Inside the with block, Adam updates only the visible Gaussians, as the default recipe."""
+        optimizer = self.trainer.optimizer
+        optimizer.visible_only = True
+        try:
+            yield
+        finally:
+            optimizer.visible_only = False
+
     def run(self) -> float:
         """A complete step, repeated until the capacity suffices; returns its loss."""
         gaussians = self.trainer.gaussians

@@ -79,6 +79,7 @@ def page(findings: Findings, outcomes: Sequence[Outcome], when: str, running: bo
         _machine(findings, name, when, running),
         _tests(findings, name),
         _sanitizer(findings, name),
+        _runs(findings, name),
         _training(findings, name),
         _stages(findings, name, in_order=False),
         _steps(findings, name),
@@ -190,6 +191,20 @@ def _training(findings: Findings, name: str) -> str:
     return "\n".join(lines)
 
 
+def _runs(findings: Findings, name: str) -> str:
+    rows = []
+    for found in findings.of_kind("run"):
+        training = "—" if found["training"] is None else f"{found['training']:.1f}"
+        cells = [found["dataset"], found["arguments"], found["size"], f"{found['steps']:,}"]
+        cells += [f"{found['gaussians']:,}", f"{found['seconds']:.1f}", training]
+        rows.append([*cells, f"{found['psnr']:.2f}", f"{found['ssim']:.3f}"])
+    if not rows:
+        return ""
+    head = "dataset,arguments,photos,steps,Gaussians,seconds,of them steps,PSNR,SSIM"
+    lines = [f"## {name}: whole runs of `snowsplat train`", ""]
+    return "\n".join(lines + _table(head.split(","), rows))
+
+
 def _stages(findings: Findings, name: str, in_order: bool) -> str:
     sizes = findings.sizes("stages")
     by_size = {size: findings.one("stages", size=size, in_order=in_order) for size in sizes}
@@ -279,7 +294,7 @@ def _steps(findings: Findings, name: str) -> str:
         limit = "GPU" if step["gpu"] >= step["host"] else "CPU"
         cells = [size, *(f"{step[key]:.3f}" for key in ("gpu", "host", "wall")), limit]
         cells += [f"{step['plain'][key]:.3f}" for key in ("host", "wall")]
-        cells.append(f"{1e3 / step['wall']:.0f}")
+        cells += [f"{1e3 / step['wall']:.0f}", f"{step['visible']['wall']:.3f}"]
         cells.append(f"{ordered['gpu'] / step['gpu']:.2f}" if ordered else "—")
         if memory and frame:
             peak, count = memory["peak"], frame["gaussians"]
@@ -294,7 +309,7 @@ def _steps(findings: Findings, name: str) -> str:
     if not rows:
         return ""
     head = "size,GPU ms,queueing ms,step ms,limit,queueing without graphs,step without graphs"
-    head += ",steps/s,in order ×,peak MB,allocated MB"
+    head += ",steps/s,step with visible rows only,in order ×,peak MB,allocated MB"
     lines = [f"## {name}: a training step", "", *_table([*head.split(","), "bytes/Gaussian"], rows)]
     each = _memory_each(findings)
     if each is not None:
