@@ -61,16 +61,21 @@ def test_masked_pixels_are_ignored():
 
 
 def test_views_without_visible_gaussians(tmp_path):
-    """The rendered image is the background, so all metrics are known."""
-    pose = torch.eye(3, 4, dtype=torch.float64)
+    """The rendered image is the background, so all metrics are known. Photos of one colour, or
+    without a pixel, judge nothing: they are named and do not count."""
+    camera = Camera(16, 12, 20.0, 20.0, 8.0, 6.0, torch.eye(3, 4, dtype=torch.float64))
+    black, noise = Image.new("RGB", (16, 12)), Image.new("RGB", (16, 12), (40, 41, 40))
+    noise.putpixel((3, 3), (42, 40, 40))
+    half, masked = Image.new("RGB", (16, 12), (204, 204, 204)), Image.new("L", (16, 12))
+    half.paste((102, 102, 102), (0, 0, 8, 12))
+    clear = Image.new("RGBA", (16, 12), (9, 9, 9, 0))  # shows the background
+    masked.save(tmp_path / "mask.png")
+    mask = ImageSource(tmp_path / "mask.png", 16, 12)
     views = []
-    for i, color in enumerate([(255, 255, 255), (204, 204, 204), (102, 102, 102)]):
-        Image.new("RGB", (16, 12), color).save(tmp_path / f"{i}.png")
-        camera = Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
-        views.append(View(f"{i}.png", camera, ImageSource(tmp_path / f"{i}.png", 16, 12)))
-    # A transparent photo shows the background.
-    Image.new("RGBA", (16, 12), (9, 9, 9, 0)).save(tmp_path / "3.png")
-    views.append(View("3.png", views[0].camera, ImageSource(tmp_path / "3.png", 16, 12)))
+    for i, photo in enumerate((black, half, noise, half, clear)):
+        photo.save(tmp_path / f"{i}.png")
+        source = ImageSource(tmp_path / f"{i}.png", 16, 12)
+        views.append(View(f"{i}.png", camera, source, mask if i == 3 else None))
     behind = Gaussians(
         means=torch.tensor([[0.0, 0.0, -5.0]]),
         log_scales=torch.zeros(1, 3),
@@ -81,12 +86,12 @@ def test_views_without_visible_gaussians(tmp_path):
     )
     seen = []
     evaluation = evaluate_views(behind, views, background=(1.0, 1.0, 1.0), on_view=seen.append)
-    metrics = [view.psnr for view in evaluation.views]
-    assert metrics[0] == metrics[3] == math.inf
-    assert metrics[1] == pytest.approx(-20 * math.log10(0.2), abs=1e-4)
-    assert metrics[2] == pytest.approx(-20 * math.log10(0.6), abs=1e-4)
     assert seen == evaluation.views
-    assert [view.name for view in seen] == ["0.png", "1.png", "2.png", "3.png"]
+    assert [view.name for view in seen] == ["1.png"]
+    assert evaluation.psnr == pytest.approx(-10 * math.log10((0.2**2 + 0.6**2) / 2), abs=1e-4)
+    assert evaluation.unjudged == ("0.png", "2.png", "3.png", "4.png")
+    assert "0.png, 2.png, 3.png and 1 more" in str(evaluation.line_of_unjudged())
+    assert all(math.isfinite(x) for x in (evaluation.psnr_aligned, evaluation.ssim))
 
 
 def test_the_explained_share_does_not_depend_on_exposure_and_contrast():

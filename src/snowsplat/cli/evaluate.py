@@ -88,7 +88,7 @@ class Evaluate(JsonCommand):
         where = scene.folder.metrics
         which = message(
             "{count} {split} views of {size}: {where}",
-            count=len(views),
+            count=len(evaluation.views),
             split=self.split,
             size=evaluation.size,
             where=where,
@@ -96,6 +96,8 @@ class Evaluate(JsonCommand):
         if scene.iteration:  # a file has none
             which = message("iteration {step}, {which}", step=scene.iteration, which=which)
         print(which)
+        if evaluation.unjudged:
+            print(evaluation.line_of_unjudged())
         out = chosen.path()
         photos = [] if chosen.dataset is None else ["--dataset", chosen.dataset]
         print(

@@ -152,6 +152,8 @@ def held_out_line(step: int, evaluation: Evaluation) -> Message:
         ssim=evaluation.ssim,
         aligned=evaluation.psnr_aligned,
     )
-    if evaluation.lpips is None:
-        return line
-    return message("{line}  LPIPS {lpips:.3f}", line=line, lpips=evaluation.lpips)
+    if evaluation.lpips is not None:
+        line = message("{line}  LPIPS {lpips:.3f}", line=line, lpips=evaluation.lpips)
+    if rest := evaluation.line_of_unjudged():
+        line = message("{line}; {rest}", line=line, rest=rest)
+    return line

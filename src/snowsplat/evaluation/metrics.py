@@ -29,6 +29,8 @@ from snowsplat.evaluation.lpips import Lpips
 from snowsplat.evaluation.renderings import renderings
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import Renderer, render
+from snowsplat.util.messages import Message, message
+from snowsplat.util.names import first_names
 
 # Number of photos for which there is memory. Each photo is used once, so the memory only serves to
 # decode ahead.
@@ -57,9 +59,14 @@ class Evaluation:
 
     As usual, the mean PSNR is the mean of the PSNR values, not the PSNR of the mean error. Means of
     no views are NaN.
+
+    Attributes:
+        views: those whose photos can be judged.
+        unjudged: the names of the others; see `is_plain`.
     """
 
     views: list[ViewMetrics]
+    unjudged: tuple[str, ...] = ()
 
     @property
     def psnr(self) -> float:
@@ -98,8 +105,18 @@ class Evaluation:
             "psnr_aligned": self.psnr_aligned,
             "lpips": self.lpips,
             "size": self.size,
+            "unjudged": self.unjudged,
         }
         return {**means, "views": views}
+
+    def line_of_unjudged(self) -> Message:
+        """The photos that do not count, and why; empty if there are none."""
+        if not self.unjudged:
+            return Message("")
+        return message(
+            "not judged, because they show one colour or are wholly masked: {names}",
+            names=first_names(self.unjudged, 3),
+        )
 
 
 def size_text(sizes: Iterable[tuple[int, int]]) -> str:
@@ -113,6 +130,17 @@ def size_text(sizes: Iterable[tuple[int, int]]) -> str:
 
 def _mean(values: list[float]) -> float:
     return sum(values) / len(values) if values else math.nan
+
+
+def is_plain(photo: Tensor, mask: Tensor | None = None) -> bool:
+    """Whether a photo (H, W, 3) in 0..1 cannot judge an image: a single colour reproduces it.
+
+    Its RMS difference from its mean colour is less than one of 255 levels, which is the noise of
+    rounding and of JPEG; or ``mask`` (H, W) leaves no pixel. Its colour-aligned PSNR is infinite,
+    or at least 48 dB, whatever the image is.
+    """
+    pixels = (photo.flatten(0, 1) if mask is None else photo[mask]).to(torch.float64)
+    return not len(pixels) or float((pixels - pixels.mean(0)).square().mean()) < 255.0**-2
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -194,17 +222,22 @@ def evaluate_views(
         on_view: called after each view.
         render: renders the scene.
 
+    Returns: the metrics of the photos that can be judged, see `is_plain`, and the other names.
+
     Raises:
         UserError: a photo is missing or damaged.
     """
     device = gaussians.means.device
     color = torch.tensor(background, dtype=torch.float32, device=device)
-    results = []
+    results, unjudged = [], []
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
     ahead = _PHOTOS_AHEAD * 3 * largest
     with ImageLoader(views, budget_bytes=ahead, device=device) as loader:
         for each in renderings(gaussians, views, loader, color, sh_degree=sh_degree, render=render):
+            if is_plain(each.photo, each.mask):
+                unjudged.append(each.view.name)
+                continue
             results.append(compare(each.image, each.photo, each.mask, lpips, each.view.name))
             if on_view is not None:
                 on_view(results[-1])
-    return Evaluation(results)
+    return Evaluation(results, tuple(unjudged))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 import warnings
 from collections.abc import Sequence
@@ -48,6 +49,8 @@ from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.process import single_threaded
 from snowsplat.util.process_memory import peak_bytes
+
+logger = logging.getLogger(__name__)
 
 #: Number of training views with which the held-out ones are compared.
 _TRAINING_VIEWS = 4
@@ -136,7 +139,7 @@ class TrainingRun:
         self.history.step_begins()
 
     def _after_step(self, progress: Progress) -> None:
-        if progress.metrics is not None and progress.metrics.views:
+        if progress.metrics is not None:
             self._record_evaluation(progress.step, progress.metrics)
         self.observer.step(replace(progress, seconds_left=self._seconds_left(progress)))
         if self._checkpoint_is_due(progress.step):
@@ -230,8 +233,11 @@ class TrainingRun:
         )
 
     def _record_evaluation(self, step: int, evaluation: Evaluation) -> None:
-        self.evaluation = (step, evaluation)
-        self.history.measure(step, evaluation.psnr, evaluation.ssim)
+        if evaluation.views:
+            self.evaluation = (step, evaluation)
+            self.history.measure(step, evaluation.psnr, evaluation.ssim)
+        elif evaluation.unjudged:
+            logger.warning("held-out photos are %s", evaluation.line_of_unjudged())
 
     def _finish(self) -> TrainResult:
         step = self.trainer.step
@@ -241,7 +247,7 @@ class TrainingRun:
         if self.trainer.dataset.test:
             if self.evaluation is None or self.evaluation[0] != step:
                 self._record_evaluation(step, self.together.evaluate())
-            assert self.evaluation is not None
+        if self.evaluation is not None:
             self.out.write_metrics(step, "test", self.evaluation[1].as_json(), self._left_out())
         if self.page is not None:
             self.page.end_training(self._result_lines(len(gaussians), seconds))
@@ -294,6 +300,8 @@ class TrainingRun:
                 used[:: -(-len(used) // _TRAINING_VIEWS)],
                 background=self.out.settings()[1],
             )
+        if not trained_on.views:
+            return None
         return scene_verdict(
             self.evaluation[1],
             trained_on,
