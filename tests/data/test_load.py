@@ -179,13 +179,13 @@ def test_images_that_are_all_smaller_by_the_same_integer_factor(large, caplog):
 
 
 @pytest.mark.parametrize("size", [(74, 64), (64, 75), (150, 128), (50, 43), (38, 32)])
-def test_one_image_of_another_size(large, size):
+def test_one_image_of_another_size_is_left_out(large, size, caplog):
     path = large / "images/view_01.png"
     with Image.open(path) as image:
         resized = image.resize(size)
     resized.save(path)
-    with pytest.raises(UserError, match=f"view_01.png: is {size[0]}x{size[1]}, .*camera is 75x64"):
-        load_dataset(large)
+    assert "view_01.png" not in {view.name for view in load_dataset(large, hold_out=None).train}
+    assert f"1 of 3 photos are left out: view_01.png ({path}: is {size[0]}x{size[1]}" in caplog.text
 
 
 def jpeg_with_orientation(path, pixels, orientation):
@@ -258,9 +258,13 @@ def test_depth_maps_beside_the_images(dataset_copy):
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n"])
-def test_a_file_that_is_not_an_image_is_rejected_when_loading(dataset_copy, content):
+def test_files_that_are_no_images_are_left_out_if_they_are_few(dataset_copy, content, caplog):
     folder = dataset_copy("colmap-bin")
     (folder / "images/view_04.png").write_bytes(content)
+    assert len(load_dataset(folder, hold_out=None).train) == 8
+    assert "1 of 9 photos are left out: view_04.png (" in caplog.text
+    for number in range(5, 9):
+        (folder / f"images/view_{number:02}.png").write_bytes(content)
     with pytest.raises(UserError, match="view_04.png: cannot be decoded"):
         load_dataset(folder)
 

@@ -76,8 +76,8 @@ def usable_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> Points | None
         xyz, rgb = xyz[usable], rgb[usable]
     if not len(xyz):
         return None
-    rgb = np.ascontiguousarray(rgb, np.uint8)
-    return Points(torch.from_numpy(np.ascontiguousarray(xyz)), torch.from_numpy(rgb))
+    # A single row of a table is contiguous for NumPy, and not for torch: it is copied, too.
+    return Points(torch.from_numpy(np.array(xyz)), torch.from_numpy(np.array(rgb, np.uint8)))
 
 
 @dataclass(frozen=True, eq=False)

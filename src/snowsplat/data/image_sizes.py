@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from snowsplat.data.dataset import PosedImage
+from snowsplat.data.files.photo_files import warn_of_unusable
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, Header, read_header
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
@@ -72,37 +73,53 @@ def _is_divided(large: Header | Camera, size: tuple[int, int], factor: float) ->
     return abs(size[0] - large.width / factor) < 1 and abs(size[1] - large.height / factor) < 1
 
 
-def image_sizes(posed: list[PosedImage]) -> list[ImageSize]:
-    """The size of each image file, checked against its camera and its mask.
+def with_sizes(root: Path, posed: list[PosedImage]) -> list[tuple[PosedImage, ImageSize]]:
+    """The images with the sizes of their files, checked against those of camera and mask.
 
     The images of a folder may be smaller or larger than the images that the poses were estimated
     from (for example ``images_4``, or a dataset that is distributed without the large images). The
-    ratio of the sizes must be the same for all images of a folder.
+    ratio of the sizes must be the same for all images of a folder. An image that is damaged, or
+    has another size, is left out with a warning.
 
-    Raises: UserError: a file is missing or no image, or does not have the size of its camera.
+    Raises: UserError: at least half of the files are missing or no images, or do not have the sizes
+        of their cameras.
     """
-    headers = [read_header(image.path) for image in posed]
-    found = [_shrink_factor(image, header) for image, header in zip(posed, headers, strict=True)]
-    usual: dict[Path, float] = {}  # the most frequent factor in each folder
-    for folder in {image.folder for image in posed}:
-        factors = [f for i, (f, _) in zip(posed, found, strict=True) if i.folder == folder and f]
-        if factors:
-            usual[folder] = Counter(sorted(factors)).most_common(1)[0][0]
-    sizes = []
-    for image, header, (factor, oriented) in zip(posed, headers, found, strict=True):
+    errors: dict[str, UserError] = {}
+    found: list[tuple[PosedImage, Header, float | None, bool]] = []
+    for image in posed:
+        try:
+            header = read_header(image.path)
+            found.append((image, header, *_shrink_factor(image, header)))
+        except UserError as error:
+            errors[image.name] = error
+    factors: dict[Path, list[float]] = {}
+    for image, _, factor, _ in found:
+        if factor is not None:
+            factors.setdefault(image.folder, []).append(factor)
+    # The most frequent factor in each folder.
+    usual = {path: Counter(sorted(each)).most_common(1)[0][0] for path, each in factors.items()}
+    sized = []
+    for image, header, factor, oriented in found:
         size = (header.height, header.width) if oriented else (header.width, header.height)
         camera = image.camera
-        if factor is None or not _is_divided(camera, size, usual[image.folder]):
-            raise UserError(
-                "{path}: is {width}x{height}, but its camera is {width2}x{height2}; use the "
-                "images that the poses were estimated from, or scale all of them by one factor",
-                path=image.path,
-                width=header.width,
-                height=header.height,
-                width2=camera.width,
-                height2=camera.height,
-            )
-        sizes.append(ImageSize(*size, oriented, header.width * header.height))
+        used = ImageSize(*size, oriented, header.width * header.height)
+        try:
+            if factor is None or not _is_divided(camera, size, usual[image.folder]):
+                raise UserError(
+                    "{path}: is {width}x{height}, but its camera is {width2}x{height2}; use the "
+                    "images that the poses were estimated from, or scale all of them by one factor",
+                    path=image.path,
+                    width=header.width,
+                    height=header.height,
+                    width2=camera.width,
+                    height2=camera.height,
+                )
+            if image.mask is not None:
+                _check_mask(image.mask, used)
+            sized.append((image, used))
+        except UserError as error:
+            errors[image.name] = error
+    warn_of_unusable(root, errors, len(sized))
     for folder, factor in usual.items():
         if factor != 1 and not folder.name.endswith(f"_{factor:g}"):
             logger.warning(
@@ -110,10 +127,7 @@ def image_sizes(posed: list[PosedImage]) -> list[ImageSize]:
                 folder,
                 f"1/{factor:g}" if factor == round(factor) else f"{1 / factor:.4g}",
             )
-    for image, size_used in zip(posed, sizes, strict=True):
-        if image.mask is not None:
-            _check_mask(image.mask, size_used)
-    return sizes
+    return sized
 
 
 def _shrink_factor(image: PosedImage, header: Header) -> tuple[float | None, bool]:

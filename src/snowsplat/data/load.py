@@ -15,7 +15,7 @@ from snowsplat.data.files.masks import with_masks
 from snowsplat.data.frame.move_to_origin import move_to_origin
 from snowsplat.data.frame.near import near_of
 from snowsplat.data.hold_out import held_out_names
-from snowsplat.data.image_sizes import ImageSize, image_sizes, with_smaller_copies
+from snowsplat.data.image_sizes import ImageSize, with_sizes, with_smaller_copies
 from snowsplat.data.lens.coverage import image_circle
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.views import LensView, is_wide, lens_views
@@ -25,6 +25,7 @@ from snowsplat.data.readers import read_poses
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.names import first_names
 from snowsplat.util.safe_json import is_file
 
 logger = logging.getLogger(__name__)
@@ -33,6 +34,10 @@ logger = logging.getLogger(__name__)
 _DIVISORS = (1, 2, 4, 8)
 # Smallest width and height of a scaled image in pixels. A smaller size is rejected as a mistake.
 _SMALLEST_SIDE = 16
+# COLMAP places no photo by fewer points than this (`abs_pose_min_num_inliers`). Fewer are no
+# reconstruction: other trainers insist on a file of points, so people write some. So many points
+# are compared.
+_FEWEST_PLACES, _PLACES = 30, 1000
 # To find the image circle of a lens: the number of photos, and their longer side in pixels.
 _CIRCLE_PHOTOS, _CIRCLE_SIDE = 12, 400
 
@@ -157,20 +162,27 @@ def read_files(
     """
     root = Path(path)
     found = read_poses(root, images)
+    if found.points is not None and _are_placeholder(found.points):
+        logger.warning(
+            "%s: the points are at fewer than %d places: as if there were none",
+            root,
+            _FEWEST_PLACES,
+        )
+        found.points = None
     posed, points, origin = move_to_origin(found.images, found.points)
     folder = root.parent if root.is_file() else root
     posed = with_masks(folder, _with_maps(folder, posed))
     if resolution in _DIVISORS[1:]:
         posed = with_smaller_copies(posed, resolution)
-    sizes = image_sizes(posed)
-    count = Counter(image.name for image in posed)
-    if len(count) < len(posed):
-        repeated = next(name for name, n in sorted(count.items()) if n > 1)
-        raise UserError(
-            "{root}: has two images named {repeated}; remove one", root=root, repeated=repeated
+    first = {image.name: image for image in reversed(posed)}
+    if len(first) < len(posed):
+        twice = [name for name, n in Counter(image.name for image in posed).items() if n > 1]
+        logger.warning(
+            "%s: has several images named %s; the first one is used", root, first_names(twice, 3)
         )
+    sized = with_sizes(root, [image for image in posed if first[image.name] is image])
+    posed = [image for image, _ in sized]
     _warn_of_cropped(posed)
-    sized = list(zip(posed, sizes, strict=True))
     return DatasetFiles(
         root=root,
         images=sized,
@@ -181,6 +193,11 @@ def read_files(
         origin=origin,
         metres_per_unit=found.metres_per_unit,
     )
+
+
+def _are_placeholder(points: Points) -> bool:
+    sample = points.xyz[:: max(1, len(points) // _PLACES)]
+    return len(sample.unique(dim=0)) < _FEWEST_PLACES
 
 
 def _with_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:

@@ -213,6 +213,31 @@ def test_equal_names_are_told_apart_by_their_folder(tmp_path):
         read_poses(tmp_path)
 
 
+def test_equal_labels_of_metashape_are_told_apart_by_their_group(tmp_path):
+    exports.metashape(tmp_path)
+    path = tmp_path / "cameras.xml"
+    text = path.read_text().replace('label="b"', 'label="a"')
+    text = text.replace('<camera id="1"', '<group label="two"><camera id="1"')
+    path.write_text(text.replace("</cameras>", "</group></cameras>"))
+    (tmp_path / "images/two").mkdir()
+    for name in ("b.png", "c.png", "d.png"):
+        new = "a.png" if name == "b.png" else name
+        (tmp_path / "images" / name).rename(tmp_path / "images/two" / new)
+    assert {image.name for image in read_poses(tmp_path).images} >= {
+        "images/a.png",
+        "images/two/a.png",
+    }
+
+
+def test_a_broken_pose_in_a_table(tmp_path, caplog):
+    exports.llff(tmp_path)
+    poses = np.load(tmp_path / "poses_bounds.npy")
+    poses[1, 3] = np.inf
+    np.save(tmp_path / "poses_bounds.npy", poses)
+    assert len(load_dataset(tmp_path, hold_out=None).train) == len(poses) - 1
+    assert "left out: images/b.png" in caplog.text
+
+
 def test_no_photo_outside_of_the_folder_is_used(tmp_path):
     folder = tmp_path / "dataset"
     folder.mkdir()

@@ -191,11 +191,11 @@ def test_splits_of_nerfstudio(scene):
 
 
 def test_points_of_ply_file_path(scene, tmp_path):
-    xyz = np.array([[1.0, 2, 3], [np.nan, 0, 0]], np.float32)
-    write_points(tmp_path / "cloud.ply", xyz, np.array([[1, 2, 3]] * 2, np.uint8))
+    xyz = np.array([[1.0, 2, i] for i in range(30)] + [[np.nan, 0, 0]], np.float32)
+    write_points(tmp_path / "cloud.ply", xyz, np.array([[1, 2, 3]] * 31, np.uint8))
     points = load_dataset(scene({"fl_x": 50, "ply_file_path": "cloud.ply"}, [{}, {}])).points
-    assert points.xyz.tolist() == [[1, 2, 3]]
-    assert points.rgb.tolist() == [[1, 2, 3]]
+    assert points.xyz.tolist() == xyz[:30].tolist()
+    assert points.rgb.tolist() == [[1, 2, 3]] * 30
 
 
 def test_a_missing_ply_file_is_reported(scene, caplog):
@@ -278,9 +278,16 @@ def test_files_of_another_kind(tmp_path, text, message):
         load_dataset(tmp_path)
 
 
-def test_the_same_image_twice(scene):
-    with pytest.raises(UserError, match="also belongs to another frame"):
-        load_dataset(scene({"fl_x": 50}, [{"file_path": "a.png"}, {"file_path": "./a.png"}]))
+def test_the_same_image_twice(scene, caplog):
+    """Is ignored; with another pose, only the first is used, and the other one is named."""
+    twice = [{"file_path": "a.png"}, {"file_path": "./a.png"}, {}]
+    assert len(load_dataset(scene({"fl_x": 50}, twice), hold_out=None).train) == 2
+    assert "left out" not in caplog.text
+    twice[1]["transform_matrix"] = [*UPRIGHT[:2], [0, 0, 1, 4], UPRIGHT[3]]
+    dataset = load_dataset(scene({"fl_x": 50}, twice), hold_out=None)
+    assert [float(view.camera.position[2]) for view in dataset.train] == [3, 3]
+    assert "1 of 3 photos are left out: ./a.png" in caplog.text
+    assert "also belongs to another frame" in caplog.text
 
 
 def test_damaged_files_raise_one_line_errors(dataset_copy, count_rejected):

@@ -202,14 +202,15 @@ def read_frames(path: Path) -> list[tuple[int, list[int]]]:
 def read_points(path: Path) -> PointFile:
     """Read a points3D.txt. Raises: UserError: the file is unreadable or damaged."""
     # Rows end with tracks of different lengths. numpy's reader is fast, but it would split the
-    # complete track into words, so it gets only the columns that are used.
+    # complete track into words, so it gets only the columns that are used. The error, which is
+    # not, and the track may be missing.
     tracks: dict[int, str] = {}
     lines = _points_without_tracks(path, tracks)
     ids, xyz, rgb = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
     while block := list(islice(lines, _LINES_PER_BLOCK)):
         try:
             values = np.loadtxt(
-                block, np.float64, comments=None, usecols=(0, 1, 2, 3, 4, 5, 6, 7), ndmin=2
+                block, np.float64, comments=None, usecols=(0, 1, 2, 3, 4, 5, 6), ndmin=2
             )
         except (ValueError, IndexError) as error:
             raise damaged_model(path, f"not points ({' '.join(str(error).split())[:90]})") from None
@@ -249,7 +250,7 @@ def _points_without_tracks(path: Path, tracks: dict[int, str]) -> Iterator[str]:
                 every *= 2
                 for odd in [row for row in tracks if row % every]:
                     del tracks[odd]
-        yield " ".join(words[:8])
+        yield " ".join(words[:7])
 
 
 def write_model(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import unicodedata
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Literal
 
 from snowsplat.util.natural_order import natural_key
+
+logger = logging.getLogger(__name__)
 
 # What is in a folder of this name. The name is compared without regard to case, and without "_" and
 # "." at its start and "_2", "_4" or "_8" at its end.
@@ -85,18 +88,20 @@ def files_below(
 ) -> list[str]:
     """Files that are not hidden; relative to ``root``, with "/", in natural order.
 
-    Links to folders are followed, but every folder is searched only once. Broken links are left
-    out. At most 500,000 files are listed.
+    Links to folders are followed, but every folder is searched only once. Broken links, and folders
+    that cannot be read, are left out; a warning names those. At most 500,000 files are listed.
 
     Args:
         enter: the subfolders of a folder to search, from the names of those that are not hidden.
         broken: gets the broken links.
 
-    Raises: OSError: a folder cannot be read.
+    Raises: OSError: ``root`` cannot be read.
     """
 
     def fail(error: OSError) -> None:
-        raise error
+        if Path(error.filename) == root:
+            raise error
+        logger.warning("%s: left out: %s", error.filename, error.strerror)
 
     found: list[str] = []
     visited = {root.resolve()}

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from snowsplat.data.files.listing import files_below, folder_kind, original_of
 from snowsplat.data.files.masks import is_marked
 from snowsplat.data.files.matching import match_names
 from snowsplat.data.photos.decode import is_photo
+from snowsplat.util.errors import UserError
+from snowsplat.util.names import first_names
 from snowsplat.util.safe_json import quoted
 
 logger = logging.getLogger(__name__)
@@ -37,6 +39,25 @@ def warn_of_missing(
     if missing:
         line = "%s: %d of %d %s are missing (the first is %s); skipped"
         logger.warning(line, where, len(missing), count, what, quoted(missing[0]))
+
+
+def warn_of_unusable(where: object, errors: Mapping[str, UserError], usable: int) -> None:
+    """Log the photos of a dataset that cannot be used, and why the first one cannot.
+
+    Raises: UserError: they are no minority, so one cause may make all of them wrong.
+    """
+    if errors:
+        first = next(iter(errors.values()))
+        if len(errors) >= usable:
+            raise first
+        logger.warning(
+            "%s: %d of %d photos are left out: %s (%s)",
+            where,
+            len(errors),
+            len(errors) + usable,
+            first_names([*errors], 3),
+            first,
+        )
 
 
 def find_photos(

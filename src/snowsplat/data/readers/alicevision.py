@@ -51,19 +51,20 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         name = str(view.get("path"))
         where = f"{path}: view {quoted(name)}"
         found.total += 1
-        pose = poses.get(str(view.get("poseId", view.get("viewId"))))
-        if pose is None:
-            continue
-        lens = lenses.get(str(view.get("intrinsicId")))
-        if lens is None:
-            raise parse.damaged(where, "has an intrinsic that is not in the file")
-        transform = parse.table(where, pose.get("transform"))
-        rotation = parse.numbers(where, transform.get("rotation"), 9).reshape(3, 3).T
-        centre = parse.numbers(where, transform.get("center"), 3)
-        cam = parse.rigid(where, rotation, -rotation @ centre)
-        if (photo := found.photo(photos, name)) is None:
-            continue
-        found.add(photos, photo, lens, cam)
+        with found.one(name):
+            pose = poses.get(str(view.get("poseId", view.get("viewId"))))
+            if pose is None:
+                continue
+            lens = lenses.get(str(view.get("intrinsicId")))
+            if lens is None:
+                raise parse.damaged(where, "has an intrinsic that is not in the file")
+            transform = parse.table(where, pose.get("transform"))
+            rotation = parse.numbers(where, transform.get("rotation"), 9).reshape(3, 3).T
+            centre = parse.numbers(where, transform.get("center"), 3)
+            cam = parse.rigid(where, rotation, -rotation @ centre)
+            if (photo := found.photo(photos, name)) is None:
+                continue
+            found.add(photos, photo, lens, cam)
     points = parse.objects(f"{path}: structure", scene.get("structure") or [])
     rows = [(point.get("X"), point.get("color", [128] * 3)) for point in points]
     found.add_points(path, str(path), rows)

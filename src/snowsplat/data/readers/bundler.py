@@ -39,17 +39,19 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     found = Reconstruction(total=cameras)
     for index, name in enumerate(names):
         where = f"{path}: camera {index}"
-        focal, k1, k2 = parse.numbers(where, next(lines, "").split(), 3)
-        rows = [parse.numbers(where, next(lines, "").split(), 3) for _ in range(4)]
-        if focal == 0:  # not aligned
-            continue
-        if (photo := found.photo(photos, name)) is None:
-            continue
-        header = read_header(photos.root / photo)
-        size = header.width, header.height
-        lens = perspective(where, *size, centred_intrinsics(*size, focal), (k1, k2))
-        pose = parse.rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
-        found.add(photos, photo, lens, pose)
+        entry = [next(lines, "").split() for _ in range(5)]
+        with found.one(name):
+            focal, k1, k2 = parse.numbers(where, entry[0], 3)
+            rows = [parse.numbers(where, row, 3) for row in entry[1:]]
+            if focal == 0:  # not aligned
+                continue
+            if (photo := found.photo(photos, name)) is None:
+                continue
+            header = read_header(photos.root / photo)
+            size = header.width, header.height
+            lens = perspective(where, *size, centred_intrinsics(*size, focal), (k1, k2))
+            pose = parse.rigid(where, _FLIP @ np.stack(rows[:3]), _FLIP @ rows[3])
+            found.add(photos, photo, lens, pose)
     # The third line of a point lists the photos that show it.
     lists = ([next(lines, "").split() for _ in range(3)][:2] for _ in range(count))
     found.add_points(path, str(path), lists)

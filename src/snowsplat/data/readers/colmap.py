@@ -8,17 +8,25 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from snowsplat.data.colmap.model import count_images, posed_camera, read_model
 from snowsplat.data.colmap.places import find_models, find_models_below, workspace_of
 from snowsplat.data.colmap.tracks import points_with_tracks
 from snowsplat.data.colmap.types import ColmapModel
-from snowsplat.data.dataset import PosedImage, safe_name, usable_points
-from snowsplat.data.files.photo_files import find_photos, photos_below, warn_of_missing
+from snowsplat.data.dataset import PosedImage, safe_name
+from snowsplat.data.files.photo_files import (
+    find_photos,
+    photos_below,
+    warn_of_missing,
+    warn_of_unusable,
+)
 from snowsplat.data.frame.placement import read_placement
-from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.readers import transforms_json
+from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reader, Reconstruction
 from snowsplat.scene.length import stored_metres
 from snowsplat.util.errors import SettingError, UserError
@@ -51,17 +59,30 @@ def read(models: list[Path], photos: PhotoFolder) -> Reconstruction:
     model = read_model(folder)
     if not model.images:
         raise UserError("{folder}: the COLMAP model has no images; run COLMAP again", folder=folder)
-    posed, names = _images_on_disk(workspace_of(folder, root, photos.images), photos.images, model)
-    points = points_with_tracks(model, names)
-    ply = folder / "points3D.ply"
-    if points is None and ply.is_file():
-        points = usable_points(ply, *read_points_ply(ply))
-    if points is None:
+    found = Reconstruction(
+        description=f"COLMAP model {name} ({'text' if model.text else 'binary'})"
+    )
+    names = _add_images(found, workspace_of(folder, root, photos.images), photos.images, model)
+    warn_of_unusable(folder, found.unusable, len(found.images))
+    own = points_with_tracks(model, names)
+    # Other programs write a denser cloud beside the model, and convert it to a PLY file.
+    points_beside(folder, found, file="points3D.ply", more_than=0 if own is None else len(own))
+    if found.points is None:
+        found.points = own
+    elif own is not None:  # whose tracks are evidence about the poses
+        logger.warning(
+            "%s: its %d points are used, too", folder / found.points_from, len(found.points)
+        )
+        found.points = replace(
+            own,
+            xyz=torch.cat([own.xyz, found.points.xyz.to(own.xyz)]),
+            rgb=torch.cat([own.rgb, found.points.rgb]),
+        )
+    if found.points is None:
         logger.warning("%s: the model has no points; training starts from random ones", folder)
     placement = read_placement(root) if folder == root / "sparse" / "0" else None
-    metres = None if placement is None else stored_metres(placement.metres_per_unit)
-    description = f"COLMAP model {name} ({'text' if model.text else 'binary'})"
-    return Reconstruction(posed, points, description, metres)
+    found.metres_per_unit = None if placement is None else stored_metres(placement.metres_per_unit)
+    return found
 
 
 def _warn_of_other_models(root: Path, models: Sequence[Path]) -> None:
@@ -75,11 +96,11 @@ def _warn_of_other_models(root: Path, models: Sequence[Path]) -> None:
     )
 
 
-def _images_on_disk(
-    root: Path, images: str, model: ColmapModel
-) -> tuple[list[PosedImage], dict[int, str]]:
-    """The images of a model whose files exist, and their names by image id; warns of those that
-    are missing.
+def _add_images(
+    found: Reconstruction, root: Path, images: str, model: ColmapModel
+) -> dict[int, str]:
+    """Add the images of a model whose files exist; returns their names by image id; warns of those
+    that are missing.
 
     They are in the folder ``root / images``. If they are not, they may be elsewhere in ``root``.
     """
@@ -94,33 +115,33 @@ def _images_on_disk(
         left = [image.name for image in model.images if image.name not in places]
         if not left or not place.is_dir():
             continue
-        found = find_photos(model.folder, place, left, places.keys())
-        for name, file in found.items():
+        for name, file in find_photos(model.folder, place, left, places.keys()).items():
             first = "" if place == folder else file.rpartition("/")[0].partition("/")[0]
             places[name] = (place / first, file.removeprefix(f"{first}/"), file)
     if not places:
         raise _no_images(root, images, model)
-    posed, missing, names = [], [], {}
+    names = {}
     for image in model.images:
         if image.name not in places:
-            missing.append(image.name)
+            found.missing.append(image.name)
             continue
         where, file, name = places[image.name]
-        camera, lens = posed_camera(model, image), model.cameras[image.camera_id]
-        frame = model.frames.get(image.number)
-        names[image.number] = safe_name(name)
-        posed.append(
-            PosedImage(
-                safe_name(name),
-                camera,
-                lens,
-                where,
-                file,
-                frame=None if frame is None else str(frame),
+        with found.one(image.name):
+            camera, lens = posed_camera(model, image), model.cameras[image.camera_id]
+            frame = model.frames.get(image.number)
+            names[image.number] = safe_name(name)
+            found.images.append(
+                PosedImage(
+                    safe_name(name),
+                    camera,
+                    lens,
+                    where,
+                    file,
+                    frame=None if frame is None else str(frame),
+                )
             )
-        )
-    warn_of_missing(folder, missing, len(model.images))
-    return posed, names
+    warn_of_missing(folder, found.missing, len(model.images))
+    return names
 
 
 def _no_images(root: Path, images: str, model: ColmapModel) -> UserError:

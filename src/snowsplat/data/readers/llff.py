@@ -34,24 +34,25 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             raise Problem("it has the shape {shape}", shape=stored.shape)
     except Exception as error:  # numpy raises many kinds
         raise parse.damaged(path, f"not a table of poses ({reason_of(error)})") from None
-    rows = parse.numbers(path, stored, len(stored), _COLUMNS)
     files = photos.sorted_files()
-    if len(files) != len(rows):
+    if len(files) != len(stored):
         raise UserError(
             "{path}: has {rows} poses, but there are {files} photos in {root}; use exactly the "
             "photos that the poses were estimated from",
             path=path,
-            rows=len(rows),
+            rows=len(stored),
             files=len(files),
             root=photos.root,
         )
-    found = Reconstruction(total=len(rows))
-    for index, (file, row) in enumerate(zip(files, rows, strict=True)):
+    found = Reconstruction(total=len(stored))
+    for index, (file, row) in enumerate(zip(files, stored, strict=True)):
         where = f"{path}: pose {index}"
-        down, right, back, position, (height, width, focal) = row[:15].reshape(3, 5).T
-        lens = perspective(where, width, height, centred_intrinsics(width, height, focal))
-        pose = parse.from_opengl(where, np.column_stack([right, -down, back, position]))
-        found.add(photos, file, lens, pose)
+        with found.one(file):
+            table = parse.numbers(where, row[:15].reshape(3, 5), 3, 5)
+            down, right, back, position, (height, width, focal) = table.T
+            lens = perspective(where, width, height, centred_intrinsics(width, height, focal))
+            pose = parse.from_opengl(where, np.column_stack([right, -down, back, position]))
+            found.add(photos, file, lens, pose)
     return found
 
 

@@ -8,7 +8,7 @@ centre of the photo. The lens model is in an appendix of the manual of Metashape
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections import Counter
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -46,7 +46,7 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     ]
     if not chunks:
         raise parse.damaged(path, "has no cameras")
-    cameras = [list(_cameras(chunk)) for chunk in chunks]
+    cameras = [_cameras(chunk) for chunk in chunks]
     aligned = [sum(camera.find("transform") is not None for camera in each) for each in cameras]
     best = aligned.index(max(aligned))
     if len(chunks) > 1:
@@ -54,11 +54,22 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     return _read_chunk(path, chunks[best], cameras[best], photos)
 
 
-def _cameras(chunk: Element) -> Iterator[Element]:
-    """The cameras that are not disabled."""
-    for camera in chunk.find("cameras").iter("camera"):  # type: ignore[union-attr]
-        if camera.get("label") and camera.get("enabled", "true") not in ("false", "0"):
-            yield camera
+def _cameras(chunk: Element) -> list[Element]:
+    """The cameras that are not disabled. The labels of their groups, which may be folders, tell
+    cameras of one label apart."""
+    cameras = chunk.find("cameras")
+    assert cameras is not None
+    found = [
+        (group, camera)
+        for group in cameras.iter()
+        for camera in group.findall("camera")
+        if camera.get("label") and camera.get("enabled", "true") not in ("false", "0")
+    ]
+    count = Counter(camera.get("label") for _, camera in found)
+    for group, camera in found:
+        if count[label := camera.get("label")] > 1:
+            camera.set("label", f"{group.get('label', '')}/{label}")
+    return [camera for _, camera in found]
 
 
 def _read_chunk(
@@ -81,18 +92,19 @@ def _read_chunk(
         transform = camera.find("transform")
         if transform is None:
             continue
-        matrix = parse.numbers(where, (transform.text or "").split(), 16).reshape(4, 4)
-        pose = parse.rigid(where, matrix[:3, :3], matrix[:3, 3])
-        if (photo := found.photo(photos, label)) is None:
-            continue
-        key = camera.get("sensor_id")
-        if key not in lenses:
-            if key not in sensors:
-                raise parse.damaged(
-                    where, f"has the sensor {quoted(key)}, which is not in the file"
-                )
-            lenses[key] = _lens(f"{path}: sensor {quoted(key)}", sensors[key])
-        groups.setdefault(camera.get("component_id"), []).append((photo, lenses[key], pose))
+        with found.one(label):
+            matrix = parse.numbers(where, (transform.text or "").split(), 16).reshape(4, 4)
+            pose = parse.rigid(where, matrix[:3, :3], matrix[:3, 3])
+            if (photo := found.photo(photos, label)) is None:
+                continue
+            key = camera.get("sensor_id")
+            if key not in lenses:
+                if key not in sensors:
+                    raise parse.damaged(
+                        where, f"has the sensor {quoted(key)}, which is not in the file"
+                    )
+                lenses[key] = _lens(f"{path}: sensor {quoted(key)}", sensors[key])
+            groups.setdefault(camera.get("component_id"), []).append((photo, lenses[key], pose))
     if not groups:
         return found
     # Components are not aligned with each other.

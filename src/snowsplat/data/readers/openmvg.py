@@ -49,19 +49,22 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         name = f"{data.get('local_path') or ''}/{data.get('filename')}"
         where = f"{path}: view {quoted(name)}"
         found.total += 1
-        key, pose_key = data.get("id_intrinsic"), data.get("id_pose")
-        pose = poses.get(pose_key) if isinstance(pose_key, int) else None
-        if pose is None:
-            continue
-        if not isinstance(key, int) or key not in lenses:
-            raise parse.damaged(where, f"has the intrinsic {quoted(key)}, which is not in the file")
-        values = parse.table(where, pose.get("value"))
-        rotation = parse.numbers(where, values.get("rotation"), 3, 3)
-        centre = parse.numbers(where, values.get("center"), 3)
-        cam = parse.rigid(where, rotation, -rotation @ centre)
-        if (photo := found.photo(photos, name)) is None:
-            continue
-        found.add(photos, photo, lenses[key], cam)
+        with found.one(name):
+            key, pose_key = data.get("id_intrinsic"), data.get("id_pose")
+            pose = poses.get(pose_key) if isinstance(pose_key, int) else None
+            if pose is None:
+                continue
+            if not isinstance(key, int) or key not in lenses:
+                raise parse.damaged(
+                    where, f"has the intrinsic {quoted(key)}, which is not in the file"
+                )
+            values = parse.table(where, pose.get("value"))
+            rotation = parse.numbers(where, values.get("rotation"), 3, 3)
+            centre = parse.numbers(where, values.get("center"), 3)
+            cam = parse.rigid(where, rotation, -rotation @ centre)
+            if (photo := found.photo(photos, name)) is None:
+                continue
+            found.add(photos, photo, lenses[key], cam)
     points = parse.objects(f"{path}: structure", scene.get("structure") or [])
     rows = [(parse.table(path, point.get("value")).get("X"), [128] * 3) for point in points]
     if found.images:  # the points of the file have no colours

@@ -55,17 +55,22 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     found = Reconstruction(total=len(shots[largest]))
     for name, entry in shots[largest].items():
         where = f"{path}: shot {quoted(name)}"
-        shot = parse.table(where, entry)
-        key = shot.get("camera")
-        if not isinstance(key, str) or key not in cameras:
-            raise parse.damaged(where, f"has the camera {quoted(key)}, which is not in the file")
-        if (photo := found.photo(photos, name)) is None:
-            continue
-        if key not in lenses:
-            lenses[key] = _lens(f"{path}: camera {quoted(key)}", parse.table(where, cameras[key]))
-        rotation = _rotation(parse.numbers(where, shot.get("rotation"), 3))
-        pose = parse.rigid(where, rotation, parse.numbers(where, shot.get("translation"), 3))
-        found.add(photos, photo, lenses[key], pose)
+        with found.one(name):
+            shot = parse.table(where, entry)
+            key = shot.get("camera")
+            if not isinstance(key, str) or key not in cameras:
+                raise parse.damaged(
+                    where, f"has the camera {quoted(key)}, which is not in the file"
+                )
+            if (photo := found.photo(photos, name)) is None:
+                continue
+            if key not in lenses:
+                lenses[key] = _lens(
+                    f"{path}: camera {quoted(key)}", parse.table(where, cameras[key])
+                )
+            rotation = _rotation(parse.numbers(where, shot.get("rotation"), 3))
+            pose = parse.rigid(where, rotation, parse.numbers(where, shot.get("translation"), 3))
+            found.add(photos, photo, lenses[key], pose)
     where = f"{path}: points"
     entries = parse.table(where, scenes[largest].get("points") or {}).values()
     points = (parse.table(where, entry) for entry in entries)

@@ -29,6 +29,8 @@ def points_beside(
     folder: Path,
     found: Reconstruction,
     frames: Sequence[np.ndarray] = (np.eye(4)[:3],),
+    file: str = "*.ply",
+    more_than: int = 0,
 ) -> None:
     """Add the points of the PLY file in ``folder`` that the photos of ``found`` show.
 
@@ -37,13 +39,15 @@ def points_beside(
     the photos is used. If the photos show few points in all of them, a warning tells it.
 
     ``frames``: world_from_frame (3, 4), which may have a scale, of the frames in which the points
-    may be, the most probable first.
+    may be, the most probable first. ``file``: the pattern of its name. ``more_than``: a file with
+    no more points than this is not used.
     """
     fitting: list[tuple[Path, np.ndarray, np.ndarray]] = []
     rejected = None
-    for path in sorted(folder.glob("*.ply")):
+    for path in sorted(folder.glob(file)):
         try:
-            if "f_dc_0" in open_table(path).columns:  # Gaussians
+            table = open_table(path)
+            if "f_dc_0" in table.columns or table.count <= more_than:  # Gaussians
                 continue
             xyz, rgb = read_points(path)
         except UserError:  # another kind of PLY file

@@ -57,22 +57,26 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     found = Reconstruction()
     for file in sorted(path.glob("*.json")):
         found.total += 1
-        if (photo := found.photo(photos, f"{prefix}/{images}/{file.stem}")) is None:
-            continue
-        values = parse.table(file, parse.load_json(file))
-        fx, fy, cx, cy = (parse.number(file, values, key) for key in ("fx", "fy", "cx", "cy"))
-        if "width" not in values:  # as in corrected cameras since 2025
-            header = read_header(photos.root / photo)
-            values |= {"width": header.width, "height": header.height}
-        width, height = parse.number(file, values, "width"), parse.number(file, values, "height")
-        lens = perspective(file, width, height, (fx, fy, cx, cy))
-        entries = [parse.number(file, values, f"t_{i // 4}{i % 4}") for i in range(12)]
-        pose = parse.from_opengl(file, np.reshape(entries, (3, 4)))
-        depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
-        confidence = keyframes / "confidence" / f"{file.stem}.png"
-        known = confidence if is_file(confidence) else None
-        maps = {"depth": depth, "depth_unit": _MILLIMETRE, "depth_confidence": known}
-        found.add(photos, photo, lens, pose, **maps)
+        with found.one(file.name):
+            if (photo := found.photo(photos, f"{prefix}/{images}/{file.stem}")) is None:
+                continue
+            values = parse.table(file, parse.load_json(file))
+            fx, fy, cx, cy = (parse.number(file, values, key) for key in ("fx", "fy", "cx", "cy"))
+            if "width" not in values:  # as in corrected cameras since 2025
+                header = read_header(photos.root / photo)
+                values |= {"width": header.width, "height": header.height}
+            width, height = (
+                parse.number(file, values, "width"),
+                parse.number(file, values, "height"),
+            )
+            lens = perspective(file, width, height, (fx, fy, cx, cy))
+            entries = [parse.number(file, values, f"t_{i // 4}{i % 4}") for i in range(12)]
+            pose = parse.from_opengl(file, np.reshape(entries, (3, 4)))
+            depth = next((d for d in (f / f"{file.stem}.png" for f in depths) if is_file(d)), None)
+            confidence = keyframes / "confidence" / f"{file.stem}.png"
+            known = confidence if is_file(confidence) else None
+            maps = {"depth": depth, "depth_unit": _MILLIMETRE, "depth_confidence": known}
+            found.add(photos, photo, lens, pose, **maps)
     return found
 
 

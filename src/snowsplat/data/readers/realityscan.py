@@ -58,29 +58,35 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
     except csv.Error as error:
         raise parse.damaged(path, f"not a complete CSV file ({error})") from None
     for row in rows:
-        if len(row) != len(columns):
-            raise parse.damaged(path, f"a line has {len(row)} columns instead of {len(columns)}")
-        values = dict(zip(columns, row, strict=True))
-        where = f"{path}: camera {quoted(values['name'])}"
-        found.total += 1
-        if (photo := found.photo(photos, values["name"])) is None:
-            continue
-        header = read_header(photos.root / photo)
-        width, height = header.width, header.height
-        unit = max(width, height)
-        focal = parse.number(where, values, "f") * unit / 36.0
-        cx = parse.number(where, values, "px", 0.0) * unit + width / 2
-        cy = parse.number(where, values, "py", 0.0) * unit + height / 2
-        radial = [parse.number(where, values, f"k{i}", 0.0) for i in (1, 2, 3, 4)]
-        tangential = parse.number(where, values, "t2", 0.0), parse.number(where, values, "t1", 0.0)
-        lens = perspective(where, width, height, (focal, focal, cx, cy), radial, tangential)
-        division &= radial[0] != 0 and not any((*radial[1:], *tangential))
-        position = [parse.number(where, values, key) for key in ("x", "y", "alt")]
-        angles = [
-            math.radians(parse.number(where, values, k)) for k in ("heading", "pitch", "roll")
-        ]
-        pose = np.column_stack([_rotation(*angles), position])
-        found.add(photos, photo, lens, parse.from_opengl(where, pose))
+        with found.one(row[0]):
+            if len(row) != len(columns):
+                raise parse.damaged(
+                    path, f"a line has {len(row)} columns instead of {len(columns)}"
+                )
+            values = dict(zip(columns, row, strict=True))
+            where = f"{path}: camera {quoted(values['name'])}"
+            found.total += 1
+            if (photo := found.photo(photos, values["name"])) is None:
+                continue
+            header = read_header(photos.root / photo)
+            width, height = header.width, header.height
+            unit = max(width, height)
+            focal = parse.number(where, values, "f") * unit / 36.0
+            cx = parse.number(where, values, "px", 0.0) * unit + width / 2
+            cy = parse.number(where, values, "py", 0.0) * unit + height / 2
+            radial = [parse.number(where, values, f"k{i}", 0.0) for i in (1, 2, 3, 4)]
+            tangential = (
+                parse.number(where, values, "t2", 0.0),
+                parse.number(where, values, "t1", 0.0),
+            )
+            lens = perspective(where, width, height, (focal, focal, cx, cy), radial, tangential)
+            division &= radial[0] != 0 and not any((*radial[1:], *tangential))
+            position = [parse.number(where, values, key) for key in ("x", "y", "alt")]
+            angles = [
+                math.radians(parse.number(where, values, k)) for k in ("heading", "pitch", "roll")
+            ]
+            pose = np.column_stack([_rotation(*angles), position])
+            found.add(photos, photo, lens, parse.from_opengl(where, pose))
     _warn(path, found, division)
     points_beside(path.parent, found)
     return found

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
 from snowsplat.data.files.listing import fold_name
-from snowsplat.data.files.photo_files import photos_below, warn_of_missing
+from snowsplat.data.files.photo_files import photos_below, warn_of_missing, warn_of_unusable
 from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
 from snowsplat.data.readers import parse
@@ -72,11 +73,15 @@ class PhotoFolder:
         return self._nearest(name, index.get(last) or index.get(_stem(last)) or [])
 
     def sorted_files(self) -> list[str]:
-        """The photos of the folder of images, or of the root if there is none, sorted by name."""
-        folder = self.root / self.images
-        prefix = f"{self.images}/" if folder.is_dir() else ""
-        names = (path.name for path in (folder if prefix else self.root).iterdir())
-        return [prefix + name for name in sorted(names) if is_photo(name)]
+        """The photos of the folder of images, or of the root, or smaller copies; sorted by name."""
+        for folder in (self.images, "", *sorted(_SMALLER)):
+            if (place := self.root / folder).is_dir():
+                names = (path.relative_to(self.root).as_posix() for path in place.iterdir())
+                if found := sorted(filter(is_photo, names)):
+                    if folder in _SMALLER:
+                        logger.warning("%s: no larger photos are here; these are used", place)
+                    return found
+        return []
 
     def _nearest(self, name: str, found: list[str]) -> str | None:
         """The one of several files that has most folders in common with ``name``."""
@@ -134,6 +139,7 @@ class Reconstruction:
         metres_per_unit: of the world; None: it is not known.
         total: number of photos in the file, with and without poses.
         missing: names of photos with poses that are not on disk.
+        unusable: the errors of photos that were left out.
         points_from: the file of the points, if it is another one.
     """
 
@@ -143,7 +149,16 @@ class Reconstruction:
     metres_per_unit: float | None = None
     total: int = 0
     missing: list[str] = field(default_factory=list)
+    unusable: dict[str, UserError] = field(default_factory=dict)
     points_from: str = ""
+
+    @contextmanager
+    def one(self, name: str) -> Iterator[None]:
+        """What is read of one photo: if its entry is damaged, the photo is left out."""
+        try:
+            yield
+        except UserError as error:
+            self.unusable[name] = error
 
     def photo(self, photos: PhotoFolder, name: str) -> str | None:
         """The result of `PhotoFolder.find`; a photo that is not there is added to ``missing``."""
@@ -223,6 +238,7 @@ def program(
         folder.check()
         cameras = files[0]
         found = read(cameras, folder)
+        warn_of_unusable(cameras, found.unusable, len(found.images))
         _report_missing(name, cameras, folder, found)
         aligned = len(found.images) + len(found.missing)
         found.description = f"{name} {cameras.name}, {aligned} of {found.total} photos aligned"

@@ -75,20 +75,21 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if file is None:
             found.missing.append(f"{images.name}/{index}.jpg")
             continue
-        pose = parse.numbers(where, entry, 7)
-        if not 0.5 < np.linalg.norm(pose[:4]) < 2.0:
-            raise parse.damaged(where, "the quaternion has no direction")
-        if own is not None:
-            fx, fy, cx, cy = parse.numbers(where, own[index], 4).tolist()
-            intrinsics = (fx, fy, cx, cy)
-        lens = perspective(where, width, height, intrinsics)
-        rotation = rotation_from_quat(torch.from_numpy(pose[[3, 0, 1, 2]])).numpy()
-        cam = parse.from_opengl(where, np.column_stack([rotation, pose[4:]]))
-        names = (path.parent / "depth" / f"{file.stem}{suffix}" for suffix in MAP_SUFFIXES)
-        depth = next((name for name in names if is_file(name)), None)
-        compressed |= depth is None and is_file(file.with_suffix(".depth"))
-        photo = file.relative_to(photos.root).as_posix()
-        found.add(photos, photo, lens, cam, depth=depth)
+        with found.one(file.name):
+            pose = parse.numbers(where, entry, 7)
+            if not 0.5 < np.linalg.norm(pose[:4]) < 2.0:
+                raise parse.damaged(where, "the quaternion has no direction")
+            if own is not None:
+                fx, fy, cx, cy = parse.numbers(where, own[index], 4).tolist()
+                intrinsics = (fx, fy, cx, cy)
+            lens = perspective(where, width, height, intrinsics)
+            rotation = rotation_from_quat(torch.from_numpy(pose[[3, 0, 1, 2]])).numpy()
+            cam = parse.from_opengl(where, np.column_stack([rotation, pose[4:]]))
+            names = (path.parent / "depth" / f"{file.stem}{suffix}" for suffix in MAP_SUFFIXES)
+            depth = next((name for name in names if is_file(name)), None)
+            compressed |= depth is None and is_file(file.with_suffix(".depth"))
+            photo = file.relative_to(photos.root).as_posix()
+            found.add(photos, photo, lens, cam, depth=depth)
     if compressed:
         logger.warning(
             "%s: the depth maps are compressed (LZFSE), which is not supported; not used; export "

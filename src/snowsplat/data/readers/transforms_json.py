@@ -32,7 +32,7 @@ import torch
 from snowsplat.data.colmap.model import read_points
 from snowsplat.data.colmap.places import find_models
 from snowsplat.data.dataset import Points, PosedImage, safe_name, usable_points
-from snowsplat.data.files.photo_files import find_photos, warn_of_missing
+from snowsplat.data.files.photo_files import find_photos, warn_of_missing, warn_of_unusable
 from snowsplat.data.photos.decode import IMAGE_SUFFIXES, read_header
 from snowsplat.data.points_ply import read_points as read_points_ply
 from snowsplat.data.readers import parse
@@ -84,25 +84,35 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
     root = files[0].parent
     shown = " + ".join(path.name for path in files)
     frames, first_scene = _frames(files)
-    found = _files_of(root / shown, root, [frame.name for frame in frames], photos.images)
+    found = _files_of(
+        root / shown, root, [frame.name for frame in frames if frame.name], photos.images
+    )
     split = _without_overlap(root, files, frames, found)
-    posed: dict[str, PosedImage] = {}
-    seen: set[tuple[str, _Split | None]] = set()
+    result = Reconstruction(description=shown)
+    seen: dict[tuple[str, _Split | None], Mapping[str, Any]] = {}
     for frame in frames:
         file = found.get(frame.name)
-        if file is None:
-            continue
-        if (file, frame.split) in seen:
-            raise UserError(
-                "{where}: the image {file} also belongs to another frame; remove one of them",
-                where=frame.where,
-                file=file,
-            )
-        seen.add((file, frame.split))
-        if file not in posed:
-            posed[file] = _posed_image(frame.where, root, file, frame.values, split[file])
-    missing = [frame.name for frame in frames if frame.name not in found]
-    if not posed:
+        values = {key: value for key, value in frame.values.maps[0].items() if key != "file_path"}
+        with result.one(frame.name or frame.where):
+            if not frame.name:
+                raise UserError("{where}: no file_path; export the file again", where=frame.where)
+            if file is None or seen.get((file, frame.split)) == values:  # or the same again
+                continue
+            if (file, frame.split) in seen:
+                raise UserError(
+                    "{where}: the image {file} also belongs to another frame; remove one of them",
+                    where=frame.where,
+                    file=file,
+                )
+            first = not any(name == file for name, _ in seen)
+            seen[file, frame.split] = values
+            if first:
+                result.images.append(
+                    _posed_image(frame.where, root, file, frame.values, split[file])
+                )
+    missing = [frame.name for frame in frames if frame.name and frame.name not in found]
+    warn_of_unusable(root / shown, result.unusable, len(result.images))
+    if not result.images:
         if not missing:
             raise UserError("{file}: it has no frames; check where the images are", file=files[0])
         raise UserError(
@@ -113,7 +123,8 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
             first=quoted(missing[0]),
         )
     warn_of_missing(root / shown, missing, len(frames))
-    return Reconstruction(list(posed.values()), _points(root, first_scene), shown)
+    result.points = _points(root, first_scene)
+    return result
 
 
 @dataclass(frozen=True)
@@ -138,9 +149,9 @@ def _frames(files: list[Path]) -> tuple[list[_Frame], _Json]:
         splits = _named_splits(scene)
         for number, frame in enumerate(scene["frames"]):
             where = f"{path}: frame {number}"
-            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-                raise UserError("{where}: no file_path; export the file again", where=where)
-            name = frame["file_path"]
+            frame = frame if isinstance(frame, dict) else {}
+            name = frame.get("file_path")
+            name = name if isinstance(name, str) else ""
             named = split or splits.get(safe_name(name))
             frames.append(_Frame(where, name, ChainMap(frame, scene), named))
     return frames, first_scene

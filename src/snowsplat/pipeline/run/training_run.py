@@ -244,9 +244,9 @@ class TrainingRun:
         gaussians = self.together.scene()
         scene = self._write_scene(gaussians)
         seconds, memory = time.monotonic() - self.started, self.memory.peak()
-        if self.trainer.dataset.test:
-            if self.evaluation is None or self.evaluation[0] != step:
-                self._record_evaluation(step, self.together.evaluate())
+        measured = self.evaluation is not None and self.evaluation[0] == step
+        if self.trainer.dataset.test and not measured:
+            self._record_evaluation(step, self.together.evaluate())
         if self.evaluation is not None:
             self.out.write_metrics(step, "test", self.evaluation[1].as_json(), self._left_out())
         if self.page is not None:
