@@ -321,7 +321,7 @@ class _Job:
         shutil.rmtree(folder.checkpoints, ignore_errors=True)  # no longer needed
         if not figures.views:
             return figures, LastPart()
-        self._stage("pictures", {}, [folder.rendered("test", figures.iteration)], self._render)
+        self._stage("pictures", {}, [folder.rendered("test", figures.iteration).path], self._render)
         last = self._stage("all", {}, [self.file], lambda: self._train_on_all(figures.iteration))
         return figures, from_json(LastPart, last)
 

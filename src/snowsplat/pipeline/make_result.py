@@ -78,12 +78,12 @@ class MakeResult:
     @property
     def renders(self) -> Path:
         """The folder with the rendered test views."""
-        return self.training.rendered("test", self.figures.iteration) / "renders"
+        return self.training.rendered("test", self.figures.iteration).renders
 
     @property
     def photos(self) -> Path:
         """The folder with the held-out photos."""
-        return self.training.rendered("test", self.figures.iteration) / "gt"
+        return self.training.rendered("test", self.figures.iteration).photos
 
     def as_json(self) -> dict[str, Any]:
         """The values for scripts; paths are `Path`s."""

@@ -16,6 +16,7 @@ from snowsplat.pipeline.options.video import panorama_width
 from snowsplat.pipeline.output import image_files
 from snowsplat.pipeline.output.scene_source import TrainedScene
 from snowsplat.pipeline.videos import level_cameras
+from snowsplat.project.training_folder import RenderedFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.panorama import PanoramaRenderer
 from snowsplat.scene.render import render
@@ -56,7 +57,7 @@ def render_images(
     for split, of_split in chosen.items():
         target = scene.folder.rendered(split, scene.iteration)
         _render(scene, of_split, target, depth)
-        rendered[target / "renders"] = len(of_split)
+        rendered[target.renders] = len(of_split)
     return rendered
 
 
@@ -89,7 +90,7 @@ def render_panoramas(
     color = torch.tensor(scene.background, device=device)
     rendered = {}
     for split, views in chosen.items():
-        folder = scene.folder.rendered(split, scene.iteration) / "panoramas"
+        folder = scene.folder.rendered(split, scene.iteration).panoramas
         folder.mkdir(parents=True, exist_ok=True)
         places: list[Camera] = []
         for view, camera in zip(views, level_cameras([v.camera for v in views]), strict=True):
@@ -120,7 +121,9 @@ def _chosen(
     return scene, chosen
 
 
-def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Depth) -> None:
+def _render(
+    scene: TrainedScene, views: Sequence[View], target: RenderedFolder, depth: Depth
+) -> None:
     gaussians = scene.gaussians
     device = gaussians.means.device
     color = torch.tensor(scene.background, device=device)
@@ -131,8 +134,8 @@ def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Dep
         assert output.depth is not None
         return image_files.mean_depth(output.depth, output.alpha)
 
-    for name in ("renders", "gt", *(["depth"] if with_depth else [])):
-        (target / name).mkdir(parents=True, exist_ok=True)
+    for folder in (target.renders, target.photos, *([target.depth] if with_depth else [])):
+        folder.mkdir(parents=True, exist_ok=True)
     steps: dict[str, float] = {}
     with (
         image_files.PngQueue() as queue,
@@ -146,9 +149,9 @@ def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Dep
         for i, view in enumerate(views):
             file = f"{i:05d}.png"
             output = render(gaussians, view.camera, color, with_depth=with_depth)
-            queue.write(target / "renders" / file, image_files.to_8bit(output.image))
+            queue.write(target.renders / file, image_files.to_8bit(output.image))
             photo = loader.get(view).over(color)
-            queue.write(target / "gt" / file, image_files.to_8bit(photo))
+            queue.write(target.photos / file, image_files.to_8bit(photo))
             if output.depth is None:
                 continue
             mean = image_files.mean_depth(output.depth, output.alpha)
@@ -156,6 +159,6 @@ def _render(scene: TrainedScene, views: Sequence[View], target: Path, depth: Dep
                 shown = image_files.depth_in_color(mean, near, far)
             else:
                 shown, steps[file] = image_files.depth_in_16_bits(mean)
-            queue.write(target / "depth" / file, shown)
+            queue.write(target.depth / file, shown)
     if steps:
-        write_json(target / "depth" / "world_units_per_step.json", steps)
+        write_json(target.depth_units, steps)

@@ -18,13 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snowsplat.project.inside import Inside
 from snowsplat.project.left_out import LeftOut
 from snowsplat.util.safe_json import read_json
 
 #: The folders that undistortion writes.
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "masks", "sparse")
-RECORD = "sfm.json"
-REPORT = "dataset_report.html"
 
 
 @dataclass(frozen=True)
@@ -33,58 +32,25 @@ class DatasetFolder:
 
     path: Path
 
-    @property
-    def record(self) -> Path:
-        return self.path / RECORD
-
-    @property
-    def report(self) -> Path:
-        return self.path / REPORT
-
-    @property
-    def photos(self) -> Path:
-        """The folder of the photos with their distortion."""
-        return self.path / "input"
-
-    @property
-    def distorted(self) -> Path:
-        return self.path / "distorted"
-
-    @property
-    def distorted_masks(self) -> Path:
-        return self.distorted / "masks"
+    record = Inside("sfm.json")
+    report = Inside("dataset_report.html")
+    #: The folder of the photos with their distortion.
+    photos = Inside("input")
+    distorted = Inside("distorted")
+    distorted_masks = Inside("distorted/masks")
+    #: The features and matches of the photos in `photos`, in a database of COLMAP.
+    database = Inside("distorted/database.db")
+    #: The COLMAP models of the photos in `photos`, "0", "1" …: the largest first.
+    distorted_models = Inside("distorted/sparse")
+    distorted_model = Inside("distorted/sparse/0")
+    images = Inside("images")
+    masks = Inside("masks")
+    #: The COLMAP model of the undistorted images.
+    model = Inside("sparse/0")
 
     def mask_of(self, photo: str) -> Path:
         """The mask of a photo in `photos`."""
         return self.distorted_masks / f"{photo}.png"
-
-    @property
-    def database(self) -> Path:
-        """The features and matches of the photos in `photos`, in a database of COLMAP."""
-        return self.distorted / "database.db"
-
-    @property
-    def distorted_models(self) -> Path:
-        """The COLMAP models of the photos in `photos`, "0", "1" …: the largest first."""
-        return self.distorted / "sparse"
-
-    @property
-    def distorted_model(self) -> Path:
-        """The largest COLMAP model of the photos in `photos`."""
-        return self.distorted_models / "0"
-
-    @property
-    def images(self) -> Path:
-        return self.path / "images"
-
-    @property
-    def masks(self) -> Path:
-        return self.path / "masks"
-
-    @property
-    def model(self) -> Path:
-        """The COLMAP model of the undistorted images."""
-        return self.path / "sparse" / "0"
 
     def result(self, stage: str) -> dict[str, Any]:
         """The result of a stage, as the record says; empty if it is not finished, or damaged."""

@@ -30,11 +30,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from snowsplat._version import __version__
-from snowsplat.formats.origin_file import origin_file, read_place
+from snowsplat.formats.origin_file import read_place
 from snowsplat.project.cfg_args import read_cfg_args
+from snowsplat.project.inside import Inside
 from snowsplat.project.left_out import LeftOut
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import UserError
@@ -48,9 +49,6 @@ from snowsplat.util.files import (
 from snowsplat.util.run_lock import LOCK
 from snowsplat.util.safe_json import from_json, read_json
 
-if TYPE_CHECKING:
-    pass
-
 logger = logging.getLogger(__name__)
 
 Color = tuple[float, float, float]
@@ -59,13 +57,7 @@ Color = tuple[float, float, float]
 DATASET, SCENE = "dataset", "scene"
 #: Why the training has left a photo out.
 UNEXPLAINED = "the scene does not explain it"
-_SCENES = "point_cloud"
 _SCENE = re.compile(r"iteration_(\d+)")
-_CONFIG, _CFG_ARGS, _CAMERAS, _POINTS = "config.json", "cfg_args", "cameras.json", "input.ply"
-# What a training writes after it has begun: folders, and files.
-_RESULTS = (_SCENES, "checkpoints", "refined", "train", "test", "videos", "masks", "tensorboard")
-_REPORTS = ("metrics.json", "exposure.json", "history.json", "report.html", "log.csv")
-_FILES = (_CFG_ARGS, _CONFIG, _CAMERAS, origin_file(Path(_CAMERAS)).name, _POINTS, *_REPORTS)
 
 
 @dataclass(frozen=True)
@@ -81,72 +73,56 @@ class DatasetSettings:
 
 
 @dataclass(frozen=True)
+class RenderedFolder:
+    """The rendered images of a split, existing or not."""
+
+    path: Path
+    renders = Inside("renders")
+    #: The photos.
+    photos = Inside("gt")
+    depth = Inside("depth")
+    depth_units = Inside("depth/world_units_per_step.json")
+    panoramas = Inside("panoramas")
+
+
+@dataclass(frozen=True)
 class TrainingFolder:
     """An output folder of a training run, existing or not."""
 
     path: Path
 
-    @property
-    def cfg_args(self) -> Path:
-        return self.path / _CFG_ARGS
+    cfg_args = Inside("cfg_args")
+    config = Inside("config.json")
+    cameras = Inside("cameras.json")
+    #: See `snowsplat.formats.origin_file`.
+    place = Inside("cameras.json.origin.json")
+    points = Inside("input.ply")
+    #: The folder of the scenes.
+    point_clouds = Inside("point_cloud")
+    checkpoints = Inside("checkpoints")
+    metrics = Inside("metrics.json")
+    exposure = Inside("exposure.json")
+    history = Inside("history.json")
+    report = Inside("report.html")
+    masks = Inside("masks")
+    videos = Inside("videos")
+    csv_log = Inside("log.csv")
+    tensorboard = Inside("tensorboard")
+    #: A folder beside whose model a link to the photos makes a dataset.
+    refined = Inside("refined")
+    refined_model = Inside("refined/sparse/0")
+    # What a training writes after it has begun: folders, and files.
+    _folders = (
+        *(point_clouds, checkpoints, refined, videos, masks, tensorboard),
+        *(Inside("train"), Inside("test")),
+    )
+    _reports = (metrics, exposure, history, report, csv_log)
+    #: The names of all files in the folder itself.
+    FILES = tuple(each.name for each in (cfg_args, config, cameras, place, points, *_reports))
 
-    @property
-    def cameras(self) -> Path:
-        return self.path / _CAMERAS
-
-    @property
-    def points(self) -> Path:
-        return self.path / _POINTS
-
-    @property
-    def point_clouds(self) -> Path:
-        """The folder of the scenes."""
-        return self.path / _SCENES
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics.json"
-
-    @property
-    def history(self) -> Path:
-        return self.path / "history.json"
-
-    @property
-    def report(self) -> Path:
-        return self.path / "report.html"
-
-    @property
-    def masks(self) -> Path:
-        return self.path / "masks"
-
-    @property
-    def videos(self) -> Path:
-        return self.path / "videos"
-
-    @property
-    def csv_log(self) -> Path:
-        return self.path / "log.csv"
-
-    @property
-    def tensorboard(self) -> Path:
-        return self.path / "tensorboard"
-
-    @property
-    def refined(self) -> Path:
-        """A folder beside whose model a link to the photos makes a dataset."""
-        return self.path / "refined"
-
-    @property
-    def refined_model(self) -> Path:
-        return self.refined / "sparse" / "0"
-
-    def rendered(self, split: str, iteration: int) -> Path:
-        """The folder of the rendered images of a split, "test" or "train"."""
-        return self.path / split / f"ours_{iteration}"
+    def rendered(self, split: str, iteration: int) -> RenderedFolder:
+        """The rendered images of a split, "test" or "train"."""
+        return RenderedFolder(self.path / split / f"ours_{iteration}")
 
     def rendered_views(self) -> list[Path]:
         """The rendered held-out views."""
@@ -154,7 +130,7 @@ class TrainingFolder:
 
     def is_training(self) -> bool:
         """Whether snowsplat or the reference implementation has written a training run here."""
-        return any((self.path / name).is_file() for name in (_CONFIG, _CFG_ARGS))
+        return self.config.is_file() or self.cfg_args.is_file()
 
     # Before a training run
 
@@ -172,7 +148,7 @@ class TrainingFolder:
         others = (
             entry
             for entry in self.path.iterdir()
-            if entry.name != LOCK and not is_temporary(entry, _FILES)
+            if entry.name != LOCK and not is_temporary(entry, self.FILES)
         )
         if any(others) and not self.is_training():
             raise UserError(
@@ -195,17 +171,17 @@ class TrainingFolder:
 
     def remove_results(self) -> None:
         """Remove what an earlier run wrote after its first step."""
-        for name in _RESULTS:
-            shutil.rmtree(self.path / name, ignore_errors=True)
-        for name in _REPORTS:
-            (self.path / name).unlink(missing_ok=True)
+        for each in self._folders:
+            shutil.rmtree(self.path / each.name, ignore_errors=True)
+        for each in self._reports:
+            (self.path / each.name).unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Remove what was written before the first step, if there is neither a scene nor a
         checkpoint."""
         if self.scenes() or self.checkpoints.exists():
             return
-        for name in _FILES:
+        for name in self.FILES:
             (self.path / name).unlink(missing_ok=True)
         shutil.rmtree(self.tensorboard, ignore_errors=True)
         self._remove_unwritten_scenes()
@@ -223,10 +199,10 @@ class TrainingFolder:
         ``training``: all settings of the training, see `config_to_json`.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(self.path, _FILES)
+        remove_temporaries(self.path, self.FILES)
         self._remove_unwritten_scenes()
         whole = {"snowsplat": __version__, "dataset": asdict(dataset), "training": training}
-        write_json(self.path / _CONFIG, whole)
+        write_json(self.config, whole)
         namespace = argparse.Namespace(
             data_device="cpu",
             eval=dataset.hold_out is not None,
@@ -241,7 +217,7 @@ class TrainingFolder:
 
     def training_settings(self) -> dict[str, Any]:
         """All settings of the training, see `config_to_json`. Raises UserError: damaged."""
-        file = self.path / _CONFIG
+        file = self.config
         try:
             return dict(read_json(file)["training"])
         except (OSError, ValueError, KeyError, TypeError):
@@ -255,7 +231,7 @@ class TrainingFolder:
         Raises:
             UserError: missing or damaged settings.
         """
-        ours, theirs = self.path / _CONFIG, self.cfg_args
+        ours, theirs = self.config, self.cfg_args
         try:
             if ours.is_file():
                 whole = read_json(ours)
@@ -406,7 +382,7 @@ class TrainingFolder:
 
         Raises UserError: the file is damaged.
         """
-        file = self.path / "exposure.json"
+        file = self.exposure
         if not file.is_file():
             return {}
         try:

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from snowsplat.data.frame.placement import PLACEMENT
-from snowsplat.project.dataset_folder import IMAGE_FOLDERS, RECORD, REPORT, DatasetFolder
+from snowsplat.project.dataset_folder import IMAGE_FOLDERS, DatasetFolder
 from snowsplat.sfm.colmap import describe_model, estimate_poses
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL, thread_count
 from snowsplat.sfm.cost import survey
@@ -45,7 +45,9 @@ from snowsplat.util.safe_json import from_json, inside
 from snowsplat.util.stages import Outcome, Stages
 
 STAGES = ("photos", "poses", "images", "report")
-_OUTPUT_NAMES = ("distorted", *IMAGE_FOLDERS, RECORD, REPORT)
+_RECORD, _REPORT = DatasetFolder.record.name, DatasetFolder.report.name
+_PHOTOS = DatasetFolder.photos.name
+_OUTPUT_NAMES = (DatasetFolder.distorted.name, *IMAGE_FOLDERS, _RECORD, _REPORT)
 
 
 class Watcher(Protocol):
@@ -100,7 +102,7 @@ def make_dataset(
     with one_run(folder):
         _check_free(folder, in_place, sources, options, overwrite)
         with _remove_on_failure(folder):
-            stages = Stages(folder / RECORD, STAGES)
+            stages = Stages(folder / _RECORD, STAGES)
             paths = [str(path.absolute()) for path in sources.inputs]
             stages.about = {"inputs": paths, "in_place": in_place}
             stages.save()  # from here on the folder is recognised as a dataset
@@ -145,7 +147,7 @@ def _run(
         return _gather(sources, folder, chosen_photos, report, stages.about["in_place"])
 
     of_photos = {"input": _fingerprint(sources.paths), **asdict(chosen_photos)}
-    stage("photos", of_photos, ["input", "distorted/masks"], gather_photos)
+    stage("photos", of_photos, [_PHOTOS, DatasetFolder.distorted_masks.name], gather_photos)
     photos = _photos(folder, outcomes["photos"].result)
     left.gathered(len(photos))
     if options.skip_matching:
@@ -188,7 +190,7 @@ def _run(
         }
         return {"file": write_report(folder, facts).name, "verdict": facts["verdict"]}
 
-    stage("report", {}, [REPORT], write)
+    stage("report", {}, [_REPORT], write)
     return outcomes
 
 
@@ -245,14 +247,14 @@ def _check_free(
     folder: Path, in_place: bool, sources: Sources, options: DatasetOptions, overwrite: bool
 ) -> None:
     """Raises UserError if the dataset must not be written to ``folder``."""
-    remove_temporaries(folder, (RECORD, REPORT))
-    if (folder / RECORD).is_file():
-        stages = Stages(folder / RECORD, STAGES)
+    remove_temporaries(folder, (_RECORD, _REPORT))
+    if (folder / _RECORD).is_file():
+        stages = Stages(folder / _RECORD, STAGES)
         if not in_place and stages.about.get("in_place") is True:
             raise UserError(
                 "{folder}: contains the original photos of this dataset, not copies; use another "
                 "folder",
-                folder=folder / "input",
+                folder=folder / _PHOTOS,
             )
         before = stages.about.get("inputs")
         same = before == [str(path.absolute()) for path in sources.inputs]
@@ -294,10 +296,10 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        record = folder / RECORD
+        record = folder / _RECORD
         resumable = record.is_file() and Stages(record, STAGES).is_finished("photos")
-        if RECORD not in before and (isinstance(error, UserError) or not resumable):
-            for name in {"input", ".new", *_OUTPUT_NAMES} - before:
+        if _RECORD not in before and (isinstance(error, UserError) or not resumable):
+            for name in {_PHOTOS, ".new", *_OUTPUT_NAMES} - before:
                 _remove(folder / name)
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
@@ -341,6 +343,6 @@ def _photos(folder: Path, gathered: dict[str, Any]) -> list[Photo]:
             raise ValueError("a photo outside of input/")
     except ValueError:
         raise UserError(
-            "{record}: damaged; delete it to start again", record=folder / RECORD
+            "{record}: damaged; delete it to start again", record=folder / _RECORD
         ) from None
     return photos
