@@ -34,7 +34,7 @@ from snowsplat.sfm.colmap.result import describe_model
 from snowsplat.sfm.ingest.photos import photo_files
 from snowsplat.sfm.ingest.video.clip import read_clip, why_no_video
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
-from snowsplat.training.core import checkpoint, checkpoint_file
+from snowsplat.training.core import checkpoint
 from snowsplat.training.core.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.stages import Stages
@@ -574,7 +574,7 @@ def test_a_checkpoint_with_a_dtype_that_numpy_lacks(tmp_path, rejected, dtype):
 
 def test_a_checkpoint_whose_meta_is_a_list(tmp_path, rejected, monkeypatch):
     """Python can convert this list to a dict."""
-    monkeypatch.setattr(checkpoint_file, "dict", lambda given: given, raising=False)
+    monkeypatch.setattr(checkpoint, "dict", lambda given: given, raising=False)
     path = checkpoint.save(tmp_path, 5, {"a": torch.ones(4)}, [[1, 2]])
     monkeypatch.undo()
     assert "not a checkpoint" in rejected(lambda: checkpoint.load(path))

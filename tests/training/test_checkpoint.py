@@ -11,7 +11,7 @@ from unittest import mock
 import pytest
 import torch
 
-from snowsplat.training.core import checkpoint, checkpoint_file
+from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
 
 from ..fork_server import popen
@@ -144,7 +144,7 @@ def test_foreign_files_and_other_versions(tmp_path, monkeypatch):
     save_file({"a": torch.zeros(3)}, tmp_path / "step_000001.safetensors")
     with pytest.raises(UserError, match="not a checkpoint"):
         checkpoint.load(tmp_path / "step_000001.safetensors")
-    monkeypatch.setattr(checkpoint_file, "VERSION", 99)
+    monkeypatch.setattr(checkpoint, "VERSION", 99)
     path = checkpoint.save(tmp_path, 2, {"a": torch.zeros(3)}, {})
     monkeypatch.undo()
     with pytest.raises(UserError, match="version 99"):
@@ -158,7 +158,7 @@ def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
     def full_disk(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoint_file.safetensors.numpy, "save_file", full_disk)
+    monkeypatch.setattr(checkpoint.safetensors.numpy, "save_file", full_disk)
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(tmp_path, 3, {"a": torch.zeros(3)}, {})
     assert sorted(p.name for p in tmp_path.iterdir()) == [
@@ -169,7 +169,7 @@ def test_a_failed_save_leaves_older_checkpoints(tmp_path, monkeypatch):
 
 SAVER = """
 import sys, torch
-from snowsplat.training.core import checkpoint, checkpoint_file
+from snowsplat.training.core import checkpoint
 table = torch.arange(4_000_000, dtype=torch.float32)
 print("ready", flush=True)
 step = 0

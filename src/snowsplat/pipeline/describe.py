@@ -15,7 +15,7 @@ from snowsplat.pipeline.output.scene_files import format_for_reading, read_array
 from snowsplat.project.project import Project
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip
-from snowsplat.training.core import checkpoint_file
+from snowsplat.training.core import checkpoint
 from snowsplat.util.errors import UserError
 from snowsplat.util.ply import open_table
 
@@ -138,12 +138,7 @@ def _rounded(values: Any) -> list[float]:
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
-    try:
-        content = checkpoint_file.read(path)
-    except OSError as error:
-        raise UserError(
-            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
-        ) from None
+    content = checkpoint.load(path)
     return {
         "kind": "checkpoint",
         "file": str(path),

@@ -239,7 +239,7 @@ class _Job:
         memory = self._memory(dataset, config, _gaussians_in(start))
         self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
         trainer = self._trainer(dataset, memory.plan.config, schedule, start.tensors)
-        start.tensors.clear()  # the trainer has a copy, which is the one in the memory plan
+        start.arrays.clear()  # the trainer has a copy, which is the one in the memory plan
         self.out.write_settings(settings, config_to_json(memory.plan.config))
         self.observer.note(_described(dataset))
         iterations = trainer.schedule.iterations
