@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import shutil
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,17 @@ from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.memory_use import MemoryUse
-from snowsplat.pipeline.run.photo_stamps import Stamp, edited, stamps_of
+from snowsplat.pipeline.run.photo_stamps import edited, stamps_of
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
-from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainResult
 from snowsplat.pipeline.run.training_files import read_dataset, read_dataset_files, write_beginning
-from snowsplat.pipeline.run.training_run import TrainingRun
+from snowsplat.pipeline.run.training_run import Request, TrainingRun
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
+from snowsplat.training.budgets.memory_budget import MemoryPlan, plan_memory
+from snowsplat.training.budgets.pace import Pace, TimeBudget
+from snowsplat.training.budgets.step_cost import Work
+from snowsplat.training.budgets.time_plan import Plan, make_plan, measure_time_ratio
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.checkpoint import Checkpoint
 from snowsplat.training.core.run import Loss
@@ -41,6 +43,7 @@ from snowsplat.training.settings.names import changed
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json, config_to_json
 from snowsplat.util.byte_size import format_bytes
+from snowsplat.util.duration import duration
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import Message, message
 from snowsplat.util.process_memory import reset_peak, resident_bytes
@@ -87,15 +90,11 @@ def train(
         TrainingStopped: Ctrl-C. Scene and checkpoint are saved; `resume` continues.
         KeyboardInterrupt: Ctrl-C before the first step; nothing is saved.
     """
-    started = time.monotonic()
     options = options or TrainOptions()
     options.configuration()  # reports an invalid setting first
-    out = TrainingFolder(Path(output))
-    with one_run(out.path):
-        out.check_free(resume=False, overwrite=overwrite)
-        job = _Job(out, options, observer, page, started, parts, loss)
-        with joined(job.device) as job.shards:
-            return job.train(dataset)
+    request = Request(TrainingFolder(Path(output)), options, observer, page, parts, loss)
+    with _job(request, resume=False, overwrite=overwrite) as job:
+        return job.train(dataset)
 
 
 def resume(
@@ -128,14 +127,10 @@ def resume(
             changed that must not change.
         TrainingStopped, KeyboardInterrupt: see `train`.
     """
-    started = time.monotonic()
     options = options or TrainOptions()
-    out = TrainingFolder(Path(output))
-    with one_run(out.path):
-        out.check_free(resume=True, overwrite=False)
-        job = _Job(out, options, observer, page, started, parts, loss)
-        with joined(job.device) as job.shards:
-            return job.resume(dataset)
+    request = Request(TrainingFolder(Path(output)), options, observer, page, parts, loss)
+    with _job(request, resume=True, overwrite=False) as job:
+        return job.resume(dataset)
 
 
 def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | None = None) -> None:
@@ -149,31 +144,31 @@ def follow_training(compute: Compute, parts: Sequence[Part] = (), loss: Loss | N
         follow(shards, device, parts, loss)
 
 
-@dataclass
+@contextmanager
+def _job(request: Request, *, resume: bool, overwrite: bool) -> Iterator[_Job]:
+    with one_run(request.out.path):
+        request.out.check_free(resume=resume, overwrite=overwrite)
+        job = _Job(request)
+        with joined(job.device) as job.shards:
+            yield job
+
+
 class _Job:
     """One call of `train` or `resume`: prepares a `TrainingRun` and runs it."""
 
-    out: TrainingFolder
-    options: TrainOptions
-    observer: Observer
-    page: LivePage | None
-    started: float
-    parts: Sequence[Part]
-    loss: Loss | None
-    shards: Shards = ALONE
-    doubts: tuple[str, ...] = ()  # about the dataset
-    photos: dict[str, Stamp] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.page is not None and count() > 1:
+    def __init__(self, request: Request) -> None:
+        if request.page is not None and count() > 1:
             raise UserError("the page needs one process; leave out `view`, and use snowsplat watch")
+        self.request, self.out, self.options = request, request.out, request.options
+        self.note = request.observer.note
         self.device = self.options.compute.apply()
         reset_peak()
         self.memory_before = resident_bytes()
+        self.shards: Shards = ALONE
+        self.doubts: tuple[str, ...] = ()  # about the dataset
 
     def train(self, path: Path | str) -> TrainResult:
         options = self.options
-        budget = TimeBudget.for_run(options.minutes, None, self.started)
         settings = options.dataset_settings(path)
         name = "custom" if options.config is not None else options.recipe or "default"
         config = options.configuration()
@@ -181,43 +176,31 @@ class _Job:
         dataset = files.dataset(settings.resolution)
         self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
         check_test_photos(dataset.test)
-        plan = None
-        if budget is None and options.iterations is None:
-            config = config.lengthened(len(dataset.train))
+        budget, plan = self._budget(), None
         if budget is not None:
-            plan = budget.plan(
-                dataset,
-                config,
-                self.device,
-                resize=options.resolution is None,
-                more_gaussians=options.config is None
-                and options.settings.get("max_gaussians") is None,
-                more_often=options.config is None
-                and all(
-                    options.settings.get(setting) is None
-                    for setting in ("densify_interval", "densify_from")
-                ),
-            )
+            plan = self._plan(dataset, config, budget)
             config = plan.config
             if plan.resolution is not None:
                 settings = replace(settings, resolution=plan.resolution)
                 dataset = files.dataset(plan.resolution)
-        memory = self._memory(dataset, config)
-        self.observer.note(_described(dataset))
+        elif options.iterations is None:
+            config = config.lengthened(len(dataset.train))
+        memory = plan_memory(dataset, config, self.device, budget=options.memory)
+        self.note(_described(dataset))
         if budget is not None and plan is not None:
-            self.observer.note(budget.described(plan))
+            time = duration(budget.seconds)
+            self.note(message("{time} on this machine: {plan}", time=time, plan=plan.summary()))
         if "sweep" in config.starts:
-            self.observer.note(message("computing depth maps for the initialisation"))
+            self.note(message("computing depth maps for the initialisation"))
         self.photos = stamps_of(dataset, settings.path)
-        self.shards.of_first(Setup(settings, memory.plan.config))
-        trainer = self._trainer(dataset, memory.plan.config)
+        self.shards.of_first(Setup(settings, memory.config))
+        trainer = self._trainer(dataset, memory.config)
         if options.config is None:
             for hint in hints(trainer, options.settings):
-                self.observer.note(hint)
+                self.note(hint)
         self.out.remove_results()
-        write_beginning(self.out, dataset, settings, memory.plan.config)
-        time_ratio = 1.0 if plan is None else plan.time_ratio
-        return self._run(settings, name, trainer, budget, time_ratio, memory)
+        write_beginning(self.out, dataset, settings, memory.config)
+        return self._run(settings, name, trainer, memory, budget, plan)
 
     def resume(self, path: Path | str | None) -> TrainResult:
         start = self._newest_checkpoint(path)
@@ -227,8 +210,7 @@ class _Job:
         options, meta = self.options, CheckpointMeta.from_checkpoint(start)
         budget, schedule = None, None
         if options.iterations is None:  # `iterations` replaces the time budget and its schedule
-            budget = TimeBudget.for_run(options.minutes, meta.time, self.started)
-            schedule = meta.schedule
+            budget, schedule = self._budget(meta.time), meta.schedule
         meta = replace(meta, dataset=self.out.located(meta.dataset))
         settings = _resumed_dataset(options, path, start, meta)
         config = _resumed_config(options, start, meta)
@@ -236,22 +218,57 @@ class _Job:
         # The first run has refused impossible cameras, or not.
         self.doubts = check_cameras(dataset, settings.path, trusted=True)
         self._compare_photos(dataset, settings.path, meta)
-        memory = self._memory(dataset, config, _gaussians_in(start))
-        self.shards.of_first(Setup(settings, memory.plan.config, schedule, start.path))
-        trainer = self._trainer(dataset, memory.plan.config, schedule, start.tensors)
+        memory = plan_memory(
+            dataset, config, self.device, budget=options.memory, present=_gaussians_in(start)
+        )
+        self.shards.of_first(Setup(settings, memory.config, schedule, start.path))
+        trainer = self._trainer(dataset, memory.config, schedule, start.tensors)
         start.arrays.clear()  # the trainer has a copy, which is the one in the memory plan
-        self.out.write_settings(settings, config_to_json(memory.plan.config))
-        self.observer.note(_described(dataset))
-        iterations = trainer.schedule.iterations
-        self.observer.note(
+        self.out.write_settings(settings, config_to_json(memory.config))
+        self.note(_described(dataset))
+        self.note(
             message(
                 "resuming from {path}, step {step} of {iterations}",
                 path=start.path,
                 step=start.step,
-                iterations=iterations,
+                iterations=trainer.schedule.iterations,
             )
         )
-        return self._run(settings, meta.recipe, trainer, budget, 1.0, memory)
+        return self._run(settings, meta.recipe, trainer, memory, budget)
+
+    def _budget(self, before: dict[str, float] | None = None) -> TimeBudget | None:
+        """The time budget; None if no time was requested, now or in an earlier run.
+
+        The requested time of a resumed run is that for the remaining steps. ``before``: the budget
+        in its checkpoint, see `TimeBudget.as_json`.
+        """
+        minutes, started = self.options.minutes, self.request.started
+        if minutes is not None:
+            return TimeBudget(60.0 * minutes, started=started)
+        return None if before is None else TimeBudget(**before, started=started)
+
+    def _plan(self, dataset: Dataset, config: TrainConfig, budget: TimeBudget) -> Plan:
+        """The number of steps, the photo size and the limit of Gaussians for the time that is left.
+
+        The speed is measured with a separate, short training run. The `Trainer` of the real run
+        cannot be used, because its resolution, limit and schedule depend on the plan.
+        """
+        options, resize = self.options, self.options.resolution is None
+
+        def is_free(*settings: str) -> bool:
+            given = any(options.settings.get(each) is not None for each in settings)
+            return options.config is None and not given
+
+        time_ratio = measure_time_ratio(dataset, config, self.device, resize=resize)
+        return make_plan(
+            dataset,
+            config,
+            budget.left,
+            time_ratio,
+            resize=resize,
+            more_gaussians=is_free("max_gaussians"),
+            more_often=is_free("densify_interval", "densify_from"),
+        )
 
     def _compare_photos(self, dataset: Dataset, path: str, meta: CheckpointMeta) -> None:
         """Warn if photos or masks were edited since the training has begun."""
@@ -279,14 +296,9 @@ class _Job:
             self.device,
             state,
             shards=self.shards,
-            parts=[*parts_of(config), *self.parts],
-            loss=self.loss,
-            note=self.observer.note,
-        )
-
-    def _memory(self, dataset: Dataset, config: TrainConfig, present: int = 0) -> MemoryUse:
-        return MemoryUse.planned(
-            self.options.memory, dataset, config, self.device, self.memory_before, present
+            parts=[*parts_of(config), *self.request.parts],
+            loss=self.request.loss,
+            note=self.note,
         )
 
     def _run(
@@ -294,20 +306,17 @@ class _Job:
         settings: DatasetSettings,
         recipe: str,
         trainer: Trainer,
+        memory: MemoryPlan,
         budget: TimeBudget | None,
-        time_ratio: float,
-        memory: MemoryUse,
+        plan: Plan | None = None,
     ) -> TrainResult:
-        self.observer.note(
-            message(
-                "training on {device_name}; {memory}",
-                device_name=device_name(self.device),
-                memory=memory.summary(),
-            )
+        device, plan_text = device_name(self.device), memory.summary()
+        self.note(
+            message("training on {device_name}; {memory}", device_name=device, memory=plan_text)
         )
-        most = _BYTES_IN_FILE * (memory.plan.limit or len(trainer.gaussians))
+        most = _BYTES_IN_FILE * (memory.limit or len(trainer.gaussians))
         if (free := shutil.disk_usage(self.out.path).free) < most:
-            self.observer.note(
+            self.note(
                 message(
                     "only {free} are free on the disk, and the scene may need {most}: free some "
                     "space",
@@ -315,24 +324,24 @@ class _Job:
                     most=format_bytes(most),
                 )
             )
-        pace = None if budget is None else budget.pace(trainer, time_ratio)
+        work = Work.for_training(trainer.config, trainer.dataset)
+        pace = Pace(work)
+        if budget is not None:
+            pace = Pace(work, budget.left, plan.time_ratio if plan else 1.0)
         run = TrainingRun(
-            self.out,
+            self.request,
             settings,
             recipe,
             trainer,
+            memory,
+            self.memory_before,
             budget,
             pace,
-            memory,
-            self.observer,
-            save_iterations=self.options.save_iterations,
-            checkpoint_seconds=self.options.checkpoint_seconds,
-            page=self.page,
-            doubts=self.doubts,
-            photos=self.photos,
+            self.doubts,
+            self.photos,
         )
-        if self.page is not None:
-            self.page.open_training(trainer, Project.open(self.out.path).name, self.observer)
+        if (page := self.request.page) is not None:
+            page.open_training(trainer, Project.open(self.out.path).name, self.request.observer)
         return run.run()
 
     def _newest_checkpoint(self, path: Path | str | None) -> Checkpoint | None:
@@ -355,7 +364,7 @@ class _Job:
                 path=out.path,
                 what=what,
             )
-        self.observer.note(message("{path}: no checkpoint yet; starting at step 0", path=out.path))
+        self.note(message("{path}: no checkpoint yet; starting at step 0", path=out.path))
         return None
 
 

@@ -36,7 +36,7 @@ class Machine:
                 gaussians = min(FINAL, int(1.4 * gaussians))
             self.downscales.append(downscale)
             self.shares.append(schedule.share(step))
-            length = pace.iterations_after(schedule, step, downscale, gaussians)
+            length = pace.after_step(schedule, step, downscale, gaussians)
             if length is not None:
                 schedule.stretch(step, length)
                 self.lengths.append(length)
@@ -140,9 +140,9 @@ def test_a_pause_moves_the_deadline():
                 clocks[i] += 60.0
                 each.postpone(60.0)
             now = clocks[i]
-            lengths.append(each.iterations_after(schedule, step, 1, 10_000))
+            lengths.append(each.after_step(schedule, step, 1, 10_000))
         assert lengths[1] == (lengths[0] and pytest.approx(lengths[0], abs=1)), step
-    assert paused.deadline == pace.deadline + 60.0
+    assert paused.end == pace.end + 60.0
 
 
 def test_without_time_the_schedule_is_completed_in_few_steps():

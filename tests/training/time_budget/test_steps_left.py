@@ -3,7 +3,7 @@
 import pytest
 
 from snowsplat.training.budgets.step_cost import Work
-from snowsplat.training.budgets.steps_left import StepsLeft
+from snowsplat.training.budgets.pace import Pace
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.schedule import Schedule
 
@@ -17,7 +17,7 @@ def estimates(cost, pause=0.0):
     by the true time left."""
     config = recipe("classic", iterations=STEPS)
     schedule, now, gaussians = Schedule(STEPS), 100.0, 10_000
-    left = StepsLeft(Work(config, PIXELS, VIEWS), lambda: now)
+    left = Pace(Work(config, PIXELS, VIEWS), clock=lambda: now)
     times, estimated = [], []
     for step in range(1, STEPS + 1):
         downscale = config.downscale_at(step, schedule)
@@ -28,7 +28,8 @@ def estimates(cost, pause=0.0):
             now += pause
             left.postpone(pause)
         times.append(now)
-        estimated.append(left.after(schedule, step, downscale, gaussians))
+        left.after_step(schedule, step, downscale, gaussians)
+        estimated.append(left.seconds_left)
     whole = times[-1] - 100.0
     return [
         ((time - 100.0) / whole, seconds / (times[-1] - time))

@@ -6,20 +6,19 @@ import logging
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from snowsplat.data import Dataset
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
+from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
 from snowsplat.pipeline.run.collective import Collective
 from snowsplat.pipeline.run.live_page import LivePage
-from snowsplat.pipeline.run.memory_use import MemoryUse
 from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.pipeline.run.refined_cameras import write_refined
-from snowsplat.pipeline.run.time_budget import TimeBudget
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
 from snowsplat.pipeline.run.training_files import (
     read_dataset,
@@ -33,13 +32,14 @@ from snowsplat.project.project import Project
 from snowsplat.project.training_folder import UNEXPLAINED, DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.sfm.report.capture_verdict import recorded_verdict
-from snowsplat.training.budgets.pace import Pace
-from snowsplat.training.budgets.step_cost import Work
-from snowsplat.training.budgets.steps_left import StepsLeft
+from snowsplat.training.budgets.memory_budget import MemoryPlan
+from snowsplat.training.budgets.pace import Pace, TimeBudget
 from snowsplat.training.core import checkpoint
 from snowsplat.training.core.history import History
 from snowsplat.training.core.progress import Progress
+from snowsplat.training.core.run import Loss
 from snowsplat.training.core.trainer import Trainer
+from snowsplat.training.parts.part import Part
 from snowsplat.training.parts.part_report import PartReport
 from snowsplat.training.report import Trained, write_training_report
 from snowsplat.training.report.scene_verdict import scene_verdict
@@ -56,36 +56,44 @@ logger = logging.getLogger(__name__)
 _TRAINING_VIEWS = 4
 
 
+@dataclass(frozen=True)
+class Request:
+    """What the caller of `train` or `resume` has given."""
+
+    out: TrainingFolder
+    options: TrainOptions
+    observer: Observer
+    page: LivePage | None = None  # shows the training in the browser
+    parts: Sequence[Part] = ()
+    loss: Loss | None = None
+    started: float = field(default_factory=time.monotonic)
+
+
 @dataclass
 class TrainingRun:
     """One training run, to its end or to Ctrl-C."""
 
-    out: TrainingFolder
+    request: Request
     # settings, recipe: how the dataset was read, and the recipe; written to checkpoints.
     settings: DatasetSettings
     recipe: str
     trainer: Trainer
-    budget: TimeBudget | None  # the time budget; None: no time budget
-    pace: Pace | None  # adapts the number of steps to the time budget; None without a time budget
-    memory: MemoryUse
-    observer: Observer
-    # Steps after which the scene is written, in addition to the last step.
-    save_iterations: tuple[int, ...] = ()
-    # Time between checkpoints, if the configuration has no checkpoint_every.
-    checkpoint_seconds: float | None = None
-    page: LivePage | None = None  # shows the training in the browser
+    memory: MemoryPlan
+    memory_before: int  # see `MemoryPlan.peak`
+    budget: TimeBudget | None  # None: no time budget
+    pace: Pace
     doubts: tuple[str, ...] = ()  # what is doubtful about the dataset, for the report
     photos: dict[str, Stamp] | None = None  # stamps of the photos and masks, for checkpoints
 
     def __post_init__(self) -> None:
+        self.out, self.observer = self.request.out, self.request.observer
         self.config = self.trainer.config
         self.first_step = self.trainer.step
         self.started = self.last_checkpoint = time.monotonic()
         self.evaluation: tuple[int, Evaluation] | None = None  # the last one and its step
         self.history = History.read(self.out.history, self.first_step)
-        self._left = StepsLeft(Work.for_training(self.config, self.trainer.dataset))
         self.together = Collective(self.trainer)
-        self.watchers = Watchers(self.out.path, self.trainer, self.page)
+        self.watchers = Watchers(self.out.path, self.trainer, self.request.page)
 
     def run(self) -> TrainResult:
         """Run all steps and write the results.
@@ -141,37 +149,29 @@ class TrainingRun:
     def _after_step(self, progress: Progress) -> None:
         if progress.metrics is not None:
             self._record_evaluation(progress.step, progress.metrics)
-        self.observer.step(replace(progress, seconds_left=self._seconds_left(progress)))
-        if self._checkpoint_is_due(progress.step):
+        schedule, step = self.trainer.schedule, progress.step
+        length = self.pace.after_step(schedule, step, progress.downscale, progress.gaussians)
+        self.observer.step(replace(progress, seconds_left=self.pace.seconds_left))
+        if self._checkpoint_is_due(step):
             self._save_checkpoint()
-        if self.trainer.schedule.contains(progress.step, self.save_iterations):
+        if schedule.contains(step, self.request.options.save_iterations):
             self._save_scene()
         paused = self.watchers.after_step(
-            progress.step, progress.iterations, progress.loss, self.trainer.gaussians
+            step, progress.iterations, progress.loss, self.trainer.gaussians
         )
         if paused:
-            self._left.postpone(paused)
-        if self.pace is None:
-            return
-        if paused and self.budget is not None:
             self.pace.postpone(paused)
-            self.budget.started += paused
-        schedule, step = self.trainer.schedule, progress.step
-        length = self.pace.iterations_after(schedule, step, progress.downscale, progress.gaussians)
+            if self.budget is not None:
+                self.budget.started += paused
         if length is not None:
             self.together.stretch(step, length)
-
-    def _seconds_left(self, progress: Progress) -> float:
-        schedule = self.trainer.schedule
-        left = self._left.after(schedule, progress.step, progress.downscale, progress.gaussians)
-        return left if self.budget is None else max(0.0, self.budget.left)
 
     def _left_out(self) -> tuple[LeftOut, ...]:
         views = self.trainer.dataset.train
         return tuple(LeftOut(views[i].name, "training", UNEXPLAINED) for i in self.trainer.excluded)
 
     def _checkpoint_is_due(self, step: int) -> bool:
-        every, seconds = self.config.checkpoint_every, self.checkpoint_seconds
+        every, seconds = self.config.checkpoint_every, self.request.options.checkpoint_seconds
         if every:
             return self.trainer.schedule.multiples(step, every) > 0
         return seconds is not None and time.monotonic() - self.last_checkpoint > seconds
@@ -183,7 +183,9 @@ class TrainingRun:
         """
         step = self.first_step
         checkpoint.remove_old(self.out.checkpoints, step)
-        due = step > 0 and self.trainer.schedule.contains(step, self.save_iterations)
+        due = step > 0 and self.trainer.schedule.contains(
+            step, self.request.options.save_iterations
+        )
         if due and step not in self.out.scenes():
             self._save_scene()
 
@@ -243,14 +245,15 @@ class TrainingRun:
         step = self.trainer.step
         gaussians = self.together.scene()
         scene = self._write_scene(gaussians)
-        seconds, memory = time.monotonic() - self.started, self.memory.peak()
+        seconds = time.monotonic() - self.started
+        memory = self.memory.peak(self.memory_before)
         measured = self.evaluation is not None and self.evaluation[0] == step
         if self.trainer.dataset.test and not measured:
             self._record_evaluation(step, self.together.evaluate())
         if self.evaluation is not None:
             self.out.write_metrics(step, "test", self.evaluation[1].as_json(), self._left_out())
-        if self.page is not None:
-            self.page.end_training(self._result_lines(len(gaussians), seconds))
+        if (page := self.request.page) is not None:
+            page.end_training(self._result_lines(len(gaussians), seconds))
         self.history.write(self.out.history)
         reports = {part.name: part.report(self.trainer, gaussians) for part in self.trainer.parts}
         for each in reports.values():
@@ -270,7 +273,7 @@ class TrainingRun:
             gaussians=len(gaussians),
             seconds=seconds,
             memory=memory,
-            reductions=self.memory.plan.reductions,
+            reductions=self.memory.reductions,
             evaluation=self.evaluation,
             left_out=self._left_out(),
             parts=reports,

@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 import torch
 
 from snowsplat.data.dataset import Dataset
-from snowsplat.data.photos.image_loader import DECODERS
+from snowsplat.data.photos.image_loader import DECODERS, available_memory
 from snowsplat.scene.gaussians import SH_REST_COUNTS
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.names import changed
-from snowsplat.util.byte_size import format_bytes
+from snowsplat.util.byte_size import format_bytes, parse_bytes
 from snowsplat.util.errors import SettingError
 from snowsplat.util.messages import Message, message
+from snowsplat.util.process_memory import peak_bytes
 
 #: Bytes per pixel of a decoded photo, and of its mask.
 _RGB = 3
@@ -79,6 +80,7 @@ class MemoryPlan:
         reductions: descriptions of the reductions that a larger budget would not need.
         limit: maximum number of Gaussians. None: no limit; ``scene`` is then the number of bytes of
             a million Gaussians.
+        device: whose memory is planned.
     """
 
     config: TrainConfig
@@ -87,6 +89,7 @@ class MemoryPlan:
     photos: int
     reductions: tuple[str, ...]
     limit: int | None
+    device: torch.device
 
     @property
     def total(self) -> int:
@@ -101,14 +104,32 @@ class MemoryPlan:
             "photos": format_bytes(self.photos),
         }
         if self.limit is None:
-            return message(
+            plan = message(
                 "{scene} for each million Gaussians, images {images}, photos {photos}", **values
             )
+        else:
+            plan = message(
+                "{total} at most ({limit:,} Gaussians {scene}, images {images}, photos {photos})",
+                total=format_bytes(self.total),
+                limit=self.limit,
+                **values,
+            )
+        if self.device.type == "cuda":
+            return message("memory of the GPU: {plan}", plan=plan)
+        return message("memory: {plan}", plan=plan)
+
+    def peak(self, before: int) -> Message:
+        """The peak memory so far, in a few words.
+
+        ``before``: resident bytes of the process before the training: Python and its libraries.
+        """
+        if self.device.type == "cuda":
+            peak = torch.cuda.max_memory_allocated(self.device)
+            return message("at most {peak:.0f} MB of the GPU", peak=peak / 1e6)
         return message(
-            "{total} at most ({limit:,} Gaussians {scene}, images {images}, photos {photos})",
-            total=format_bytes(self.total),
-            limit=self.limit,
-            **values,
+            "at most {peak:.0f} MB, {before:.0f} of them Python and its libraries",
+            peak=peak_bytes() / 1e6,
+            before=before / 1e6,
         )
 
 
@@ -140,8 +161,8 @@ def plan_memory(
     dataset: Dataset,
     config: TrainConfig,
     device: torch.device,
-    available: int,
-    budget: int | None = None,
+    available: int | None = None,
+    budget: int | str | None = None,
     present: int = 0,
 ) -> MemoryPlan:
     """Estimate the memory of training on ``dataset``; with a ``budget``, reduce it to this budget.
@@ -149,13 +170,16 @@ def plan_memory(
     First, fewer photos stay decoded; then the number of Gaussians is limited.
 
     Args:
-        available: free bytes of the device; photos may use half of them.
-        budget: bytes; None: no limit.
+        available: free bytes of the device; photos may use half of them. None: as many as there
+            are.
+        budget: bytes, or a text such as "4GB"; None: no limit.
         present: number of Gaussians of a resumed training run; they are not removed.
 
-    Raises: SettingError: ``memory`` is too little for photos of this size, or for the Gaussians
-    that are present.
+    Raises: SettingError: ``memory`` is no number of bytes, or too little for photos of this size,
+    or for the Gaussians that are present.
     """
+    budget = parse_bytes(budget) if isinstance(budget, str) else budget
+    available = available_memory(device) if available is None else available
     sizes = sorted(view.camera.width * view.camera.height for view in dataset.train)
     largest, median = sizes[-1], sizes[len(sizes) // 2]
     config = config.capped(median, len(dataset.train))
@@ -193,7 +217,8 @@ def plan_memory(
             photos = left
         config = replace(config, image_memory=photos)
     gaussians = 1_000_000 if limit is None else limit
-    return MemoryPlan(config, scene.bytes_for(gaussians), images, photos, tuple(reductions), limit)
+    whole = scene.bytes_for(gaussians)
+    return MemoryPlan(config, whole, images, photos, tuple(reductions), limit, device)
 
 
 def _photo_bytes(dataset: Dataset) -> int:

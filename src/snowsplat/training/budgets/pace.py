@@ -1,10 +1,11 @@
-"""`Pace`: makes a training run complete its schedule within a time budget.
+"""`Pace`: the time until the end of a training, and the steps for which a time budget suffices.
 
 The time of a step depends on the resolution of the coarse-to-fine stage, on the number of
-Gaussians, and on the load of the machine by other processes. The time of every step is measured,
-and the mean time of the remaining steps is estimated from recent steps. `Schedule.stretch` then
-distributes the rest of the schedule over as many steps as there is time for. No part of the
-schedule is skipped.
+Gaussians, and on the load of the machine by other processes. The first steps use small photos and
+few Gaussians, so their number per second is too high for the later ones. The time of every step is
+measured, and the mean time of the remaining steps is estimated from recent steps. With a time
+budget, `Schedule.stretch` then distributes the rest of the schedule over as many steps as there is
+time for. No part of the schedule is skipped.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
-from snowsplat.training.budgets.step_cost import StepCost, Work
+from snowsplat.training.budgets.step_cost import GROWTH, StepCost, Work
 from snowsplat.training.settings.schedule import Schedule
 
+#: Number of seconds over which measurements are averaged without a time budget.
+_AVERAGING_SECONDS = 10.0
 #: Fraction of the time budget over which measurements are averaged. It is long enough to average
 #: over views, and short enough to follow a change of the load.
 _AVERAGING_SHARE = 0.2
@@ -31,32 +35,59 @@ FEWEST_STEPS = 100
 _MAX_SHORTENING = 10.0
 
 
+@dataclass
+class TimeBudget:
+    """The time that a training run may take, from the start of the command to its end."""
+
+    seconds: float  # total time, including earlier runs
+    spent: float = 0.0  # seconds in earlier runs, up to the checkpoint
+    # When this run started, by `time.monotonic`.
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def left(self) -> float:
+        """The seconds that are left; negative if the time is over."""
+        return self.seconds - self.spent - (time.monotonic() - self.started)
+
+    def as_json(self) -> dict[str, float]:
+        """The JSON value for a checkpoint: ``seconds``, and the present value of ``spent``."""
+        return {"seconds": self.seconds, "spent": self.seconds - self.left}
+
+
 class Pace:
-    """Keeps a training run within its time; call `iterations_after` after each of its steps."""
+    """Call `after_step` after each step of a training run.
+
+    Attributes:
+        end: when the last step is completed; with a time budget, when this is over.
+    """
 
     def __init__(
         self,
         work: Work,
-        seconds: float,
-        time_ratio: float = 1.0,
+        seconds: float | None = None,
+        time_ratio: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """
         Args:
             work: what the time of the steps depends on.
-            seconds: time from now to the end, including evaluation on the test photos and saving.
+            seconds: the time budget: from now to the end, including evaluation on the test photos
+                and saving; None: there is none.
             time_ratio: see `StepCost`.
             clock: returns the time in seconds.
         """
-        self._work = work
-        self._clock = clock
-        self._last_step = self._last_estimate = clock()
-        self.deadline = self._last_step + seconds
-        self._cost = StepCost(
-            work, time_ratio, max(_MIN_AVERAGING_SECONDS, _AVERAGING_SHARE * seconds)
-        )
+        self._work, self._clock = work, clock
+        self._limited = seconds is not None
+        averaging = _AVERAGING_SECONDS
+        if seconds is not None:
+            averaging = max(_MIN_AVERAGING_SECONDS, _AVERAGING_SHARE * seconds)
+        self._cost = StepCost(work, time_ratio, averaging)
+        self._last_step = clock()
+        self._last_estimate = self._last_step if self._limited else -math.inf
+        self._gaussians, self._growth = 0, GROWTH  # in the last step; by the last densification
+        self.end = self._last_step + (seconds or 0.0)
 
-    def iterations_after(
+    def after_step(
         self, schedule: Schedule, step: int, downscale: int, gaussians: int
     ) -> int | None:
         """The total number of steps for which there is time; None: leave the schedule unchanged.
@@ -69,24 +100,30 @@ class Pace:
         now = self._clock()
         self._cost.observe(now - self._last_step, downscale, gaussians)
         self._last_step = now
-        if now - self._last_estimate < _MIN_INTERVAL or step >= schedule.iterations:
+        if gaussians > self._gaussians > 0:
+            self._growth = gaussians / self._gaussians
+        self._gaussians = gaussians
+        if now - self._last_estimate < _MIN_INTERVAL:
             return None
         self._last_estimate = now
-        steps = round(self._seconds_left(now, gaussians) / self._mean(schedule, step, gaussians))
+        growth = None if self._limited else self._growth
+        mean = self._cost.mean(self._work.parts_ahead(schedule, step, gaussians, growth))
+        if not self._limited:
+            self.end = now + mean * (schedule.iterations - step)
+        if not self._limited or step >= schedule.iterations:
+            return None
+        after = self._work.seconds_after(self._cost.predict(1, gaussians), gaussians)
+        steps = round((self.end - now - after) / mean)
         fewest = math.ceil((1.0 - schedule.share(step)) * step / _MAX_SHORTENING)
         return step + max(steps, fewest, FEWEST_STEPS - step, 1)
 
+    @property
+    def seconds_left(self) -> float:
+        """The time from the last step to `end`."""
+        return max(0.0, self.end - self._last_step)
+
     def postpone(self, seconds: float) -> None:
-        """Postpone the deadline by a pause of ``seconds`` since the last step."""
-        self.deadline += seconds
+        """The training has paused for ``seconds`` since the last step."""
+        self.end += seconds
         self._last_step += seconds
         self._last_estimate += seconds
-
-    def _mean(self, schedule: Schedule, step: int, gaussians: int) -> float:
-        """Mean seconds of the remaining steps."""
-        return self._cost.mean(self._work.parts_ahead(schedule, step, gaussians))
-
-    def _seconds_left(self, now: float, gaussians: int) -> float:
-        """Seconds until the last step has to be completed, before the final evaluation."""
-        after = self._work.seconds_after(self._cost.predict(1, gaussians), gaussians)
-        return self.deadline - now - after
