@@ -2,8 +2,8 @@
 
 import pytest
 
-from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.budgets.pace import Pace
+from snowsplat.training.budgets.step_cost import Work
 from snowsplat.training.settings.recipes import recipe
 from snowsplat.training.settings.schedule import Schedule
 
