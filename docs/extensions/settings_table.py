@@ -47,7 +47,7 @@ _OPTIONS = {
     TrainOptions: "`train`, `resume`: `TrainOptions`",
     VideoOptions: "`render_video`: `VideoOptions`",
     Edits: "`convert`: `Edits`",
-    MeshOptions: "`write_mesh`, `write_points`: `MeshOptions`",
+    MeshOptions: "`write_mesh`: `MeshOptions`",
     PublishOptions: "`publish`: `PublishOptions`",
     BenchmarkOptions: "`benchmark`: `BenchmarkOptions`",
     PlanOptions: "`plan_blocks`: `PlanOptions`",

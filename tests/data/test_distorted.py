@@ -226,16 +226,17 @@ def test_impossible_coefficients_are_one_line(tmp_path):
 
 def test_a_block_keeps_the_lens(tmp_path):
     from snowsplat.data import read_files
+    from snowsplat.project.training_folder import DatasetSettings
 
     folder = write(tmp_path / "whole")
-    files = read_files(folder, hold_out=None)
+    files = read_files(DatasetSettings(str(folder)))
     write_block_dataset(
         tmp_path / "block", [image for image, _ in files.images], None, files.origin
     )
     (camera,) = read_model(tmp_path / "block/sparse/0").cameras.values()
     assert (camera.model, camera.params) == ("OPENCV", OPENCV)
     again = load_dataset(tmp_path / "block", hold_out=None).train[0].camera
-    assert again.fx == files.dataset(None).train[0].camera.fx
+    assert again.fx == files.dataset(-1).train[0].camera.fx
 
 
 # transforms.json

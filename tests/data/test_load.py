@@ -13,6 +13,7 @@ from snowsplat import data
 from snowsplat.data import ImageLoader, Points, load_dataset, read_files
 from snowsplat.data.dataset import safe_name, scene_extent
 from snowsplat.data.frame.bounds import scene_bounds
+from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import SettingError, UserError
 
@@ -64,8 +65,8 @@ def test_files_that_are_read_once_give_the_dataset_at_any_resolution(pristine, t
     half = write_toy_dataset(tmp_path / "half", "colmap-bin", 9, 66, 50)
     resize_folder(half / "images", half / "images", (33, 25))
     for root in (pristine["colmap-bin"], half):
-        files = read_files(root)
-        files.dataset(None)
+        files = read_files(DatasetSettings(str(root), hold_out=8))
+        files.dataset(-1)
         for width in (23, 30):
             once, again = files.dataset(width), load_dataset(root, resolution=width)
             assert [view.name for view in once.test] == [view.name for view in again.test]

@@ -34,9 +34,7 @@ class Mesh(SurfaceCommand):
     options: MeshOptions = group(MeshOptions)
 
     def run(self) -> dict[str, Any]:
-        from snowsplat.pipeline.mesh import write_mesh
-
-        surface = self.written(write_mesh)
+        surface = self.written()
         faces = len(surface.mesh.faces)
         count = message("{kept:,} of {found:,} triangles", kept=faces, found=surface.found)
         points = self.output.with_suffix(".ply")

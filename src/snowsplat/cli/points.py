@@ -30,9 +30,7 @@ class Points(SurfaceCommand):
     options: MeshOptions = group(MeshOptions, only=("voxel", "far", "parts"))
 
     def run(self) -> dict[str, Any]:
-        from snowsplat.pipeline.mesh import write_points
-
-        surface = self.written(write_points)
+        surface = self.written(points=True)
         count = message("{count:,} points", count=len(surface.mesh.vertices))
         mesh = self.output.with_suffix(".glb")
         return self.reported(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,17 +36,19 @@ class SurfaceCommand(JsonCommand):
     overwrite: bool = common.overwrite()
     compute: Compute = group(Compute, only=("device", "threads"))
 
-    def written(self, write: Callable[..., Surface]) -> Surface:
-        """What a function of `snowsplat.pipeline.mesh` has written."""
+    def written(self, *, points: bool = False) -> Surface:
+        """What `write_mesh` has written."""
+        from snowsplat.pipeline.mesh import write_mesh
         from snowsplat.pipeline.output.scene_source import load_trained
 
         with TerminalObserver() as observer:
-            return write(
+            return write_mesh(
                 lambda: load_trained(self.scene, dataset=self.dataset, compute=self.compute),
                 self.output,
                 self.options,
                 self.overwrite,
                 observer,
+                points=points,
             )
 
     def reported(self, surface: Surface, what: Message, hint: Message) -> dict[str, Any]:

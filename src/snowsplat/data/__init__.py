@@ -10,7 +10,7 @@ from snowsplat.util.lazy import lazy_names
 
 if TYPE_CHECKING:
     from snowsplat.data.dataset import Dataset, Points, View, scene_extent
-    from snowsplat.data.load import DatasetFiles, load_dataset, read_files
+    from snowsplat.data.load import DatasetFiles, load_dataset, read_dataset, read_files
     from snowsplat.data.photos.decode import ImageSource, LoadedImage
     from snowsplat.data.photos.image_loader import ImageLoader
 
@@ -23,6 +23,7 @@ __all__ = [
     "Points",
     "View",
     "load_dataset",
+    "read_dataset",
     "read_files",
     "scene_extent",
 ]
@@ -36,6 +37,7 @@ _MODULES = {
     "Points": "dataset",
     "View": "dataset",
     "load_dataset": "load",
+    "read_dataset": "load",
     "read_files": "load",
     "scene_extent": "dataset",
 }

@@ -22,6 +22,7 @@ from snowsplat.data.lens.views import LensView, is_wide, lens_views
 from snowsplat.data.maps.map_files import MAP_SUFFIXES
 from snowsplat.data.photos.decode import ImageSource, load_thumbnail
 from snowsplat.data.readers import read_poses
+from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
@@ -77,14 +78,16 @@ def load_dataset(
         SettingError: ``images`` is not the folder of the images, or ``resolution``, ``hold_out`` or
             ``first_held_out`` is invalid.
     """
-    return read_files(
-        path,
-        images=images,
-        resolution=resolution,
-        hold_out=hold_out,
-        first_held_out=first_held_out,
-        test_list=test_list,
-    ).dataset(resolution)
+    named: str | list[str] | None = None
+    if test_list is not None:
+        named = str(test_list) if isinstance(test_list, str | Path) else list(test_list)
+    size = -1 if resolution is None else resolution
+    return read_dataset(DatasetSettings(str(path), images, size, hold_out, first_held_out, named))
+
+
+def read_dataset(settings: DatasetSettings) -> Dataset:
+    """`load_dataset` with its arguments as one object."""
+    return read_files(settings).dataset(settings.resolution)
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ class DatasetFiles:
     origin: Origin
     metres_per_unit: float | None
 
-    def dataset(self, resolution: int | None) -> Dataset:
+    def dataset(self, resolution: int) -> Dataset:
         """The dataset at a resolution, see `load_dataset`; reads no file.
 
         Raises:
@@ -145,23 +148,14 @@ def _in_order(views: Sequence[View], near: float) -> list[View]:
     return sorted(with_near, key=lambda view: view.name)
 
 
-def read_files(
-    path: Path | str,
-    *,
-    images: str = "images",
-    resolution: int | None = None,
-    hold_out: int | None = 8,
-    first_held_out: int = 0,
-    test_list: Path | str | Sequence[str] | None = None,
-) -> DatasetFiles:
+def read_files(settings: DatasetSettings) -> DatasetFiles:
     """Read and check the files of a dataset, once for several resolutions.
 
-    ``resolution``: 2, 4 or 8 selects the folder ``images_2`` …; other values select the full size.
-
-    The other arguments and the errors are those of `load_dataset`.
+    ``settings``: a resolution of 2, 4 or 8 selects the folder ``images_2`` …; other values select
+    the full size. The errors are those of `load_dataset`.
     """
-    root = Path(path)
-    found = read_poses(root, images)
+    root, resolution = Path(settings.path), settings.resolution
+    found = read_poses(root, settings.images)
     if found.points is not None and _are_placeholder(found.points):
         logger.warning(
             "%s: the points are at fewer than %d places: as if there were none",
@@ -186,7 +180,9 @@ def read_files(
     return DatasetFiles(
         root=root,
         images=sized,
-        test_names=held_out_names(posed, hold_out, first_held_out, test_list),
+        test_names=held_out_names(
+            posed, settings.hold_out, settings.first_held_out, settings.test_list
+        ),
         circles=_circles(sized),
         points=points,
         description=found.description,
@@ -238,7 +234,7 @@ def _circles(images: Sequence[tuple[PosedImage, ImageSize]]) -> dict[Lens, float
 
 
 def _views(
-    image: PosedImage, size: ImageSize, resolution: int | None, circle: float | None
+    image: PosedImage, size: ImageSize, resolution: int, circle: float | None
 ) -> Iterator[View]:
     """The view of an image; of a wide lens, several views. All of them are without distortion."""
     maps = image.depth, image.depth_unit, image.depth_confidence, image.normals
@@ -297,10 +293,8 @@ def _warn_of_cropped(posed: Sequence[PosedImage]) -> None:
         )
 
 
-def _final_size(
-    image: PosedImage, width: int, height: int, resolution: int | None
-) -> tuple[int, int]:
-    if resolution is None or resolution == -1:
+def _final_size(image: PosedImage, width: int, height: int, resolution: int) -> tuple[int, int]:
+    if resolution == -1:
         return width, height
     if resolution < 1:
         raise SettingError(

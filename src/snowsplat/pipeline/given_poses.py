@@ -6,11 +6,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from snowsplat.data import Dataset, View
+from snowsplat.data import Dataset, View, read_dataset
 from snowsplat.data.files.matching import match_names
 from snowsplat.data.judge.verdict import judge
 from snowsplat.pipeline.observer import Observer
-from snowsplat.pipeline.run.training_files import read_dataset
 from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.sfm.ingest.search.sources import Source, Sources
 from snowsplat.util.errors import UserError

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from snowsplat import ops
-from snowsplat.data import Dataset
+from snowsplat.data import Dataset, read_dataset
 from snowsplat.pipeline.all_photos import SHARE, LastPart, train_on_all
 from snowsplat.pipeline.given_poses import given_poses
 from snowsplat.pipeline.make_plan import POSES_SHARE, MakePlan, choose_plan, described
@@ -29,7 +29,6 @@ from snowsplat.pipeline.quality import PRESETS, Preset
 from snowsplat.pipeline.render import render_images
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import hash_of_dataset, hash_of_files
-from snowsplat.pipeline.run.training_files import read_dataset
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.project import MAKE_RECORD, Project

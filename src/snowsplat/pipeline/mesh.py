@@ -1,4 +1,4 @@
-"""`write_mesh` and `write_points`: the surfaces of a scene as triangles or as dense points."""
+"""`write_mesh`: the surfaces of a scene as triangles or as dense points."""
 
 from __future__ import annotations
 
@@ -65,6 +65,8 @@ def write_mesh(
     options: MeshOptions | None = None,
     overwrite: bool = False,
     observer: Observer = SILENT,
+    *,
+    points: bool = False,
 ) -> Surface:
     """Write the surfaces of a scene as triangles with the colours of the photos.
 
@@ -74,62 +76,30 @@ def write_mesh(
     Args:
         load: loads the scene with its dataset, as `load_trained`; called after the other
             arguments have been checked.
-        target: .ply, .glb or .obj; its folder is created if it does not exist.
+        target: .ply, .glb or .obj; with ``points``, .ply, .las or .laz, of which the last two need
+            the packages laspy and lazrs. Its folder is created if it does not exist.
         overwrite: replace ``target``.
         observer: gets the stages "reading", "depth", "stereo", "fusion", "triangles" and
             "colours".
+        points: write a dense cloud of points with normals and colours: the vertices, about one for
+            each voxel of the surface.
 
     Raises:
         UserError: ``target`` exists or has another suffix; a photo is damaged; there is no surface,
             or a package for an option is missing.
         OSError: ``target`` cannot be written.
     """
-    _check(target, mesh_files.MESH_SUFFIXES, overwrite)
-    surface = _loaded(load, options, observer)
-    return _written(target, surface)
-
-
-def write_points(
-    load: Callable[[], TrainedScene],
-    target: Path,
-    options: MeshOptions | None = None,
-    overwrite: bool = False,
-    observer: Observer = SILENT,
-) -> Surface:
-    """Write a dense cloud of points on the surfaces, with normals and the colours of the photos.
-
-    The points are the vertices of `write_mesh`: about one for each voxel of the surface.
-
-    Args:
-        load: as in `write_mesh`.
-        target: .ply, .las or .laz; the last two need the packages laspy and lazrs.
-        overwrite, observer: as in `write_mesh`.
-
-    Raises: as `write_mesh`.
-    """
-    _check(target, mesh_files.POINTS_SUFFIXES, overwrite)
-    surface = _loaded(load, options, observer)
-    mesh = surface.mesh
-    return _written(target, replace(surface, mesh=replace(mesh, faces=mesh.faces[:0])))
-
-
-def _loaded(
-    load: Callable[[], TrainedScene], options: MeshOptions | None, observer: Observer
-) -> Surface:
-    with observer.waiting("reading"):
-        scene = load()
-    return surface_of(scene, options or MeshOptions(), observer)
-
-
-def _check(target: Path, suffixes: tuple[str, ...], overwrite: bool) -> None:
-    mesh_files.check_suffix(target, suffixes)
+    kinds = mesh_files.POINTS_SUFFIXES if points else mesh_files.MESH_SUFFIXES
+    mesh_files.check_suffix(target, kinds)
     if target.exists() and not overwrite:
         raise UserError("{target}: exists; use `overwrite` to replace it", target=target)
     if target.is_dir():
         raise UserError("{target}: a folder; use the name of a file", target=target)
-
-
-def _written(target: Path, surface: Surface) -> Surface:
+    with observer.waiting("reading"):
+        scene = load()
+    surface = surface_of(scene, options or MeshOptions(), observer)
+    if points:
+        surface = replace(surface, mesh=replace(surface.mesh, faces=surface.mesh.faces[:0]))
     make_parent(target)
     comments = [f"snowsplat: voxels of {surface.voxel:.4g} from {surface.photos} photos"]
     mesh_files.write_mesh(target, surface.mesh, comments)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from snowsplat.data import Dataset
+from snowsplat.data import Dataset, read_dataset
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.run.refined_cameras import with_refined
-from snowsplat.pipeline.run.training_files import read_dataset
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.distillation import MERGED_RATES

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from snowsplat.data import Dataset
+from snowsplat.data import Dataset, read_dataset, read_files
 from snowsplat.ops import device_name
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
@@ -23,7 +23,7 @@ from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import edited, stamps_of
 from snowsplat.pipeline.run.processes import Setup, count, follow, joined
 from snowsplat.pipeline.run.train_result import TrainResult
-from snowsplat.pipeline.run.training_files import read_dataset, read_dataset_files, write_beginning
+from snowsplat.pipeline.run.training_files import write_beginning
 from snowsplat.pipeline.run.training_run import Request, TrainingRun
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
@@ -172,7 +172,7 @@ class _Job:
         settings = options.dataset_settings(path)
         name = "custom" if options.config is not None else options.recipe or "default"
         config = options.configuration()
-        files = read_dataset_files(settings)
+        files = read_files(settings)
         dataset = files.dataset(settings.resolution)
         self.doubts = check_cameras(dataset, settings.path, trusted=options.trust_cameras)
         check_test_photos(dataset.test)
@@ -378,7 +378,8 @@ def _resumed_dataset(
 
     def relevant(settings: DatasetSettings) -> tuple[Any, ...]:
         resolution = max(1, settings.resolution)  # -1 is full resolution too
-        tests = settings.test_list and Path(settings.test_list).name
+        tests = settings.test_list
+        tests = Path(tests).name if isinstance(tests, str) else tests
         split = settings.hold_out, settings.first_held_out, tests
         return settings.images, resolution, split
 

@@ -62,14 +62,14 @@ _SCENE = re.compile(r"iteration_(\d+)")
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """How the dataset of a training run is read: see `snowsplat.data.load.read_dataset`."""
+    """How the dataset of a training run is read: the arguments of `snowsplat.load_dataset`."""
 
     path: str
     images: str = "images"
     resolution: int = -1
     hold_out: int | None = None
     first_held_out: int = 0
-    test_list: str | None = None
+    test_list: str | list[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -290,9 +290,8 @@ class TrainingFolder:
             return str(moved)
 
         tests = dataset.test_list
-        return replace(
-            dataset, path=today(dataset.path), test_list=None if tests is None else today(tests)
-        )
+        tests = today(tests) if isinstance(tests, str) else tests
+        return replace(dataset, path=today(dataset.path), test_list=tests)
 
     # Scenes
 

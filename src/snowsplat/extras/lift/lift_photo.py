@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from snowsplat.data import read_dataset
 from snowsplat.data.maps.depth_alignment import Alignment
 from snowsplat.data.maps.map_files import read_depth_file, to_z
 from snowsplat.evaluation.metrics import Evaluation, compare
@@ -21,7 +22,7 @@ from snowsplat.extras.lift.lift import lift
 from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.output.image_files import depth_in_color, to_8bit, write_png
-from snowsplat.pipeline.run.training_files import read_dataset, write_beginning, write_scene
+from snowsplat.pipeline.run.training_files import write_beginning, write_scene
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians

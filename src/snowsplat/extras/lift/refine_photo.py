@@ -6,14 +6,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from snowsplat.data import Dataset, ImageLoader, Points, View
+from snowsplat.data import Dataset, ImageLoader, Points, View, read_dataset
 from snowsplat.data.maps.depth_alignment import align
 from snowsplat.extras.lift.lift import lift
 from snowsplat.extras.lift.lift_photo import LiftResult, finish, read_depth
 from snowsplat.extras.lift.options import DepthSource, LiftOptions
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.run.training_files import read_dataset, write_beginning
+from snowsplat.pipeline.run.training_files import write_beginning
 from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.edit import with_sh_degree

@@ -17,13 +17,14 @@ import torch
 from torch import Tensor
 
 from snowsplat._version import __version__
+from snowsplat.data import read_files
 from snowsplat.pipeline.blocks.block_dataset import write_block_dataset
 from snowsplat.pipeline.blocks.cells import Axes, Cell
 from snowsplat.pipeline.blocks.content import block_content
 from snowsplat.pipeline.options.benchmark import PlanOptions
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.camera_check import check_cameras
-from snowsplat.pipeline.run.training_files import read_dataset_files, write_beginning
+from snowsplat.pipeline.run.training_files import write_beginning
 from snowsplat.project.training_folder import DATASET, DatasetSettings, TrainingFolder
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.training.parts.found_sky import sky_distance
@@ -140,7 +141,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         test_list=options.test_list,
     )
     settings = train_options.dataset_settings(dataset)
-    files = read_dataset_files(settings)
+    files = read_files(settings)
     whole = files.dataset(settings.resolution)
     check_cameras(whole, settings.path, trusted=True)
     if options.blocks > len(whole.train):
@@ -152,7 +153,7 @@ def _plan(dataset: Path | str, folder: Path, options: PlanOptions) -> Plan:
         )
     posed = [image for image, _ in files.images]
     if any(image.divided > 1 for image in posed):
-        original = read_dataset_files(replace(settings, resolution=-1))
+        original = read_files(replace(settings, resolution=-1))
         posed += [image for image, _ in original.images]
     axes, contents = block_content(whole, options.blocks, options.margin)
     sizes = sorted(view.camera.width * view.camera.height for view in whole.train)

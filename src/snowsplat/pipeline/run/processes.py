@@ -126,8 +126,8 @@ def follow(
     shards: Shards, device: torch.device, parts: Sequence[Part] = (), loss: Loss | None = None
 ) -> None:
     """Take part in the training of process 0, until it ends; ``parts`` and ``loss`` as there."""
+    from snowsplat.data import read_dataset
     from snowsplat.pipeline.run.collective import Collective
-    from snowsplat.pipeline.run.training_files import read_dataset
     from snowsplat.training.core.checkpoint import load
     from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.list import parts_of

@@ -1,12 +1,11 @@
-"""Reads the dataset of a training, and writes its cameras and Gaussians to a `TrainingFolder`."""
+"""Writes the cameras and Gaussians of a training to its `TrainingFolder`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-from snowsplat.data import Dataset, DatasetFiles, View, read_files
+from snowsplat.data import Dataset, View
 from snowsplat.data.points_ply import write_points
 from snowsplat.formats import write_gaussians
 from snowsplat.formats.origin_file import Place, write_place
@@ -15,16 +14,6 @@ from snowsplat.scene import camera_json
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.stored import config_to_json
-
-
-def read_dataset(settings: DatasetSettings) -> Dataset:
-    """The dataset. Raises: UserError: see `snowsplat.data.load_dataset`."""
-    return read_dataset_files(settings).dataset(settings.resolution)
-
-
-def read_dataset_files(settings: DatasetSettings) -> DatasetFiles:
-    """The files of the dataset, to load it at several resolutions; see `read_dataset`."""
-    return read_files(**asdict(settings))
 
 
 def write_beginning(

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from snowsplat.data import Dataset
+from snowsplat.data import Dataset, read_dataset
 from snowsplat.evaluation.metrics import Evaluation, evaluate_views
 from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
@@ -20,12 +20,7 @@ from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import Stamp
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
-from snowsplat.pipeline.run.training_files import (
-    read_dataset,
-    write_beginning,
-    write_cameras,
-    write_scene,
-)
+from snowsplat.pipeline.run.training_files import write_beginning, write_cameras, write_scene
 from snowsplat.pipeline.run.watchers import Watchers
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project
