@@ -12,8 +12,9 @@ from torch import Tensor
 
 import snowsplat
 from snowsplat import Camera, Gaussians, UserError, rasterization
-from snowsplat.ops import Splats2D, View, reference
+from snowsplat.ops import Splats2D, View, reference, scratch
 from snowsplat.ops.native import LAUNCHERS
+from snowsplat.scene import rasterization as module
 from snowsplat.scene.render import render
 
 from ..ops.engines import launcher
@@ -85,7 +86,11 @@ def inputs(kind: str = "RGB", count: int = 40) -> Inputs:
 
 
 def expected(
-    given: Inputs, mode: str = "RGB", degree: int | None = None, antialiased: bool = False
+    given: Inputs,
+    mode: str = "RGB",
+    degree: int | None = None,
+    antialiased: bool = False,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, list[Splats2D]]:
     """The images, alphas and splats of the reference, one camera at a time."""
     images, alphas, each = [], [], []
@@ -102,6 +107,8 @@ def expected(
             view,
         )
         splats.packed.retain_grad()
+        if absgrad:
+            splats.abs_grad = torch.zeros_like(splats.means2d)
         each.append(splats)
         image, alpha, depth = reference.rasterize(
             splats, WIDTH, HEIGHT, given.backgrounds[c], with_depth=True
@@ -370,13 +377,15 @@ def test_the_arguments_are_those_of_gsplat() -> None:
         "eps2d": 0.3,
         "sh_degree": None,
         "packed": True,
-        "tile_size": 16,
+        "tile_size": None,
         "backgrounds": None,
         "render_mode": "RGB",
         "sparse_grad": False,
         "absgrad": False,
         "rasterize_mode": "classic",
         "channel_chunk": 32,
+        "segmented": False,
+        "covars": None,
     }
     parameters = inspect.signature(snowsplat.rasterization).parameters
     found = {n: p.default for n, p in parameters.items() if p.kind is not p.VAR_KEYWORD}
@@ -389,15 +398,13 @@ def test_the_arguments_are_those_of_gsplat() -> None:
         {"camera_model": "fisheye"},
         {"camera_model": "ortho"},
         {"distributed": True},
-        {"segmented": True},
         {"sparse_grad": True},
-        {"absgrad": True},
-        {"covars": torch.zeros(40, 3, 3)},
+        {"absgrad": True, "render_mode": "RGB+D", "colors": torch.zeros(40, 4)},
+        {"extra_signals": torch.zeros(40, 2)},
         {"with_ut": True},
         {"with_eval3d": True},
         {"radial_coeffs": torch.zeros(2, 6)},
-        {"eps2d": 0.1},
-        {"rasterize_mode": "antialiased"},  # gsplat's eps2d is 0.3 here, too
+        {"eps2d": 0.0},
         {"rasterize_mode": "mip"},
         {"render_mode": "N"},
         {"sh_degree": 4},
@@ -405,21 +412,113 @@ def test_the_arguments_are_those_of_gsplat() -> None:
     ids=str,
 )
 def test_what_is_not_supported_is_refused_by_name(options: dict[str, Any]) -> None:
+    given = {**vars(inputs()), "backgrounds": None, "width": WIDTH, "height": HEIGHT}
     with pytest.raises(UserError, match=r"^rasterization: ") as caught:
-        inputs().rendered(**options)
+        rasterization(**{**given, **options})
     assert one_line(caught.value)
-    assert "eps2d" in str(caught.value) or next(iter(options)) in str(caught.value)
+    assert next(iter(options)) in str(caught.value)
     assert ";" in str(caught.value)
 
 
 @pytest.mark.isa
 def test_the_defaults_of_other_arguments_are_accepted() -> None:
     given = inputs()
-    others = {"camera_model": "pinhole", "distributed": False, "segmented": False, "covars": None}
-    speed = {"tile_size": 8, "channel_chunk": 1, "packed": False}
+
+    class RendererConfig_MixedBatch:
+        pass
+
+    others = {name: value for name, (value, _) in module._FIXED.items()}
+    others["renderer_config"] = RendererConfig_MixedBatch()
+    speed = {"tile_size": 8, "channel_chunk": 1, "packed": False, "segmented": True}
     assert torch.equal(given.rendered(**others, **speed)[0], given.rendered()[0])
     with pytest.raises(TypeError, match="no argument chanel_chunk"):
         given.rendered(chanel_chunk=3)
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize(
+    ("mode", "eps2d"), [("antialiased", 0.3), ("classic", 0.1), ("classic", 2)]
+)
+@pytest.mark.parametrize("with_covars", [False, True])
+def test_other_filters_and_covariances(
+    mode: str, eps2d: float, with_covars: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reference, "LOW_PASS", eps2d)
+    monkeypatch.setattr(reference, "MIP_LOW_PASS", eps2d)
+    given, exact = inputs().requiring_grad(), inputs().requiring_grad()
+    options = dict(vars(given), width=WIDTH, height=HEIGHT, rasterize_mode=mode, eps2d=eps2d)
+    if with_covars:
+        factors = reference._rotation_matrices(given.quats) * given.scales[:, None, :]
+        options |= {"covars": factors @ factors.mT, "quats": None, "scales": None}
+    colors, alphas, _ = rasterization(**options)
+    *wanted, _ = expected(exact, antialiased=mode == "antialiased")
+    for found, value in zip((colors, alphas), wanted, strict=True):
+        assert_close(found, value, 1e-5)
+    backward(colors, alphas)
+    backward(*wanted)
+    for name, grad in given.grads().items():
+        assert_close(grad, exact.grads()[name], 1e-4, name)
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize("packed", [True, False])
+def test_absolute_gradients(packed: bool) -> None:
+    """Those of the reference: sums over tiles."""
+    given, exact = inputs().requiring_grad(), inputs().requiring_grad()
+    colors, alphas, meta = given.rendered(packed=packed, absgrad=True)
+    assert not meta["means2d"].absgrad.any()
+    backward(colors, alphas)
+    wanted = expected(exact, absgrad=True)
+    backward(*wanted[:2])
+    found = meta["means2d"].absgrad
+    assert found.shape == meta["means2d"].shape
+    if not packed:
+        assert not found[meta["depths"] == 0].any()
+        found = found[meta["depths"] != 0]
+    assert_close(found, torch.cat([splats.abs_grad for splats in wanted[2]]), 1e-5)
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize("packed", [True, False])
+def test_edges_of_tensors(packed: bool) -> None:
+    """No Gaussians, signed scales, no colours, harmonics shared by a batch."""
+    given = inputs()
+    plain = given.rendered(packed=packed)
+    nothing = {
+        n: t[:0] for n, t in vars(given).items() if n not in ("viewmats", "Ks", "backgrounds")
+    }
+    empty = Inputs(**{**vars(given), **nothing}).rendered(packed=packed)
+    assert torch.equal(empty[0], given.backgrounds[:, None, None].expand_as(empty[0]))
+    assert not empty[1].any()
+    given.scales *= torch.tensor([1.0, -1.0, -1.0])
+    assert torch.equal(given.rendered(packed=packed)[0], plain[0])
+    depth = given.rendered(packed=packed, render_mode="D")[0]
+    given.colors = None  # type: ignore[assignment]
+    assert torch.equal(given.rendered(packed=packed, render_mode="D")[0], depth)
+    with pytest.raises(ValueError, match="colors are needed"):
+        given.rendered()
+    one = inputs("SH")
+    both = Inputs(**{n: torch.stack([t, t]) for n, t in vars(one).items()})
+    both.colors = one.colors
+    found = both.rendered(sh_degree=3, packed=packed)[0]
+    assert torch.equal(found[1], one.rendered(sh_degree=3)[0])
+
+
+def test_a_size_that_is_no_integer_breaks_no_later_call() -> None:
+    given = inputs()
+    before = given.rendered()[0]
+    with pytest.raises(ValueError, match="width and height must be int, got 30.0"):
+        rasterization(**vars(given), width=30.0, height=HEIGHT)  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        scratch.empty((3e5, 2), torch.float32)  # type: ignore[arg-type]
+    assert torch.equal(given.rendered()[0], before)
+
+
+@pytest.mark.slow
+def test_torch_compile_breaks_its_graph() -> None:
+    given = inputs()
+    call = torch.compile(lambda: given.rendered()[0], backend="eager")
+    assert torch.equal(call(), given.rendered()[0])
 
 
 def test_skewed_intrinsics_are_refused() -> None:

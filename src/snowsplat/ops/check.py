@@ -41,6 +41,8 @@ def check_float(op: str, name: str, tensor: Tensor) -> None:
 
 
 def check_size(op: str, width: int, height: int) -> None:
+    if not (isinstance(width, int) and isinstance(height, int)):
+        raise ValueError(f"{op}: width and height must be int, got {width!r} and {height!r}")
     if width < 1 or height < 1:
         raise ValueError(f"{op}: the image must be at least 1×1, got {width}×{height}")
 

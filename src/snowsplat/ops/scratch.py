@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import operator
 import threading
 from collections import deque
 from typing import Any
@@ -100,7 +101,7 @@ def empty_like(tensor: Tensor) -> Tensor:
 
 
 def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
-    return math.prod(shape) * dtype.itemsize
+    return operator.index(math.prod(shape)) * dtype.itemsize  # TypeError before the pool changes
 
 
 def _take(size: int) -> tuple[_Segment, int, int]:

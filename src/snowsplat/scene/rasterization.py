@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from snowsplat.ops.activated import project_activated, with_centres
+from snowsplat.ops.check import check_size
 from snowsplat.ops.rasterizer import rasterize
-from snowsplat.ops.splats import Splats2D
+from snowsplat.ops.reference import JACOBIAN_MARGIN
+from snowsplat.ops.splats import Splats2D, radii_of_conics
 from snowsplat.ops.view import View
+from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.util.errors import UserError
 from snowsplat.util.native_layout import TILE
 
-#: eps2d of each `rasterize_mode`: the low-pass filters of the kernels.
+#: eps2d of each `rasterize_mode` for which there are kernels. For others, and for covariances,
+#: PyTorch computes the shapes of the splats.
 _EPS2D = {"classic": 0.3, "antialiased": 0.1}
+#: The most channels, with the depth, for which the kernels sum absolute gradients.
+_ABSGRAD_CHANNELS = 4
 _RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 #: The value of each argument of gsplat that has only one here, and what to do.
 _FIXED: dict[str, tuple[Any, str]] = {
     "sparse_grad": (False, "gradients are dense; leave it out"),
-    "absgrad": (False, "use the gradient of meta['means2d'], or `ops.Splats2D.abs_grad`"),
     "distributed": (False, "train in several processes with `snowsplat train --processes`"),
     "camera_model": ("pinhole", "undistort the photos, and use pinhole cameras"),
-    "segmented": (False, "the sort has one implementation; leave it out"),
-    "covars": (None, "pass quats and scales"),
     "with_ut": (False, "leave it out, and use pinhole cameras"),
     "with_eval3d": (False, "leave it out, and use pinhole cameras"),
     "radial_coeffs": (None, "undistort the photos, and use pinhole cameras"),
@@ -35,15 +39,41 @@ _FIXED: dict[str, tuple[Any, str]] = {
     "ftheta_coeffs": (None, "undistort the photos, and use pinhole cameras"),
     "rolling_shutter": (None, "use photos of a global shutter"),
     "viewmats_rs": (None, "use photos of a global shutter"),
+    "return_normals": (False, "leave it out"),
+    "global_z_order": (True, "Gaussians are sorted by their depth; leave it out"),
+    "rays": (None, "use pinhole cameras"),
+    "lidar_coeffs": (None, "use pinhole cameras"),
+    "external_distortion_coeffs": (None, "undistort the photos, and use pinhole cameras"),
+    "ut_params": (None, "leave it out, and use pinhole cameras"),
+    "extra_signals": (None, "render them as colors, by a call of their own"),
+    "extra_signals_sh_degree": (None, "render them as colors, by a call of their own"),
+    "renderer_config": (None, "leave it out"),
 }
+#: Names of those defaults of gsplat that are objects.
+_DEFAULTS = ("RollingShutterType.GLOBAL", "RendererConfig_MixedBatch")
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
+def _outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """`torch.compile` breaks its graph at a call: it cannot look into native kernels."""
+
+    @wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if torch.compiler.is_compiling():  # `disable` takes seconds to import
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
+
+
+@_outside_graphs
 def rasterization(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -54,13 +84,16 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = TILE,
+    tile_size: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     channel_chunk: int = 32,
+    *,
+    segmented: bool = False,
+    covars: Tensor | None = None,
     **others: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians from C cameras: the arguments and results of `gsplat.rasterization`.
@@ -72,25 +105,30 @@ def rasterization(
     Args:
         means: (…, N, 3) in world units.
         quats: (…, N, 4) wxyz, not necessarily normalised.
-        scales: (…, N, 3) standard deviations, at least 0, in world units.
+        scales: (…, N, 3) standard deviations in world units; the sign does not matter.
         opacities: (…, N), in [0, 1].
         colors: without `sh_degree`, (…, N, D) or (…, C, N, D): colours or features, any numbers.
-            With `sh_degree`, (…, N, K, 3) or (…, C, N, K, 3): coefficients of spherical harmonics,
-            K ≥ (sh_degree + 1)².
+            With `sh_degree`, (N, K, 3), (…, N, K, 3) or (…, C, N, K, 3): coefficients of spherical
+            harmonics, K ≥ (sh_degree + 1)². None for depths alone.
         viewmats: (…, C, 4, 4) from the world to the camera, with the axes of OpenCV.
         Ks: (…, C, 3, 3) intrinsics, in pixels, without skew. They get no gradient.
         width, height: of the images, in pixels.
         near_plane, far_plane: Gaussians with a depth outside of these limits are not visible.
         radius_clip: Gaussians with a radius up to this one, in pixels, are not visible. The radius
             is 3 σ of the major axis.
-        eps2d: must be 0.3 for "classic" and 0.1 for "antialiased": the kernels have no others.
+        eps2d: of the low-pass filter, in pixels². For 0.3 with "classic" and 0.1 with
+            "antialiased" there are kernels; others are slower.
         sh_degree: None, or 0 to 3.
         packed: whether `meta` has rows of the visible Gaussians only. The images are the same.
-        tile_size, channel_chunk: accepted for compatibility; they change nothing.
+        tile_size, channel_chunk, segmented: accepted for compatibility; they change nothing.
         backgrounds: (…, C, D); None is black. Depths have the background 0.
         render_mode: "RGB", "D" (depth Σ T α z), "ED" (expected depth: D / alpha), "RGB+D" or
             "RGB+ED". "RGB" are the colours or features.
+        absgrad: the backward pass fills ``meta["means2d"].absgrad``, the sums of absolute gradients
+            of the centres over the tiles of 16×16 pixels. gsplat sums over pixels, which is more.
+            At most four channels, with the depth.
         rasterize_mode: "classic"; or "antialiased", which is the 2D mip filter.
+        covars: (…, N, 3, 3), used instead of quats and scales.
         others: the other arguments of gsplat; only their defaults are possible.
 
     Returns:
@@ -108,7 +146,7 @@ def rasterization(
         gradient for a density control. Also "width", "height", "tile_size", "tile_width",
         "tile_height", "n_batches" and "n_cameras", but not the lists of intersections.
 
-    Gradients flow to means, quats, scales, opacities, colors, viewmats and backgrounds.
+    Gradients flow to means, quats, scales, covars, opacities, colors, viewmats and backgrounds.
 
     Differences from gsplat: α is at most 0.99, not 0.999. The position of a camera, for the viewing
     directions, is −Rᵀ t instead of that of the inverse matrix, so the gradients of viewmats agree
@@ -121,13 +159,20 @@ def rasterization(
         ValueError: shapes, dtypes or devices do not match.
     """
     _refuse_unsupported(
-        {"sparse_grad": sparse_grad, "absgrad": absgrad, **others},
-        eps2d,
-        sh_degree,
-        render_mode,
-        rasterize_mode,
+        {"sparse_grad": sparse_grad, **others}, eps2d, sh_degree, render_mode, rasterize_mode
     )
+    check_size("rasterization", width, height)
+    with_colors, with_depth = render_mode.startswith("RGB"), render_mode != "RGB"
     *batch, n, _ = means.shape
+    if not with_colors:  # a depth needs no colours; one feature is the cheapest
+        colors, sh_degree, backgrounds = means[..., :1].detach(), None, None
+    if covars is not None:
+        quats, scales = means.new_zeros(*batch, n, 4), means.new_ones(*batch, n, 3)
+    if colors is None or quats is None or scales is None:
+        raise ValueError("rasterization: colors are needed, and quats and scales, or covars")
+    if sh_degree is not None and colors.dim() == 3:
+        colors = colors.expand(*batch, *colors.shape)
+    scales = scales.abs()
     if viewmats.dim() != len(batch) + 3:
         what = f"viewmats must be {(*batch, 'C', 4, 4)}, got {tuple(viewmats.shape)}"
         raise ValueError(f"rasterization: {what}; for one camera, C is 1: viewmats[None]")
@@ -137,6 +182,7 @@ def rasterization(
     for name, tensor, shape in (
         ("quats", quats, (*batch, n, 4)),
         ("scales", scales, (*batch, n, 3)),
+        ("covars", covars, (*batch, n, 3, 3)),
         ("opacities", opacities, (*batch, n)),
         ("colors", colors, (*(of_views if per_camera else batch), n, *row)),
         ("viewmats", viewmats, (*of_views, 4, 4)),
@@ -146,9 +192,13 @@ def rasterization(
         if tensor is not None and tuple(tensor.shape) != shape:
             raise ValueError(f"rasterization: {name} must be {shape}, got {tuple(tensor.shape)}")
 
-    with_colors, with_depth = render_mode.startswith("RGB"), render_mode != "RGB"
-    if not with_colors:  # a depth needs no colours; one feature is the cheapest
-        colors, row, per_camera, backgrounds = means[..., :1].detach(), (1,), False, None
+    if absgrad and row[-1] + (with_colors and with_depth) > _ABSGRAD_CHANNELS:
+        what = f"absgrad is supported for {_ABSGRAD_CHANNELS} channels; render fewer at a time"
+        raise UserError("rasterization: {what}", what=what)
+    if covars is None and eps2d != _EPS2D[rasterize_mode]:
+        factors = rotation_from_quat(quats) * scales[..., None, :]
+        covars = factors @ factors.mT
+    each_covars = [] if covars is None else _items(covars, 3)
     cameras = of_views[-1]
     each_means, each_scales, each_quats = (_items(t, 2) for t in (means, scales, quats))
     each_opacities, each_colors = _items(opacities, 1), _items(colors, 1 + len(row))
@@ -165,21 +215,23 @@ def rasterization(
             *(pose[:3], width, height, fx, fy, cx, cy),
             sh_degree=0 if sh_degree is None else sh_degree,
             near=near_plane,
-            antialiased=rasterize_mode == "antialiased",
+            antialiased=rasterize_mode == "antialiased" and covars is None,
         )
         b = i // cameras
-        projected.append(
-            project_activated(
-                each_means[b],
-                each_scales[b],
-                each_quats[b],
-                each_opacities[b],
-                each_colors[i if per_camera else b],
-                view,
-                far=far_plane,
-                radius_clip=radius_clip,
-            )
+        splats, means2d = project_activated(
+            each_means[b],
+            _balls(each_means[b], each_covars[b], view, eps2d) if each_covars else each_scales[b],
+            each_quats[b],
+            each_opacities[b],
+            each_colors[i if per_camera else b],
+            view,
+            far=far_plane,
+            radius_clip=0.0 if each_covars else radius_clip,
         )
+        if each_covars:
+            mip = rasterize_mode == "antialiased"
+            splats = _reshaped(splats, each_means[b], each_covars[b], view, eps2d, mip, radius_clip)
+        projected.append((splats, means2d))
     meta, centres = _meta(projected, packed, of_views, n)
     meta |= {
         "width": width,
@@ -191,6 +243,8 @@ def rasterization(
         "n_cameras": cameras,
     }
 
+    if absgrad:
+        _keep_absgrad(meta["means2d"], projected, packed)
     images, alphas = [], []
     behind = [None] * len(projected) if backgrounds is None else _items(backgrounds, 1)
     for (splats, _), means2d, background in zip(projected, centres, behind, strict=True):
@@ -217,7 +271,8 @@ def _refuse_unsupported(
         if name not in _FIXED:
             raise TypeError(f"rasterization: there is no argument {name}")
         only, remedy = _FIXED[name]
-        if value is not only and value != only:
+        names = {str(value), type(value).__name__}
+        if value is not only and value != only and names.isdisjoint(_DEFAULTS):
             raise UserError(
                 "rasterization: {name} is not supported; {remedy}", name=name, remedy=remedy
             )
@@ -227,25 +282,85 @@ def _refuse_unsupported(
     if rasterize_mode not in _EPS2D:
         what = f"rasterize_mode={rasterize_mode!r} is not supported; use {' or '.join(_EPS2D)}"
         raise UserError("rasterization: {what}", what=what)
-    if eps2d != _EPS2D[rasterize_mode]:
-        raise UserError(
-            "rasterization: eps2d={eps2d:g} is not supported with "
-            "rasterize_mode={rasterize_mode!r}; use eps2d={eps2d2:g}",
-            eps2d=eps2d,
-            rasterize_mode=rasterize_mode,
-            eps2d2=_EPS2D[rasterize_mode],
-        )
+    if not 0.0 < eps2d < math.inf:
+        raise UserError("rasterization: eps2d={eps2d} is not positive; use 0.3", eps2d=eps2d)
     if sh_degree is not None and not 0 <= sh_degree <= 3:
         raise UserError(
             "rasterization: sh_degree={sh_degree} is not supported; use 0 to 3", sh_degree=sh_degree
         )
 
 
+@torch.no_grad()
+def _balls(means: Tensor, covars: Tensor, view: View, eps2d: float) -> Tensor:
+    """Scales (N, 3) of balls that cover the Gaussians in the view, also with a wider filter."""
+    depths = means @ view.cam_from_world[2, :3].to(means) + view.cam_from_world[2, 3].to(means)
+    wider = max(0.0, eps2d - _EPS2D["classic"]) * (depths / min(view.fx, view.fy)).square()
+    return (covars.diagonal(dim1=1, dim2=2).sum(1) + wider).sqrt()[:, None].expand(-1, 3)
+
+
+def _reshaped(
+    splats: Splats2D,
+    means: Tensor,
+    covars: Tensor,
+    view: View,
+    eps2d: float,
+    mip: bool,
+    radius_clip: float,
+) -> Splats2D:
+    """The splats with the shapes of covariances (N, 3, 3) after a low-pass filter; see
+    `ops.reference.project`. ``mip``: the filter keeps the integral of a splat."""
+    assert splats.ids is not None
+    rows = splats.ids.long()
+    pose = view.cam_from_world.to(means.device, torch.float64)
+    turn = pose[:, :3]
+    x, y, z = (means[rows].double() @ turn.T + pose[:, 3]).unbind(1)
+    tx, ty = (
+        (f * at / z).clamp(-c - JACOBIAN_MARGIN * side, (1 + JACOBIAN_MARGIN) * side - c) / z
+        for at, f, c, side in (
+            (x, view.fx, view.cx, view.width),
+            (y, view.fy, view.cy, view.height),
+        )
+    )
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([view.fx / z, zero, -tx, zero, view.fy / z, -ty], 1)
+    affine = jacobian.reshape(-1, 2, 3) @ turn
+    shapes = affine @ covars[rows].double() @ affine.mT
+    xx, xy, yy = shapes[:, 0, 0], shapes[:, 0, 1], shapes[:, 1, 1]
+    sharp = (xx * yy - xy * xy).clamp_min(0.0)
+    det = sharp + eps2d * (xx + yy) + eps2d**2
+    conics = torch.stack([(yy + eps2d) / det, -xy / det, (xx + eps2d) / det], 1).to(means)
+    opacities, radii = splats.opacities, radii_of_conics(conics)
+    if mip:
+        opacities = opacities * (sharp / det).clamp_min(1e-12).sqrt().to(means)
+    opacities = torch.where(radii > radius_clip, opacities, 0.0)
+    return Splats2D.pack(
+        splats.means2d, conics, opacities, splats.depths, splats.colors, radii, splats.ids
+    )
+
+
+def _keep_absgrad(means2d: Tensor, projected: list[tuple[Splats2D, Tensor]], packed: bool) -> None:
+    """Let the backward pass fill ``means2d.absgrad``, in the shape of ``means2d``."""
+    kept = torch.zeros_like(means2d)
+    means2d.absgrad = kept  # type: ignore[attr-defined]
+    parts = kept.split([len(splats) for splats, _ in projected]) if packed else ()
+    for i, (splats, _) in enumerate(projected):
+        splats.abs_grad = parts[i] if packed else kept.new_zeros(len(splats), 2)
+
+    def fill(_: Tensor) -> None:
+        for rows, (splats, _) in zip(kept.flatten(0, -3), projected, strict=True):
+            assert splats.ids is not None
+            assert splats.abs_grad is not None
+            rows.index_copy_(0, splats.ids.long(), splats.abs_grad)
+
+    if means2d.requires_grad and not packed:
+        means2d.register_hook(fill)
+
+
 def _items(tensor: Tensor, dims: int) -> list[Tensor]:
     """The items, which have `dims` dimensions, of a batch of any dimensions."""
     if tensor.dim() == dims:
         return [tensor]
-    items = tensor.reshape(-1, *tensor.shape[tensor.dim() - dims :])
+    items = tensor.flatten(0, -dims - 1)
     # The gradient of one of several items is a copy.
     return [items.squeeze(0)] if len(items) == 1 else list(items.unbind(0))
 
@@ -293,7 +408,7 @@ def _meta(
 
     meta = {name: every_row(parts) for name, parts in columns.items()}
     meta |= dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
-    every = meta["means2d"].reshape(-1, n, 2)
+    every = meta["means2d"].flatten(0, -3)
     return meta, [every[i, own] for i, own in enumerate(rows)]
 
 
