@@ -13,7 +13,6 @@ def import_all() -> None:
     import snowsplat.extras
     import snowsplat.formats
     import snowsplat.pipeline.make
-    import snowsplat.pipeline.run.memory_use
     import snowsplat.pipeline.videos
     import snowsplat.scene.edit
     import snowsplat.sfm.colmap.reconstruct

@@ -32,6 +32,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import reading
 from snowsplat.util.safe_json import check_header
 
 # Mean and standard deviation of ImageNet's colours, converted from the range [0, 1] to [-1, 1]:
@@ -212,12 +213,9 @@ def _packaged_state(name: str) -> dict[str, Tensor]:
 
 def _read_state(path: Path) -> dict[str, Tensor]:
     try:
-        check_header(path)
-        return safetensors.torch.load_file(path)
-    except OSError as error:
-        raise UserError(
-            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
-        ) from None
+        with reading(path):
+            check_header(path)
+            return safetensors.torch.load_file(path)
     except (safetensors.SafetensorError, ValueError, KeyError):
         raise UserError(
             "{path}: not a safetensors file; see snowsplat evaluate --help for how to make one",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from snowsplat.data import ImageLoader, View
+from snowsplat.evaluation.renderings import renderings
 from snowsplat.pipeline.evaluate import Split
 from snowsplat.pipeline.options.video import panorama_width
 from snowsplat.pipeline.output import image_files
@@ -19,6 +21,7 @@ from snowsplat.pipeline.videos import level_cameras
 from snowsplat.project.training_folder import RenderedFolder
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.panorama import PanoramaRenderer
+from snowsplat.scene.pixels import to_8bit
 from snowsplat.scene.render import render
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
@@ -101,7 +104,7 @@ def render_panoramas(
         for i, camera in enumerate(places):
             with torch.no_grad():
                 image = renderer.render(scene.gaussians, camera.cam_from_world, color)
-            image_files.write_panorama(folder / f"{i:05d}.jpg", image_files.to_8bit(image))
+            image_files.write_panorama(folder / f"{i:05d}.jpg", to_8bit(image))
         rendered[folder] = len(places)
     return rendered
 
@@ -129,6 +132,7 @@ def _render(
     color = torch.tensor(scene.background, device=device)
     with_depth = depth != "none"
 
+    @torch.no_grad()
     def depth_of(camera: Camera) -> np.ndarray:
         output = render(gaussians, camera, color, with_depth=True)
         assert output.depth is not None
@@ -137,21 +141,16 @@ def _render(
     for folder in (target.renders, target.photos, *([target.depth] if with_depth else [])):
         folder.mkdir(parents=True, exist_ok=True)
     steps: dict[str, float] = {}
-    with (
-        image_files.PngQueue() as queue,
-        ImageLoader(views, device=device) as loader,
-        torch.no_grad(),
-    ):
-        loader.prefetch(views)
+    with image_files.PngQueue() as queue, ImageLoader(views, device=device) as loader:
         if depth == "color":  # one range for all images, from a sample of them
             sample = views[:: -(-len(views) // _RANGE_VIEWS)]
             near, far = image_files.depth_range([depth_of(view.camera) for view in sample])
-        for i, view in enumerate(views):
-            file = f"{i:05d}.png"
-            output = render(gaussians, view.camera, color, with_depth=with_depth)
-            queue.write(target.renders / file, image_files.to_8bit(output.image))
-            photo = loader.get(view).over(color)
-            queue.write(target.photos / file, image_files.to_8bit(photo))
+        draw = partial(render, with_depth=with_depth)
+        drawn = renderings(gaussians, views, loader, color, render=draw)
+        for i, each in enumerate(drawn):
+            file, output = f"{i:05d}.png", each.output
+            queue.write(target.renders / file, to_8bit(each.image))
+            queue.write(target.photos / file, to_8bit(each.photo))
             if output.depth is None:
                 continue
             mean = image_files.mean_depth(output.depth, output.alpha)

@@ -26,6 +26,7 @@ from snowsplat.scene.edit import seen_from_dataset
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.orientation import scene_up
 from snowsplat.scene.panorama import PanoramaRenderer, level_pose
+from snowsplat.scene.pixels import to_8bit
 from snowsplat.scene.render import render
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
@@ -262,7 +263,7 @@ class Video:
         background = torch.tensor(self.background)
         if self.around is not None:
             pose = camera.cam_from_world
-            return image_files.to_8bit(self.around.render(self.gaussians, pose, background)), None
+            return to_8bit(self.around.render(self.gaussians, pose, background)), None
         output = render(self.gaussians, camera, background, with_depth=with_depth)
         depth = None if output.depth is None else image_files.mean_depth(output.depth, output.alpha)
-        return image_files.to_8bit(output.image), depth
+        return to_8bit(output.image), depth

@@ -21,7 +21,8 @@ from snowsplat.extras.image.options import FitOptions
 from snowsplat.extras.image.svg import write_svg
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.image_files import to_8bit, write_png
+from snowsplat.pipeline.output.image_files import write_png
+from snowsplat.scene.pixels import to_8bit
 from snowsplat.training.core.progress import Progress
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError

@@ -22,13 +22,15 @@ from PIL import Image
 from snowsplat.data import ImageLoader
 from snowsplat.evaluation.lpips import Lpips
 from snowsplat.evaluation.metrics import Evaluation
+from snowsplat.evaluation.renderings import renderings
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.evaluate import evaluate
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.output.scene_source import TrainedScene, load_trained
 from snowsplat.pipeline.train import resume, train
 from snowsplat.project.training_folder import TrainingFolder
-from snowsplat.scene.render import render
+from snowsplat.scene.pixels import to_8bit
+from snowsplat.training.core.history import History
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path, write_json
 from snowsplat.util.interrupts import ended_by_signals, ended_together
@@ -154,7 +156,8 @@ def work(job: Job, device: str | None, threads: int | None) -> None:
         trained_now = resume(output, options, dataset=job.dataset)
     else:
         trained_now = train(job.dataset, output, options)
-    seconds = time.monotonic() - begin + _seconds_of_steps(output) - trained_now.seconds
+    history = History.read(TrainingFolder(output).history, trained_now.step)  # of all runs
+    seconds = time.monotonic() - begin + history.seconds - trained_now.seconds
     memory = peak_bytes()
     trained = load_trained(output, dataset=job.dataset, compute=compute)
     evaluation = evaluate(trained, lpips=lpips)
@@ -176,23 +179,15 @@ def work(job: Job, device: str | None, threads: int | None) -> None:
     write_json(job.result, asdict(result))
 
 
-def _seconds_of_steps(output: Path) -> float:
-    """The duration of the steps of all runs."""
-    history = read_json(TrainingFolder(output).history)
-    return float(sum(stretch["seconds"] for stretch in history["stretches"]))
-
-
 def _write_worst(trained: TrainedScene, evaluation: Evaluation, file: Path) -> str:
     """Write the picture `WORST`; returns the name of the view."""
     worst = min(evaluation.views, key=lambda view: view.psnr)
     [view] = [view for view in trained.dataset.test if view.name == worst.name]
-    device = trained.gaussians.means.device
-    color = torch.tensor(trained.background, device=device)
-    with ImageLoader([view], background=trained.background) as loader, torch.no_grad():
-        photo = loader.get(view).rgb.cpu().numpy()
-        image = render(trained.gaussians, view.camera.to(device), color).image
-    rendered = image.clamp(0, 1).mul(255).round().to(torch.uint8).cpu().numpy()
-    both = Image.fromarray(np.concatenate([photo, rendered], axis=1))
+    color = torch.tensor(trained.background, device=trained.gaussians.means.device)
+    with ImageLoader([view], device=color.device) as loader:
+        (drawn,) = renderings(trained.gaussians, [view], loader, color)
+    pixels = [to_8bit(image) for image in (drawn.photo, drawn.image)]
+    both = Image.fromarray(np.concatenate(pixels, axis=1))
     both.thumbnail((2 * _SIDE, _SIDE))
     with atomic_path(file) as temporary:
         both.save(temporary, "JPEG", quality=85)

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
+from snowsplat.scene.pixels import in_colors
 from snowsplat.trajectory.spherical_metadata import panorama_xmp
 from snowsplat.util.files import atomic_path
 
@@ -20,11 +21,6 @@ _DEPTH_COLORS = np.array(
     np.float32,
 )
 _MIN_ALPHA = 0.5  # below this alpha, a pixel mostly shows the background, which has no depth
-
-
-def to_8bit(image: Tensor) -> np.ndarray:
-    """(H, W, 3) in 0..1 -> uint8, rounded to the nearest."""
-    return (image.clamp(0.0, 1.0) * 255.0 + 0.5).byte().contiguous().cpu().numpy()
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
@@ -74,11 +70,8 @@ def depth_in_color(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """
     with np.errstate(divide="ignore"):
         t = (1.0 / depth - 1.0 / far) / (1.0 / near - 1.0 / far)
-    position = np.clip(np.nan_to_num(t), 0.0, 1.0) * (len(_DEPTH_COLORS) - 1)
-    low = np.minimum(position.astype(np.int64), len(_DEPTH_COLORS) - 2)
-    share = (position - low)[:, :, None]
-    color = _DEPTH_COLORS[low] * (1.0 - share) + _DEPTH_COLORS[low + 1] * share
-    return np.where(depth[:, :, None] > 0, np.rint(color), 0.0).astype(np.uint8)
+    color = in_colors(np.nan_to_num(t), _DEPTH_COLORS)
+    return np.where(depth[:, :, None] > 0, color, 0.0).astype(np.uint8)
 
 
 class PngQueue:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
 
 from snowsplat.data import ImageLoader, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
+from snowsplat.evaluation.renderings import Rendering, renderings
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import render
+from snowsplat.scene.pixels import in_colors, to_8bit
 from snowsplat.util.messages import Message, message
 
 #: Number of views that are shown, of those with the lowest and the highest PSNR.
@@ -59,48 +59,23 @@ def compared(
         groups = {message("Photo, rendering, error"): order}
     by_name = {view.name: view for view in views}
     with ImageLoader(views, device=gaussians.means.device) as loader:
-        return [
-            (
-                title,
-                [
-                    _compared(gaussians, color, by_name[one.name], one, loader)
-                    for one in chosen
-                    if one.name in by_name
-                ],
-            )
-            for title, chosen in groups.items()
-        ]
+
+        def all_of(chosen: list[ViewMetrics]) -> list[Compared]:
+            known = [metrics for metrics in chosen if metrics.name in by_name]
+            drawn = renderings(gaussians, [by_name[each.name] for each in known], loader, color)
+            return [_compared(*pair) for pair in zip(drawn, known, strict=True)]
+
+        return [(title, all_of(chosen)) for title, chosen in groups.items()]
 
 
-def _compared(
-    gaussians: Gaussians, color: Tensor, view: View, metrics: ViewMetrics, loader: ImageLoader
-) -> Compared:
-    loaded = loader.get(view)
-    photo = loaded.over(color)
-    with torch.no_grad():
-        image = render(gaussians, view.camera, color).image.clamp(0.0, 1.0)
-    difference = (image - photo).abs().mean(2)
-    if loaded.mask is not None:
-        difference = torch.where(loaded.mask, difference, 0.0)
-    images = {
-        "photo": _bytes(photo),
-        "rendering": _bytes(image),
-        "error": _error_in_color(difference.cpu().numpy()),
-    }
-    return Compared(view.name, metrics, {what: reduced(each) for what, each in images.items()})
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return (image * 255.0 + 0.5).byte().contiguous().cpu().numpy()
-
-
-def _error_in_color(difference: np.ndarray) -> np.ndarray:
-    """(H, W) in 0..1 -> (H, W, 3) uint8."""
-    position = np.clip(difference / WHITE_ERROR, 0.0, 1.0) * (len(_ERROR_COLORS) - 1)
-    low = np.minimum(position.astype(np.int64), len(_ERROR_COLORS) - 2)
-    share = (position - low)[:, :, None]
-    color = _ERROR_COLORS[low] * (1.0 - share) + _ERROR_COLORS[low + 1] * share
-    return np.rint(color).astype(np.uint8)
+def _compared(drawn: Rendering, metrics: ViewMetrics) -> Compared:
+    difference = (drawn.image - drawn.photo).abs().mean(2)
+    if drawn.mask is not None:
+        difference = torch.where(drawn.mask, difference, 0.0)
+    error = in_colors(difference.cpu().numpy() / WHITE_ERROR, _ERROR_COLORS).astype(np.uint8)
+    images = {"photo": to_8bit(drawn.photo), "rendering": to_8bit(drawn.image), "error": error}
+    reduced_images = {what: reduced(each) for what, each in images.items()}
+    return Compared(drawn.view.name, metrics, reduced_images)
 
 
 def reduced(pixels: np.ndarray) -> Image.Image:
