@@ -74,13 +74,13 @@ def test_no_chinese_text_is_left_of_a_message_that_does_not_exist(tool, keys):
 
 def test_the_text_of_a_message_is_a_template(tool):
     """Neither an f-string, whose values are lost, nor an error that is rendered too early."""
-    wrong = []
+    keywords, wrong = tool.keywords(SOURCE), []
     for file in SOURCE.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call):
                 continue
             name = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            if name in ("warning", "info") or name not in {*tool.KEYWORDS, "Reason", "note"}:
+            if name in ("warning", "info") or name not in {*keywords, "Reason", "note"}:
                 continue
             if getattr(getattr(node.func, "value", None), "id", "") == "cut":  # not for people
                 continue
@@ -89,6 +89,13 @@ def test_the_text_of_a_message_is_a_template(tool):
                 if isinstance(each, ast.JoinedStr) or rendered:
                     wrong.append(f"{file.relative_to(SOURCE)}:{node.lineno}")
     assert wrong == []
+
+
+def test_the_texts_of_all_errors_are_messages(tool):
+    """Also of errors that are derived from others: Damaged, of Unsupported, of UserError."""
+    keywords = tool.keywords(SOURCE)
+    assert keywords["Damaged"] == keywords["UserError"]
+    assert keywords["_InUse"] == keywords["SettingError"]
 
 
 def test_values_are_rendered_in_the_language_of_the_message(chinese):

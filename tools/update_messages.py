@@ -19,9 +19,8 @@ from babel.messages.pofile import read_po, write_po
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "snowsplat"
 LANGUAGE = "zh"
 # The calls whose first text is a message. For others: the positions of the texts.
-_ERRORS = ("UserError", "Problem", "InUse", "Diverged", "OtherScene", "ProcessLost", "NoPosesError")
-_CALLS = ("message", "needed", "warning", "info", *_ERRORS, "NoSpace", "UnknownScene")
-KEYWORDS = dict.fromkeys(_CALLS) | {"plural": (1, 2), "SettingError": (2,), "_InUse": (2,)}
+_CALLS = ("message", "needed", "warning", "info", "UserError", "Problem")
+_KEYWORDS = dict.fromkeys(_CALLS) | {"plural": (1, 2), "SettingError": (2,)}
 
 Key = str | tuple[str, str]
 
@@ -31,7 +30,7 @@ def messages_of(source: Path = SOURCE) -> Iterator[tuple[str, Key]]:
     found = extract_from_dir(
         source,
         [("**.py", "python"), ("**.html.j2", "jinja2.ext:babel_extract")],
-        keywords=KEYWORDS | {"t": None},
+        keywords=keywords(source) | {"t": None},
         comment_tags=(),
     )
     for file, _, key, _, _ in found:
@@ -41,6 +40,25 @@ def messages_of(source: Path = SOURCE) -> Iterator[tuple[str, Key]]:
             parts = Path(file).parts
             yield parts[0] if len(parts) > 1 else "snowsplat", key
     yield from _allowed(source)
+
+
+def keywords(source: Path) -> dict[str, tuple[int, ...] | None]:
+    """The calls with texts: an error takes its text as the class from which it is derived."""
+    bases = {
+        node.name: [getattr(base, "id", "") for base in node.bases]
+        for file in source.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    }
+    found: dict[str, tuple[int, ...] | None] = dict(_KEYWORDS)
+    while new := {
+        name: found[base]
+        for name, each in bases.items()
+        for base in each
+        if base in found and name not in found
+    }:
+        found |= new
+    return found
 
 
 @cache

@@ -173,7 +173,7 @@ def _spz(
         write_spz(path, GaussianArrays.from_gaussians(make_scene(30, 2)), max(version, 2))
         if version == 4:
             return
-        columns = unpack(path, path.read_bytes()).columns
+        columns = unpack(path.read_bytes()).columns
         if version == 1:
             columns[0] = bytes(range(30)) * 6
         head = struct.pack("<4sIIBBBB", b"NGSP", version, 30, 2, 12, 0x80 if links else 0, 0)

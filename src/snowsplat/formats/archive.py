@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats.compressed_ply import is_compressed_ply, read_compressed_ply
-from snowsplat.formats.damage import Damaged, reads
+from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.ply import is_ply, is_scene, read_ply
 from snowsplat.formats.sog import read_sog
 from snowsplat.formats.zip_members import ZipMembers
-from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import parse_json, quoted
@@ -97,20 +96,16 @@ def _single(path: Path, members: ZipMembers, names: Sequence[str]) -> GaussianAr
     if len(scenes) == 1:
         return found[0]
     if scenes:
-        raise UserError(
-            "{path}: contains {scenes} scenes; unzip it, and use {some}",
-            path=path,
+        raise Unsupported(
+            "contains {scenes} scenes; unzip it, and use {some}",
             scenes=len(scenes),
             some=_some(scenes),
         )
     others = [name for name in names if name.lower().endswith(_OTHER_SCENES)]
     if others:
-        raise UserError(
-            "{path}: a zip file; unzip it, and use {some}", path=path, some=_some(others)
-        )
-    raise UserError(
-        "{path}: a zip file without a scene; it contains {some}",
-        path=path,
+        raise Unsupported("a zip file; unzip it, and use {some}", some=_some(others))
+    raise Unsupported(
+        "a zip file without a scene; it contains {some}",
         some=_some(names) or message("nothing"),
     )
 

@@ -25,11 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.formats.damage import reads
+from snowsplat.formats.damage import Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.ply import is_antialiased, placement_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
-from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_bytes
 from snowsplat.util.ply import PlyTable, header_of, open_table
 
@@ -65,17 +64,15 @@ def read_compressed_ply(path: Path, data: bytes | None = None) -> GaussianArrays
     missing = [n for n in _WORDS if vertices.columns.get(n) != "u4"]
     missing += [n for n in _GEOMETRY_BOUNDS if n not in chunks.columns]
     if missing:
-        raise UserError(
-            "{path}: not a supported compressed PLY file; it has no {missing}",
-            path=path,
+        raise Unsupported(
+            "not a supported compressed PLY file; it has no {missing}",
             missing=missing[0],
         )
     n = vertices.count
     if chunks.count * _CHUNK < n:
-        raise UserError(
-            "{path}: the compressed PLY file has only {count} chunks for {number} Gaussians; it "
+        raise Unsupported(
+            "the compressed PLY file has only {count} chunks for {number} Gaussians; it "
             "is damaged, export it again",
-            path=path,
             count=chunks.count,
             number=n,
         )
@@ -114,10 +111,9 @@ def _read_sh(path: Path, vertices: PlyTable, data: bytes | None) -> np.ndarray:
     k = len(table.columns) // 3
     names = [f"f_rest_{i}" for i in range(3 * k)]
     if k not in SH_REST_COUNTS or list(table.columns) != names or table.count != n:
-        raise UserError(
-            "{path}: the 'sh' element of the compressed PLY file has {columns} properties of "
+        raise Unsupported(
+            "the 'sh' element of the compressed PLY file has {columns} properties of "
             "{count} Gaussians; expected 9, 24 or 45 of {number}",
-            path=path,
             columns=len(table.columns),
             count=table.count,
             number=n,

@@ -16,14 +16,19 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class Damaged(UserError):
+class Unsupported(UserError):
+    """The file cannot be read as it is. A function that `reads` adds the path."""
+
+
+class Damaged(Unsupported):
     """The file is damaged. A function that `reads` adds the path, and what to do."""
 
 
 def reads(
     function: Callable[Concatenate[Path, P], T],
 ) -> Callable[Concatenate[Path | str, P], T]:
-    """Decorates a function that reads a file, its first argument; it may raise `Damaged`, OSError.
+    """Decorates a function that reads a file, its first argument; it may raise `Unsupported`,
+    OSError.
 
     NumPy does not warn of numbers that are not finite: such Gaussians are left out at the end.
     """
@@ -37,5 +42,7 @@ def reads(
             raise UserError(
                 "{path}: {error}; copy or export it again", path=path, error=error
             ) from None
+        except Unsupported as error:
+            raise UserError("{path}: {error}", path=path, error=error) from None
 
     return named

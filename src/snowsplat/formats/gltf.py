@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats import glb, packing
-from snowsplat.formats.damage import Damaged, reads
+from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.glb import Document
 from snowsplat.formats.spz import parse_spz
@@ -87,9 +87,8 @@ def read_gltf(path: Path) -> GaussianArrays:
             )
         parts = _parts(path, document, notes)
         if not parts and EXTENSION not in document.json.get("extensionsUsed", []):
-            raise UserError(
-                "{path}: a glTF file without Gaussian splats ({extension})",
-                path=path,
+            raise Unsupported(
+                "a glTF file without Gaussian splats ({extension})",
                 extension=EXTENSION,
             )
         if _are_logarithms([part.log_scales for part, _ in parts]):

@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from snowsplat.formats.archive import first_member
-from snowsplat.formats.damage import Damaged, reads
+from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
-from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +44,7 @@ def read_checkpoint(path: Path) -> GaussianArrays:
         inner = [name for name in members.names() if name.endswith(_METADATA)]
         if len(inner) != 1 or len(members.read(inner[0], 1)) > _METADATA_LIMIT:
             raise Damaged("not a plausible checkpoint of PyTorch")
-    splats = _splats(path, _load(path))
+    splats = _splats(_load(path))
     arrays = [_array(path, splats[name]) for name in _NAMES if name in splats]
     means, scales, quats, opacities, sh0 = arrays[:5]
     n = len(means)
@@ -56,9 +55,7 @@ def read_checkpoint(path: Path) -> GaussianArrays:
     if shapes != [(n, 3), (n, 3), (n, 4), (n,), (n, 1, 3)] or shN.shape != (n, rest, 3):
         raise Damaged("its tensors do not have the shapes of Gaussians")
     if rest not in [(degree + 1) ** 2 - 1 for degree in range(11)]:
-        raise UserError(
-            "{path}: {rest} SH coefficients do not match an SH degree", path=path, rest=rest
-        )
+        raise Unsupported("{rest} SH coefficients do not match an SH degree", rest=rest)
     if rest > SH_REST_COUNTS[-1]:
         logger.warning("%s: its SH degree is reduced to 3", path)
     _name_other_ranks(path)
@@ -76,31 +73,26 @@ def _load(path: Path) -> Any:
         raise Damaged("a checkpoint that cannot be loaded safely, or a damaged one") from None
 
 
-def _splats(path: Path, content: Any) -> dict[Any, Any]:
-    """The tensors by name. Raises: UserError: another kind of checkpoint."""
+def _splats(content: Any) -> dict[Any, Any]:
+    """The tensors by name. Raises: Unsupported: another kind of checkpoint."""
     splats = content.get("splats", content) if isinstance(content, dict) else None
     if isinstance(splats, dict) and all(name in splats for name in _NAMES[:4]):
         if "sh0" in splats:
             return splats
-        raise UserError(
-            "{path}: a checkpoint of gsplat whose colours are a network (app_opt); train without "
+        raise Unsupported(
+            "a checkpoint of gsplat whose colours are a network (app_opt); train without "
             "it, or save a .ply",
-            path=path,
         )
     if isinstance(content, tuple | list):
-        raise UserError(
-            "{path}: a checkpoint of the reference implementation; use its point_cloud.ply",
-            path=path,
+        raise Unsupported(
+            "a checkpoint of the reference implementation; use its point_cloud.ply",
         )
     if isinstance(content, dict) and "pipeline" in content:
-        raise UserError(
-            "{path}: a checkpoint of nerfstudio; ns-export gaussian-splat makes a .ply", path=path
-        )
+        raise Unsupported("a checkpoint of nerfstudio; ns-export gaussian-splat makes a .ply")
     missing = [name for name in _NAMES[:5] if not isinstance(splats, dict) or name not in splats]
-    raise UserError(
-        "{path}: a checkpoint of PyTorch without the Gaussians of gsplat (no {missing} in "
+    raise Unsupported(
+        "a checkpoint of PyTorch without the Gaussians of gsplat (no {missing} in "
         "splats); save a .ply in the program that made it",
-        path=path,
         missing=", ".join(missing),
     )
 

@@ -27,10 +27,9 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.formats.damage import Damaged, reads
+from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
-from snowsplat.util.errors import UserError
 
 _HEADER_BYTES = 4096
 _SECTION_HEADER_BYTES = 1024
@@ -63,10 +62,9 @@ def read_ksplat(path: Path) -> GaussianArrays:
         raise Damaged("too short for a .ksplat file")
     major, minor, section_count, level = struct.unpack_from("<BB2xI12xH", data)
     if major != 0 or minor < 1 or level >= len(_TYPES):
-        raise UserError(
-            "{path}: not a supported .ksplat file (version {major}.{minor}, compression level "
+        raise Unsupported(
+            "not a supported .ksplat file (version {major}.{minor}, compression level "
             "{level}); supported is version 0.1 with levels 0 to 2",
-            path=path,
             major=major,
             minor=minor,
             level=level,

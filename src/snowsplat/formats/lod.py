@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from snowsplat.formats.damage import Damaged, reads
+from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.sog import read_stored, sog_files
 from snowsplat.util.errors import UserError
@@ -108,9 +108,7 @@ def read_index(path: Path) -> LodIndex:
         raise Damaged("{error}", error=error) from None
     try:
         if meta.get("version", 1) != 1:  # the first files had no version
-            raise UserError(
-                "{path}: version {meta}; supported is 1", path=path, meta=quoted(meta["version"])
-            )
+            raise Unsupported("version {meta}; supported is 1", meta=quoted(meta["version"]))
         levels, names = meta["lodLevels"], meta["filenames"]
         environment = meta.get("environment")
         leaves = list(_leaves(meta["tree"], _number(levels, 1, _MOST_LEVELS), len(names)))
@@ -166,9 +164,7 @@ def _file(path: Path, name: Any) -> Path:
             raise ValueError
         found = inside(path.parent, name)
     if found is None:
-        raise UserError(
-            "{path}: refers to a file outside of its folder ({name})", path=path, name=quoted(name)
-        )
+        raise Unsupported("refers to a file outside of its folder ({name})", name=quoted(name))
     return found
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from snowsplat.formats.damage import Unsupported
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.scene.sh_constants import SH_C0
-from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
 
@@ -35,20 +35,18 @@ _RARE = 0.001  # share of Gaussians, see `Cut`
 _SMALLEST_SCALE = 1e-12  # replaces a standard deviation of 0, which has no logarithm
 
 
-def check_count(path: Path, count: int, file_size: int) -> None:
+def check_count(count: int, file_size: int) -> None:
     """Compare the number of Gaussians that a compressed file declares with its size in bytes.
 
     This is done before memory is allocated. Real scenes take five bytes per Gaussian or more in
     any format. A few bytes can declare millions of equal Gaussians, and each takes up to 600 bytes
     of memory while the file is read.
 
-    Raises: UserError: more Gaussians than bytes, and more than `ALWAYS_ALLOWED`.
+    Raises: Unsupported: more Gaussians than bytes, and more than `ALWAYS_ALLOWED`.
     """
     if count > max(ALWAYS_ALLOWED, file_size):
-        raise UserError(
-            "{path}: a file of {file_size} bytes declares {count} Gaussians; it is damaged or "
-            "malicious",
-            path=path,
+        raise Unsupported(
+            "a file of {file_size} bytes declares {count} Gaussians; it is damaged or malicious",
             file_size=file_size,
             count=count,
         )

@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
+from snowsplat.formats.damage import Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, float32_gaussians, unusable
 from snowsplat.formats.packing import FLAT
 from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, Origin, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
-from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 from snowsplat.util.ply import PlyTable, header_of, open_table
 
@@ -80,7 +80,8 @@ def _missing(table: PlyTable) -> list[str]:
     return [name for name in missing if not (colored and name in _DC)]
 
 
-def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
+@reads
+def read_ply(path: Path, data: bytes | None = None) -> GaussianArrays:
     """Read a scene of any SH degree; coefficients beyond degree 3 are ignored.
 
     The properties may have any order and any type. Unknown properties are ignored. NaN and infinity
@@ -94,9 +95,8 @@ def read_ply(path: Path | str, data: bytes | None = None) -> GaussianArrays:
     table = open_table(path, data=data)
     if missing := _missing(table):
         shown = ", ".join(missing[:4]) + (", …" if len(missing) > 4 else "")
-        raise UserError(
-            "{path}: a PLY file without 3D Gaussians; missing properties: {shown}",
-            path=path,
+        raise Unsupported(
+            "a PLY file without 3D Gaussians; missing properties: {shown}",
             shown=shown,
         )
     stored = _rest_count(table)
@@ -158,10 +158,9 @@ def _rest_count(table: PlyTable) -> int:
         or len(rest) // 3 not in counts
         or set(rest) != set(_rest_names(len(rest) // 3))
     ):
-        raise UserError(
-            "{path}: {rest} f_rest properties do not match an SH degree; expected 0, 9, 24, 45 "
+        raise Unsupported(
+            "{rest} f_rest properties do not match an SH degree; expected 0, 9, 24, 45 "
             "or 72, numbered from 0",
-            path=table.path,
             rest=len(rest),
         )
     return len(rest) // 3

@@ -77,7 +77,7 @@ def read_stored(path: Path) -> GaussianArrays:
     with Bundle(path) as files:
         meta = files.meta()
         layout = _layout(meta)
-        packing.check_count(path, layout.count, files.bytes_with(layout.files.values()))
+        packing.check_count(layout.count, files.bytes_with(layout.files.values()))
         arrays = _decode(files, layout)
     antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
     scene = float32_gaussians(*arrays, antialiased=antialiased)

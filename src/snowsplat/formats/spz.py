@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.formats import packing
-from snowsplat.formats.damage import reads
+from snowsplat.formats.damage import Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.spz_container import (
     ANTIALIASED,
@@ -38,7 +38,6 @@ from snowsplat.formats.spz_container import (
     unpack,
 )
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
-from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_bytes
 
 __all__ = ["WRITTEN_VERSIONS", "is_spz", "parse_spz", "read_spz", "spz_version", "write_spz"]
@@ -81,7 +80,7 @@ def read_spz(path: Path) -> GaussianArrays:
 @reads
 def parse_spz(path: Path, data: bytes) -> GaussianArrays:
     """The scene in the content ``data`` of a file, as `read_spz`; ``path`` is for messages."""
-    contents = unpack(path, data)
+    contents = unpack(data)
     header, columns = contents.header, contents.columns
     if header.sh_degree > 3:
         logger.warning("%s: SH degree %d is reduced to 3", path, header.sh_degree)
@@ -109,7 +108,7 @@ def parse_spz(path: Path, data: bytes) -> GaussianArrays:
         (color.astype(np.float32)[:, None] - 127.5) / _COLOR_STEP,
         (sh_rest.astype(np.float32) - 128) / 128,
     )
-    scene = packing.flip_axes(stored, _signs(path, contents.extensions))
+    scene = packing.flip_axes(stored, _signs(contents.extensions))
     return usable_gaussians(path, *scene, antialiased=bool(header.flags & ANTIALIASED))
 
 
@@ -130,10 +129,10 @@ def _leaves(path: Path, rows: list[np.ndarray], children: np.ndarray) -> list[np
 @reads
 def spz_version(path: Path) -> str:
     """The version of a file that `read_spz` accepts."""
-    return str(read_header(path, path.read_bytes()).version)
+    return str(read_header(path.read_bytes()).version)
 
 
-def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
+def _signs(extensions: bytes) -> tuple[int, int, int]:
     """1 or −1 for each axis: the factors that convert the frame of the file to that of PLY."""
     start = 0
     while start + 8 <= len(extensions):
@@ -141,10 +140,9 @@ def _signs(path: Path, extensions: bytes) -> tuple[int, int, int]:
         if kind == _FRAME_EXTENSION and size == 4 and start + 12 <= len(extensions):
             (number,) = struct.unpack_from("<I", extensions, start + 8)
             if number > len(_FRAMES):
-                raise UserError(
-                    "{path}: SPZ coordinate system {number} (swapped y and z axes) is not "
+                raise Unsupported(
+                    "SPZ coordinate system {number} (swapped y and z axes) is not "
                     "supported; export the file with the default coordinate system RUB",
-                    path=path,
                     number=number,
                 )
             axes = _FRAMES[number - 1] if number else "RUB"

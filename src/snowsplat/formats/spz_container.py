@@ -14,13 +14,11 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
-from pathlib import Path
 
 import zstandard
 
-from snowsplat.formats.damage import Damaged
+from snowsplat.formats.damage import Damaged, Unsupported
 from snowsplat.formats.packing import check_count
-from snowsplat.util.errors import UserError
 
 #: Bits of `Header.flags`.
 ANTIALIASED = 1
@@ -85,34 +83,34 @@ def is_of_spark(data: bytes) -> bool:
     return data.startswith(_SPARK)
 
 
-def read_header(path: Path, data: bytes) -> Header:
+def read_header(data: bytes) -> Header:
     """The header of the file content ``data``.
 
-    Raises: UserError: another version, a damaged header, or an implausible number of Gaussians.
+    Raises: Unsupported: another version, a damaged header, or an implausible number of Gaussians.
     """
     head = data
     try:
         if data.startswith(_GZIP):
             head = zlib.decompressobj(31).decompress(data, _HEAD.size)
-        return _header(path, head, len(data))
+        return _header(head, len(data))
     except (zlib.error, struct.error):
         raise _damaged() from None
 
 
-def unpack(path: Path, data: bytes) -> Contents:
+def unpack(data: bytes) -> Contents:
     """The columns of the file content ``data``.
 
-    Raises: UserError: see `read_header`; or the file is damaged or truncated.
+    Raises: Unsupported: see `read_header`; or the file is damaged or truncated.
     """
     try:
-        return _unpack(path, data)
+        return _unpack(data)
     except (zlib.error, zstandard.ZstdError, struct.error):
         raise _damaged() from None
 
 
-def _unpack(path: Path, data: bytes) -> Contents:
+def _unpack(data: bytes) -> Contents:
     if not data.startswith(_GZIP):
-        header = _header(path, data, len(data))
+        header = _header(data, len(data))
         if header.version > 3:
             return _unpack_streams(data, header)
         body = data[_HEAD.size :]
@@ -120,7 +118,7 @@ def _unpack(path: Path, data: bytes) -> Contents:
     else:
         stream = zlib.decompressobj(31)
         head = stream.decompress(data, _HEAD.size)
-        header = _header(path, head, len(data))
+        header = _header(head, len(data))
         size = _body_bytes(header)
         # The checksum is only verified at the end of the stream.
         body = stream.decompress(stream.unconsumed_tail, size + _EXTENSION_LIMIT)
@@ -141,20 +139,19 @@ def _body_bytes(header: Header) -> int:
     return (sum(header.columns()) + links) * header.count
 
 
-def _header(path: Path, head: bytes, file_size: int) -> Header:
+def _header(head: bytes, file_size: int) -> Header:
     if not head.startswith(_MAGIC):
-        raise UserError("{path}: not an .spz file; its content does not begin with NGSP", path=path)
+        raise Unsupported("not an .spz file; its content does not begin with NGSP")
     _, *values, _ = _HEAD.unpack_from(head)
     header = Header(*values)
     if not 1 <= header.version <= 4:
-        raise UserError(
-            "{path}: version {version} of .spz; supported are 1 to 4",
-            path=path,
+        raise Unsupported(
+            "version {version} of .spz; supported are 1 to 4",
             version=header.version,
         )
     if header.sh_degree > 4 or header.fractional_bits > 31:
         raise _damaged()
-    check_count(path, header.count, file_size)
+    check_count(header.count, file_size)
     return header
 
 

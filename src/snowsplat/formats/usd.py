@@ -25,7 +25,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.archive import first_member
-from snowsplat.formats.damage import reads
+from snowsplat.formats.damage import Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.gltf import place_in_scene
 from snowsplat.scene.length import stored_metres
@@ -97,9 +97,7 @@ def read_usd(path: Path) -> GaussianArrays:
                 matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
                 parts.append(place_in_scene(_splats(prim), matrix))
     if not parts:
-        raise UserError(
-            "{path}: a USD file without Gaussian splats (ParticleField3DGaussianSplat)", path=path
-        )
+        raise Unsupported("a USD file without Gaussian splats (ParticleField3DGaussianSplat)")
     scene = GaussianArrays.cat(parts)
     found = usable_gaussians(path, *packing.flip_axes(replace(scene, means=scene.world_means())))
     # A file of ours is in metres; another unit is that of another program that has edited it.

@@ -35,8 +35,8 @@ class WrongPart(UserError):
         received: the number of bytes that have arrived.
     """
 
-    def __init__(self, message: str, received: int) -> None:
-        super().__init__(message)
+    def __init__(self, path: Path | str, received: int) -> None:
+        super().__init__("{path}: {n} bytes of it have arrived", path=path, n=received)
         self.received = received
 
 
@@ -113,7 +113,7 @@ def write_part(scene: StudioScene, file: Upload, data: bytes) -> int:
     if part.is_file() and before == size:  # all was written, and then the process was killed
         end, data = size, b""
     elif file.received != before or end > size:
-        raise WrongPart(f"{path}: {before} bytes of it have arrived", before)
+        raise WrongPart(path, before)
     free = shutil.disk_usage(target.parent).free
     if size - before + _RESERVE > free:
         raise NoSpace(

@@ -41,7 +41,7 @@ _HEADER = "snowsplat"
 _NAME = re.compile(r"step_(\d+)\.safetensors")
 
 
-class Unusable(UserError):
+class InvalidCheckpoint(UserError):
     """The content of a file is not that of a checkpoint of this version, or damaged."""
 
 
@@ -130,7 +130,7 @@ def load(path: Path | str) -> Checkpoint:
     """Read a checkpoint and verify its checksums.
 
     Raises:
-        Unusable: the file is truncated, damaged, not finite, not a checkpoint, or has another
+        InvalidCheckpoint: the file is truncated, damaged, not finite, not a checkpoint, or has another
             version.
         UserError: the file is missing or cannot be read; it may be valid.
     """
@@ -143,7 +143,7 @@ def load(path: Path | str) -> Checkpoint:
                 text = metadata[_HEADER].encode("utf-8", "replace")
                 header = parse_json(text)
                 if header["version"] != VERSION:
-                    raise Unusable(
+                    raise InvalidCheckpoint(
                         "{path}: checkpoint of version {header}, this program reads version "
                         "{version}; resume with the snowsplat that wrote it",
                         path=path,
@@ -166,11 +166,15 @@ def load(path: Path | str) -> Checkpoint:
         ValueError,
         OverflowError,
     ):
-        raise Unusable("{path}: not a checkpoint, or damaged; use another one", path=path) from None
+        raise InvalidCheckpoint(
+            "{path}: not a checkpoint, or damaged; use another one", path=path
+        ) from None
     if not intact:
-        raise Unusable("{path}: damaged, checksums do not match; use another one", path=path)
+        raise InvalidCheckpoint(
+            "{path}: damaged, checksums do not match; use another one", path=path
+        )
     if found := _rows_not_finite(arrays):
-        raise Unusable(
+        raise InvalidCheckpoint(
             "{path}: non-finite values in {listed}; remove it and resume from an earlier one",
             path=path,
             listed=rows_text(found),
@@ -186,7 +190,7 @@ def latest(folder: Path | str) -> Checkpoint | None:
     for _, path in files(folder):
         try:
             return load(path)
-        except Unusable as error:
+        except InvalidCheckpoint as error:
             warnings.warn(f"{error}; using the previous one", stacklevel=2)
     return None
 
