@@ -130,8 +130,8 @@ def load(path: Path | str) -> Checkpoint:
     """Read a checkpoint and verify its checksums.
 
     Raises:
-        InvalidCheckpoint: the file is truncated, damaged, not finite, not a checkpoint, or has another
-            version.
+        InvalidCheckpoint: the file is truncated, damaged, not finite, not a checkpoint, or has
+            another version.
         UserError: the file is missing or cannot be read; it may be valid.
     """
     path = Path(path)
