@@ -234,14 +234,14 @@ def test_masked_and_transparent_pixels_are_unknown(dataset: Dataset, tmp_path: P
 
 def test_only_depths_that_another_map_confirms_are_used(dataset: Dataset) -> None:
     maps, sources = maps_of(dataset)
-    confirmed = confirmed_pixels(maps, sources)
+    confirmed = confirmed_pixels(maps, sources, torch.device("cpu"))
     assert all(float(chosen.float().mean()) > 0.5 for chosen in confirmed)
     wrong = maps[2]
     assert wrong is not None
     inverse = wrong.inverse_depth.clone()
     inverse[:30] *= 1.1
     maps[2] = replace(wrong, inverse_depth=inverse)
-    confirmed = confirmed_pixels(maps, sources)
+    confirmed = confirmed_pixels(maps, sources, torch.device("cpu"))
     assert float(confirmed[2][:30].float().mean()) < 0.1
     assert float(confirmed[2][32:].float().mean()) > 0.5
 

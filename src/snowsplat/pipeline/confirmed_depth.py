@@ -81,7 +81,7 @@ def confirm_by_photos(
     for number in range(_SWEEPS):
         report(number, _SWEEPS, "comparisons of photos")
         swept = swept_maps(pictures, ranges, sources)
-        for i, known in enumerate(confirmed_pixels(swept, sources)):
+        for i, known in enumerate(confirmed_pixels(swept, sources, points.device)):
             each, finer = swept[i], found[i]
             if each is not None:
                 inverse = each.inverse_depth.masked_fill_(~known, 0.0)  # not used again

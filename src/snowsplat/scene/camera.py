@@ -95,9 +95,10 @@ class Camera:
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project world points (P, 3) to pixel positions (P, 2) and depths (P,), the camera's z.
 
-        The position of a point is meaningless if its depth is not positive.
+        The position of a point is meaningless if its depth is not positive. The results are on the
+        device of the points.
         """
-        x_cam = transform_points(self.cam_from_world.to(points.dtype), points)
+        x_cam = transform_points(self.cam_from_world.to(points), points)
         depth = x_cam[:, 2]
         focal, centre = points.new_tensor([[self.fx, self.fy], [self.cx, self.cy]])
         return x_cam[:, :2] / depth[:, None] * focal + centre, depth

@@ -16,6 +16,7 @@ import torch
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 from torch import Tensor
+from torch.nn.functional import pad
 
 from snowsplat.data.lens.coverage import covered_pixels
 from snowsplat.data.lens.resample import resample
@@ -195,12 +196,14 @@ def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
         return image
     height, width = image.planes.shape[1:]
     size = max(1, width // factor), max(1, height // factor)
-    planes = torch.from_numpy(resize_area(image.planes.numpy(), *size))
-    mask = None
-    if image.mask is not None:
-        shares = resize_area(image.mask.numpy()[None].astype(np.uint8) * 255, *size)
-        mask = torch.from_numpy(shares[0] == 255)
-    return LoadedImage(planes, mask)
+
+    def reduced(planes: Tensor) -> Tensor:
+        if planes.device.type == "cpu":
+            return torch.from_numpy(resize_area(planes.numpy(), *size))
+        return resize_area_on_gpu(planes, *size)
+
+    mask = None if image.mask is None else reduced(image.mask[None].to(torch.uint8) * 255)
+    return LoadedImage(reduced(image.planes), None if mask is None else mask[0] == 255)
 
 
 def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -220,6 +223,36 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
         rows = _mean_over_columns(plane, width)
         out[...] = np.rint(_mean_over_columns(rows.T, height).T)
     return resized
+
+
+def resize_area_on_gpu(planes: Tensor, width: int, height: int) -> Tensor:
+    """As `resize_area`, with the same values: each number is rounded in the same operations."""
+    old_height, old_width = planes.shape[1:]
+    if (old_width, old_height) == (width, height):
+        return planes
+    rows, columns = old_height // height, old_width // width
+    if (rows * height, columns * width) == (old_height, old_width):
+        boxes = planes.reshape(-1, height, rows, width, columns)
+        area = rows * columns
+        # Pillow divides by a product with 2²⁴ / area, rounded down.
+        sums = boxes.sum((2, 4), dtype=torch.int64) + area // 2
+        return (sums * ((1 << 24) // area) >> 24).to(torch.uint8)
+    transposed = planes.to(torch.float64).transpose(1, 2).contiguous()
+    means = _mean_over_rows(transposed, width).transpose(1, 2).contiguous()
+    return _mean_over_rows(means, height).round().to(torch.uint8)
+
+
+def _mean_over_rows(values: Tensor, count: int) -> Tensor:
+    """(C, H, W) float64 to (C, count, W): means over equal intervals of each column."""
+    size = values.shape[1]
+    edges = np.arange(count + 1) * (size / count)
+    whole = np.minimum(edges.astype(np.int64), size - 1)
+    part = torch.from_numpy(edges - whole).to(values.device)[:, None]
+    at = torch.from_numpy(whole).to(values.device)
+    # A GPU adds up along this dimension from the first row to the last one.
+    integral = pad(values.cumsum(1), (0, 0, 1, 0))
+    at_edges = integral[:, at] + part * values[:, at]
+    return at_edges.diff(dim=1) * (count / size)
 
 
 def _decode(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:
@@ -291,7 +324,8 @@ def _planes(image: Image.Image, path: Path) -> np.ndarray:
     planes: np.ndarray = np.empty((len(mode), image.height, image.width), np.uint8)
     rows = max(1, _BAND_PIXELS // image.width)
     for top in range(0, image.height, rows):
-        band = image.crop((0, top, image.width, min(top + rows, image.height)))
+        whole = rows >= image.height
+        band = image if whole else image.crop((0, top, image.width, min(top + rows, image.height)))
         pixels = np.asarray(to_srgb(band, path))
         planes[:, top : top + rows] = pixels if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
     if transparent and planes[3].min() == 255:

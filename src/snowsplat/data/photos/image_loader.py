@@ -1,7 +1,8 @@
 """Images for training: decoded ahead in background threads and cached within a memory budget.
 
 The result of `ImageLoader.get` depends only on the files, not on the order of threads or on the
-content of the cache: after a cache miss, the same file is decoded again.
+content of the cache: after a cache miss, the same file is decoded again. On a GPU, each file is
+decoded once if the memory permits: the photos stay there at full size, and are reduced there.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from snowsplat.data.dataset import View
 from snowsplat.data.photos.decode import ImageSource, LoadedImage, box_downscale, load_views
 from snowsplat.util.machine import available_memory_bytes
 
-#: Default number of threads that decode ahead.
+#: Default number of threads that decode ahead. A GPU waits for them, and leaves the processor free.
 DECODERS = min(4, os.cpu_count() or 1)
+_DECODERS_FOR_GPU = min(8, os.cpu_count() or 1)
+_FACTORS = (1, 2, 4)
 
 _Key = tuple[ImageSource, ImageSource | None, int]  # image, mask, downscale factor
 
@@ -33,6 +36,11 @@ class Photos(Protocol):
     @property
     def budget_bytes(self) -> int:
         """Memory for decoded images."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the images are."""
         ...
 
     def prefetch(self, order: Iterable[View], downscale: int | None = None) -> None:
@@ -57,7 +65,10 @@ class ImageLoader:
         background: RGB in 0..1. Transparent images are composited over it; None keeps their alpha.
         budget_bytes: memory for decoded images; None uses half of the memory available now.
         device: where images are stored and returned; None is the CPU.
-        threads: number of threads that decode ahead; None uses `DECODERS`.
+        threads: number of threads that decode ahead; None uses `DECODERS`, or more for a GPU.
+
+    Attributes:
+        decodes_once: whether all images stay on a GPU, at full size and reduced.
     """
 
     def __init__(
@@ -72,12 +83,14 @@ class ImageLoader:
     ) -> None:
         self.views = list(views)
         self.level = level
-        self._device = device or torch.device("cpu")
+        self.device = device or torch.device("cpu")
         if budget_bytes is None:
-            budget_bytes = available_memory(self._device) // 2
+            budget_bytes = available_memory(self.device) // 2
         self.budget_bytes = budget_bytes
+        on_gpu = self.device.type == "cuda"
+        self.decodes_once = on_gpu and self._fits(*_FACTORS)
         self._background = None if background is None else tuple(float(c) for c in background)
-        self._threads = threads or DECODERS
+        self._threads = threads or (_DECODERS_FOR_GPU if on_gpu else DECODERS)
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="snowsplat-images")
         self._lock = threading.RLock()
         self._cache: OrderedDict[_Key, LoadedImage] = OrderedDict()  # least recently used first
@@ -104,7 +117,8 @@ class ImageLoader:
         that requests it raises the error.
         """
         with self._lock:
-            self._queue = deque(self._key(view, downscale) for view in order)
+            factor = 1 if self.decodes_once else downscale
+            self._queue = deque(self._key(view, factor) for view in order)
             wanted = set(self._queue)
             self._ahead = {key: size for key, size in self._ahead.items() if key in wanted}
             self._submit_queued()
@@ -131,6 +145,11 @@ class ImageLoader:
                 self._submit_queued()
                 return image
             running = self._running.get(key)
+        if self.decodes_once and key[2] > 1:
+            image = box_downscale(self.get(view, 1), key[2])
+            with self._lock:
+                self._store(key, image)
+            return image
         # If no thread decodes it yet, decode it in this thread instead of waiting for the queue.
         image = running.result() if running is not None else self._decode(key)
         with self._lock:
@@ -161,7 +180,7 @@ class ImageLoader:
 
     def _key(self, view: View, factor: int | None) -> _Key:
         factor = self.level if factor is None else factor
-        if factor not in (1, 2, 4):
+        if factor not in _FACTORS:
             raise ValueError(f"downscale must be 1, 2 or 4, not {factor}")
         return view.image, view.mask, factor
 
@@ -187,16 +206,16 @@ class ImageLoader:
         """Images of views of one photo, at one downscale factor."""
         with self._lock:
             whole = [self._cache.get((source, mask, 1)) for source, mask, _ in keys]
-        if any(image is None or image.planes.device.type != "cpu" for image in whole):
+        if any(image is None for image in whole):
             sources = [(source, mask) for source, mask, _ in keys]
             whole = [*load_views(sources, self._background)]
         factor = keys[0][2]
-        return [box_downscale(image, factor).to(self._device) for image in whole if image]
+        return [box_downscale(image.to(self.device), factor) for image in whole if image]
 
-    def _fits(self, factor: int) -> bool:
-        """Whether all views stay in the cache, so that none is resampled in vain."""
-        sizes = (_estimated_bytes((view.image, view.mask, factor)) for view in self.views)
-        return sum(sizes) <= self.budget_bytes
+    def _fits(self, *factors: int) -> bool:
+        """Whether all views stay in the cache at these sizes, so that no work is done in vain."""
+        keys = ((view.image, view.mask, factor) for view in self.views for factor in factors)
+        return sum(map(_estimated_bytes, keys)) <= self.budget_bytes
 
     def _next_of(self, key: _Key) -> list[_Key]:
         """The views of the same photo that directly follow in the order, as many as may be decoded

@@ -165,6 +165,8 @@ class Run:
             device=self.device,
         )
         self.photos: Photos = self.images
+        if self.images.decodes_once and shards.size == 1:
+            self.images.prefetch(dataset.train)  # the start needs most of them
         fixed = DatasetCameras(dataset, self.device)
         self.dataset_cameras: Sequence[Camera] = fixed.on_device
         self.cameras: Cameras = fixed

@@ -37,11 +37,13 @@ def regions_of(cells: Tensor) -> Tensor:
     A region is a set of cells each of which has a side in common with another one.
     """
     axis, side, column, row = _places_of(cells)
-    place = torch.full((COUNT,), len(cells)).index_put_((cells,), torch.arange(len(cells)))
+    device = cells.device
+    place = torch.full((COUNT,), len(cells), device=device)
+    place.index_put_((cells,), torch.arange(len(cells), device=device))
     # A cell beyond the edge of a face is on the next face.
     steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
     beside = [place[cells_of(_directions(axis, side, column + x, row + y))] for x, y in steps]
-    region = torch.arange(len(cells) + 1)  # the last one stands for all other cells
+    region = torch.arange(len(cells) + 1, device=device)  # the last one stands for all other cells
     while True:
         lowest = torch.stack([region[:-1], *(region[next_to] for next_to in beside)]).amin(0)
         if torch.equal(lowest, region[:-1]):
@@ -58,7 +60,7 @@ def _places_of(cells: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _directions(axis: Tensor, side: Tensor, column: Tensor, row: Tensor) -> Tensor:
     """(M, 3) float32, unit vectors: the middles of the cells at these places."""
     u, v = (torch.tan(((at + 0.5) * (2.0 / SIDE) - 1.0) * (math.pi / 4)) for at in (column, row))
-    directions = torch.zeros(len(axis), 3)
+    directions = u.new_zeros(len(axis), 3)
     directions.scatter_(1, axis[:, None], side[:, None].to(torch.float32))
     directions.scatter_(1, (axis[:, None] + 1) % 3, u[:, None])
     directions.scatter_(1, (axis[:, None] + 2) % 3, v[:, None])
@@ -69,7 +71,7 @@ def median_of(group: Tensor, values: Tensor) -> Tensor:
     """(COUNT, C): the lower median of the rows (M, C) of each cell (M,); 0 without rows."""
     counts = torch.bincount(group, minlength=COUNT)
     middle = counts.cumsum(0) - counts + (counts - 1).clamp(min=0) // 2
-    medians = torch.zeros(len(counts), values.shape[1])
+    medians = torch.zeros(len(counts), values.shape[1], device=values.device)
     for channel in range(values.shape[1]):
         column = values[:, channel]
         order = torch.argsort(column, stable=True)
@@ -82,6 +84,6 @@ def spread_of(group: Tensor, positions: Tensor) -> Tensor:
     """(COUNT,): the root mean square distance of the positions (M, 3) of a cell from their
     mean."""
     number = torch.bincount(group, minlength=COUNT).clamp(min=1)[:, None]
-    mean = torch.zeros(COUNT, 3).index_add_(0, group, positions) / number
+    mean = positions.new_zeros(COUNT, 3).index_add_(0, group, positions) / number
     squares = (positions - mean[group]).square().sum(1)
-    return (torch.zeros(COUNT).index_add_(0, group, squares) / number[:, 0]).sqrt()
+    return (squares.new_zeros(COUNT).index_add_(0, group, squares) / number[:, 0]).sqrt()

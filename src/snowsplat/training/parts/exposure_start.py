@@ -112,17 +112,20 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
 
 
 def _log_colors(views: Sequence[View], xyz: Tensor, step: int, images: Photos) -> Tensor:
-    """(V, P, 3) float64: logs of the colours of every ``step``-th point; NaN: not usable."""
+    """(V, P, 3) float64 on the CPU: logs of the colours of every ``step``-th point; NaN: not
+    usable.
+    """
     size = max(max(view.camera.width, view.camera.height) for view in views)
     downscale = next((factor for factor in (4, 2) if size >= factor * _SIDE), 1)
     images.prefetch(views, downscale)
-    black, logs = torch.zeros(3), []
+    xyz = xyz.to(images.device)
+    black, logs = xyz.new_zeros(3), []
     for view in views:
         colors, known = point_colors(view, images, xyz[::step], black, downscale)
         known = known & _visible(view.camera, xyz)[::step]
         usable = known[:, None] & (colors >= _DARKEST) & (colors <= _BRIGHTEST)
         logs.append(torch.where(usable, colors.to(torch.float64).log(), torch.nan))
-    return torch.stack(logs)
+    return torch.stack(logs).cpu()
 
 
 def _visible(camera: Camera, xyz: Tensor) -> Tensor:

@@ -62,12 +62,13 @@ def in_far_regions(
     region_of_cell = regions_of(different)
     region = region_of_cell[own]
     directions, origins = directions_of(cells), offsets[photos]
-    far = _residuals(region, photos, colors, cells_of(directions @ _TURN))
+    turn = _TURN.to(directions)
+    far = _residuals(region, photos, colors, cells_of(directions @ turn))
     best, best_near = torch.full_like(far, torch.inf), torch.full_like(far, torch.inf)
     for radius in _RADII:
         distance = _distances(origins, directions, radius * depth)
         inside = distance > 0.0
-        there = cells_of((origins + distance[:, None] * directions) @ _TURN)
+        there = cells_of((origins + distance[:, None] * directions) @ turn)
         found = _residuals(region, photos, colors, torch.where(inside, there, -1))
         best = torch.minimum(best, found)
         if radius <= _NEAR:
@@ -123,4 +124,4 @@ def _residuals(region: Tensor, photos: Tensor, colors: Tensor, cells: Tensor) ->
 def _means(group: Tensor, values: Tensor, count: int) -> Tensor:
     """(count, C): the mean of the rows (M, C) of each group (M,); 0 without rows."""
     number = torch.bincount(group, minlength=count).clamp(min=1)[:, None]
-    return torch.zeros(count, values.shape[1]).index_add_(0, group, values) / number
+    return values.new_zeros(count, values.shape[1]).index_add_(0, group, values) / number

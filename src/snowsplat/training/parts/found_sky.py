@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -75,9 +75,10 @@ class Sky:
         directions: (M, 3) float32, unit vectors in the world frame: the middles of the cells.
         colors: (M, 3) uint8.
         share: the share of the photos that shows the sky.
-        middle: (3,) float32, the middle of the cameras.
+        middle: (3,) float32, the middle of the cameras, on the device of the photos.
         distance: of the sky from there, in world units.
-        views: cameras of reduced photos, and where they show the sky, (H, W) bool.
+        views: cameras of reduced photos, and where they show the sky, (H, W) bool; on the device
+            of the photos. The other tensors are on the CPU.
     """
 
     directions: Tensor
@@ -96,13 +97,8 @@ class Sky:
         behind = torch.tensor(background or (torch.inf,) * 3) * 255.0
         needed = ((self.colors - behind).abs() > _BACKGROUND).any(1).nonzero()[:, 0]
         chosen = needed[:: math.ceil(len(needed) / most) or 1]
-        xyz = self.middle + self.distance * self.directions[chosen]
+        xyz = self.middle.cpu() + self.distance * self.directions[chosen]
         return Points(xyz, self.colors[chosen])
-
-    def to(self, device: torch.device) -> Sky:
-        """This with the middle and the views on ``device``."""
-        views = [(camera.to(device), sky.to(device)) for camera, sky in self.views]
-        return replace(self, middle=self.middle.to(device), views=views)
 
     def is_before(self, xyz: Tensor) -> Tensor:
         """(N,) bool: the points (N, 3) in the world frame, on the device of the views, that are not
@@ -133,29 +129,33 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
     """
     if dataset.points is None:
         return None
+    device = images.device
     views = dataset.train[:: math.ceil(len(dataset.train) / _VIEWS)]
-    points = dataset.points.xyz.cpu()
-    points = points[:: max(1, len(points) // _POINTS)]
+    points = dataset.points.xyz
+    points = points[:: max(1, len(points) // _POINTS)].to(device)
     cameras = [view.camera for view in dataset.train]
     up = _up(cameras)
-    samples = in_threads(lambda view: _Sample.of(view, images, points, up), views)
+    # A basis of the horizontal plane; small decompositions are slow on a GPU.
+    axes = torch.linalg.svd(up[None])[2][1:].to(device)
+    up = up.to(device)
+    samples = in_threads(lambda view: _Sample.of(view, images, points, up, axes), views, device)
     cell = torch.cat([sample.cells for sample in samples])
     color = torch.cat([sample.colors for sample in samples])
     depths = torch.cat([sample.depths for sample in samples])
     if not len(depths):
         return None
     depth = float(depths.median())
-    number = torch.tensor([len(sample.cells) for sample in samples])
-    photo = torch.arange(len(samples)).repeat_interleave(number)
+    number = [len(sample.cells) for sample in samples]
+    photo = torch.arange(len(samples)).repeat_interleave(torch.tensor(number)).to(device)
     origin, _ = _offsets(cameras)
     positions = torch.stack([view.camera.position.cpu() for view in views])
-    offsets = (positions - origin).to(torch.float32)
+    offsets = (positions - origin).to(device, torch.float32)
     middle = median_of(cell, color)
     same = ((color - middle[cell]).abs() <= _SAME).all(1)
     shown = torch.bincount(cell, minlength=COUNT)
     agreeing = torch.bincount(cell[same], minlength=COUNT)
     is_sky = (
-        (directions_of(torch.arange(COUNT)) @ up > -_BELOW_THE_HORIZON)
+        (directions_of(torch.arange(COUNT, device=device)) @ up > -_BELOW_THE_HORIZON)
         & (agreeing >= _FEWEST_VIEWS)
         & (agreeing >= _LEAST_AGREEMENT * shown)
         & (spread_of(cell[same], offsets[photo[same]]) >= _LEAST_BASELINE * depth)
@@ -172,14 +172,14 @@ def find_sky(dataset: Dataset, images: Photos, distance: float = 0.0) -> Sky | N
         return None
     found = cell[confirmed].unique()
     masks = [
-        (sample.camera, sample.mask(part))
-        for sample, part in zip(samples, confirmed.split(number.tolist()), strict=True)
+        (sample.camera.to(device), sample.mask(part))
+        for sample, part in zip(samples, confirmed.split(number), strict=True)
     ]
     return Sky(
-        directions_of(found),
-        middle[found].round().to(torch.uint8),
+        directions_of(found).cpu(),
+        middle[found].round().to(torch.uint8).cpu(),
         share,
-        origin.to(torch.float32),
+        origin.to(device, torch.float32),
         distance or sky_distance(cameras),
         masks,
     )
@@ -222,7 +222,13 @@ class _Sample:
     plain: Tensor
 
     @staticmethod
-    def of(view: View, images: Photos, points: Tensor, up: Tensor) -> _Sample:
+    def of(view: View, images: Photos, points: Tensor, up: Tensor, axes: Tensor) -> _Sample:
+        """
+        Args:
+            points: (P, 3) in the world frame, on the device of the photos; so are the others.
+            up: (3,), away from the ground.
+            axes: (2, 3), unit vectors perpendicular to it and to each other.
+        """
         scale = min(1.0, _PIXELS / ANGLE / max(view.camera.fx, view.camera.fy))
         width, height = (
             max(1, round(scale * side)) for side in (view.camera.width, view.camera.height)
@@ -234,7 +240,7 @@ class _Sample:
         contrast = max_pool2d(detail, fine) + max_pool2d(-detail, fine)
         x, y, depth = _pixels(camera, points)
         visible = depth > 0.0
-        scene = torch.zeros(1, 1, height, width)
+        scene = torch.zeros(1, 1, height, width, device=images.device)
         scene[0, 0, y[visible], x[visible]] = 1.0
         reach = math.ceil(_AROUND * _PIXELS)
         near = max_pool2d(scene, 2 * reach + 1, stride=1, padding=reach)[0, 0] > 0.0
@@ -242,34 +248,37 @@ class _Sample:
         usable = usable_pixels(photo)
         if usable is not None:
             used, near = used & usable, near & usable
-        cells = cells_of(_rays(camera))
+        cells = cells_of(_rays(camera, images.device))
         cell, own = cells[used].unique(return_inverse=True)
-        total = torch.zeros(len(cell), 3).index_add_(0, own, photo.rgb[used].to(torch.float32))
-        pixels = torch.full((height, width), -1).masked_scatter_(used, own)
+        color = photo.rgb[used].to(torch.float32)
+        total = color.new_zeros(len(cell), 3).index_add_(0, own, color)
+        pixels = torch.full_like(cells, -1).masked_scatter_(used, own)
         colors = total / torch.bincount(own, minlength=len(cell))[:, None]
         scene_light = photo.rgb[near].to(torch.float32).mean(1).sort().values
         darker = torch.searchsorted(scene_light, colors.mean(1))
-        overcast = (darker > _DARKER * len(scene_light)) & _is_open(cell, cells[near], up)
+        overcast = (darker > _DARKER * len(scene_light)) & _is_open(
+            cell, cells[near], up, axes
+        )
         plain = (contrast <= _PLAIN).all(1)[0]
         shown = len(cells.unique())
         return _Sample(camera, cell, colors, overcast, depth[visible], shown, pixels, plain)
 
     def mask(self, confirmed: Tensor) -> Tensor:
         """(H, W) bool: the plain pixels of the cells (M,) bool, without those at their borders."""
-        sky = torch.cat([confirmed, torch.zeros(1, dtype=torch.bool)])[self.pixels] & self.plain
+        sky = torch.cat([confirmed, confirmed.new_zeros(1)])[self.pixels] & self.plain
         return max_pool2d((~sky)[None, None].float(), 3, stride=1, padding=1)[0, 0] == 0.0
 
 
-def _is_open(cells: Tensor, scene: Tensor, up: Tensor) -> Tensor:
+def _is_open(cells: Tensor, scene: Tensor, up: Tensor, axes: Tensor) -> Tensor:
     """(M,) bool: the cells (M,) that have none of the cells ``scene`` (S,) above."""
-    east, north = torch.linalg.svd(up[None])[2][1:]
+    east, north = axes
 
     def azimuth_and_height(cells: Tensor) -> tuple[Tensor, Tensor]:
         directions = directions_of(cells)
         azimuth = torch.atan2(directions @ north, directions @ east) + math.pi
         return (azimuth / (2.0 * ANGLE)).long(), directions @ up
 
-    highest = torch.full((math.ceil(math.pi / ANGLE) + 1,), -torch.inf)
+    highest = up.new_full((math.ceil(math.pi / ANGLE) + 1,), -torch.inf)
     highest.scatter_reduce_(0, *azimuth_and_height(scene), "amax")
     azimuth, height = azimuth_and_height(cells)
     return height > highest[azimuth]
@@ -284,11 +293,10 @@ def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return x, y, torch.where(inside, depth, 0.0)
 
 
-def _rays(camera: Camera) -> Tensor:
+def _rays(camera: Camera, device: torch.device) -> Tensor:
     """(H, W, 3) float32: the directions of the pixels in the world frame; not unit vectors."""
-    y, x = torch.meshgrid(
-        torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
-    )
+    sides = camera.height, camera.width
+    y, x = torch.meshgrid([torch.arange(n, device=device) + 0.5 for n in sides], indexing="ij")
     right, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-    rotation = camera.world_from_cam[:, :3].cpu().to(torch.float32)
+    rotation = camera.world_from_cam[:, :3].to(right)
     return torch.stack([right, down, torch.ones_like(right)], dim=2) @ rotation.T

@@ -83,9 +83,9 @@ class NearLimit(Part):
         cameras = [camera.to(cpu) for camera in run.dataset_cameras]
         points = run.dataset.points.xyz.to(cpu, torch.float64)
         used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
-        unseen = unseen_cameras(used, _sample(points, _PAIRING))
+        unseen = unseen_cameras(used, _sample(points, _PAIRING).to(device))
         sample = _sample(points, _POINTS)
-        nearest = in_threads(lambda camera: nearest_depth(camera, sample), used + unseen)
+        nearest = in_threads(lambda camera: nearest_depth(camera, sample), used + unseen, cpu)
         limits = [self.share * depth for depth in nearest]
         views = [(c, limit) for c, limit in zip(used + unseen, limits, strict=True) if limit > 0.0]
         if not views:
@@ -126,7 +126,7 @@ class NearLimit(Part):
 def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:
     """Cameras between each camera and others that show the same points, and on its other side.
 
-    ``points``: (P, 3) in the world frame, a sample of the scene.
+    ``points``: (P, 3) in the world frame, a sample of the scene; on the device that computes.
     """
     partners = source_views(cameras, points, _PARTNERS)
     return [

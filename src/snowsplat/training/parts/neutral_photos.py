@@ -30,6 +30,11 @@ class NeutralPhotos:
         """See `ImageLoader`."""
         return self._images.budget_bytes
 
+    @property
+    def device(self) -> torch.device:
+        """See `Photos`."""
+        return self._images.device
+
     def prefetch(self, order: Iterable[View], downscale: int | None = None) -> None:
         """See `ImageLoader.prefetch`."""
         self._images.prefetch(order, downscale)

@@ -190,7 +190,7 @@ def normal_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> Te
     known = length > _SAME
     usable = usable_pixels(photo_for_map(view, images, longer_side))
     if usable is not None:
-        known &= usable
+        known &= usable.cpu()
     return torch.where(known, found / length, 0.0)
 
 

@@ -63,15 +63,14 @@ class SkyPart(Part):
                     share=share,
                 )
             )
-            self.sky = found.to(run.device)
+            self.sky = found
 
     def points(self, run: Run, points: Points) -> Points:
         """The points that are not before the sky, and points in it."""
         if self.sky is None:
             return points
-        sky = self.sky.to(points.xyz.device)
-        far = sky.points(most_sky_points(run.config.points_per_start), run.background.fixed)
-        kept = ~sky.is_before(points.xyz)
+        far = self.sky.points(most_sky_points(run.config.points_per_start), run.background.fixed)
+        kept = ~self.sky.is_before(points.xyz.to(run.device)).cpu()
         return Points(
             torch.cat([points.xyz[kept], far.xyz]), torch.cat([points.rgb[kept], far.rgb])
         )

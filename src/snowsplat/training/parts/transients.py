@@ -144,9 +144,9 @@ class Transients(Part):
             render=sharded_render(run.shards, with_depth=True),
         )
         maps = [cell_map(each) for each in shown]
-        found = _moving_cells(maps, [~self.masks[i] for i in used], self._mode)
+        found = _moving_cells(maps, [~self.masks[i].to(run.device) for i in used], self._mode)
         for i, cells in zip(used, found, strict=True):
-            self.masks[i] = ~cells
+            self.masks[i] = ~cells.cpu()
 
     def target(self, run: Run, view: BatchView, photo: LoadedImage) -> LoadedImage:
         """The photo, at any size, with the mask of the user and that of what moves."""
@@ -286,7 +286,7 @@ def _dilated(cells: Tensor) -> Tensor:
 
 def large_residual(residuals: Sequence[Tensor]) -> float:
     """The smallest large residual, for the residuals of the cells of all views."""
-    every = torch.cat([residual.flatten() for residual in residuals])
+    every = torch.cat([residual.flatten() for residual in residuals]).cpu()
 
     def quantile(share: float) -> float:
         return float(every.kthvalue(round(share * (len(every) - 1)) + 1).values)

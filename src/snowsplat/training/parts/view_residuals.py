@@ -38,7 +38,7 @@ _PLAIN = 1e-4
 
 @dataclass(frozen=True)
 class CellMap:
-    """The cells of one view, on the CPU."""
+    """The cells of one view, on the device of its rendering."""
 
     residual: Tensor  # (h, w) float32 in 0..1, largest of the channels; 0 at masked cells
     correlation: Tensor  # (h, w) float32 in -1..1, of photo and rendering around each cell
@@ -63,12 +63,11 @@ def cell_map(rendering: Rendering) -> CellMap:
         output.alpha[None],
         output.depth[None],
     ]
-    pooled = [adaptive_avg_pool2d(plane, size).cpu() for plane in planes]
-    seen, shown, opaque, z = pooled
-    usable = torch.ones(size, dtype=torch.bool)
+    seen, shown, opaque, z = (adaptive_avg_pool2d(plane, size) for plane in planes)
+    usable = torch.ones(size, dtype=torch.bool, device=z.device)
     if rendering.mask is not None:
         mask = rendering.mask[None].to(torch.float32)
-        usable = adaptive_avg_pool2d(mask, size)[0].cpu() == 1.0
+        usable = adaptive_avg_pool2d(mask, size)[0] == 1.0
     residual = torch.where(usable, _residual(seen, shown, usable), 0.0)
     known = (opaque[0] >= _OPAQUE) & (z[0] > 0.0)
     correlation = _correlation(output.image.mean(2), target.mean(0), size)
@@ -104,7 +103,7 @@ def _residual(image: Tensor, photo: Tensor, usable: Tensor) -> Tensor:
 def _correlation(image: Tensor, photo: Tensor, size: tuple[int, int]) -> Tensor:
     """(h, w): the correlation of two images (H, W) in the 3 × 3 cells around each cell."""
     moments = torch.stack([image, photo, image * image, photo * photo, image * photo])
-    moments = adaptive_avg_pool2d(moments, size).cpu()
+    moments = adaptive_avg_pool2d(moments, size)
     x, y, xx, yy, xy = avg_pool2d(moments, 3, stride=1, padding=1, count_include_pad=False)
     variances = (xx - x * x).clamp_min(0.0) * (yy - y * y).clamp_min(0.0)
     return (xy - x * y) / variances.sqrt().clamp_min(_PLAIN)
@@ -116,22 +115,24 @@ def residuals_elsewhere(
     """For each map, the usual residual (h, w) of its places in other views, and the number (h, w)
     of these views. The residual is infinite if there are none.
 
-    ``ignored``: (h, w) bool for each map, cells that do not count in other views.
+    ``ignored``: (h, w) bool for each map, cells that do not count in other views; on the device of
+    the maps.
     """
     cameras = [cells.places.camera for cells in maps]
     positions = torch.stack([camera.position for camera in cameras])
     to_image = torch.stack([camera.intrinsics @ camera.cam_from_world for camera in cameras])
-    to_image = to_image.to(torch.float32)
     size = torch.tensor([[camera.width, camera.height] for camera in cameras])
     # The cells of all maps, one after the other.
     start = size.prod(1).cumsum(0) - size.prod(1)
+    device = maps[0].residual.device
+    to_image, size, start = to_image.to(device, torch.float32), size.to(device), start.to(device)
     inverse_depth = torch.cat([cells.places.inverse_depth.flatten() for cells in maps])
     residual = torch.cat([cells.residual.flatten() for cells in maps])
     residual[torch.cat([cells.flatten() for cells in ignored])] = torch.nan
     found = []
     for i, cells in enumerate(maps):
         order = torch.argsort((positions - positions[i]).norm(dim=1), stable=True)
-        others = order[order != i][:_NEIGHBOURS]
+        others = order[order != i][:_NEIGHBOURS].to(device)
         known = cells.places.inverse_depth > 0.0
         points = cells.places.points(known)
         x, y, z = (points @ to_image[others, :, :3].mT + to_image[others, None, :, 3]).unbind(2)
@@ -142,7 +143,7 @@ def residuals_elsewhere(
         row = row.where(inside, 0)
         # 0 if the depth is unknown there, which is none of the same place.
         visible = inside & ((inverse_depth[row] * z - 1.0).abs() <= _SAME_DEPTH)
-        table = torch.full((_NEIGHBOURS, *known.shape), torch.nan)
+        table = residual.new_full((_NEIGHBOURS, *known.shape), torch.nan)
         table[: len(others), known] = residual[row].where(visible, torch.nan)
         usual = table.nanquantile(_USUAL, 0).nan_to_num(torch.inf)
         found.append((usual, (~table.isnan()).sum(0)))

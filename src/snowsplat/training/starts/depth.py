@@ -72,13 +72,15 @@ def depth_points(
         )
     if unused:
         logger.warning("%d depth maps do not agree with the points; not used", unused)
-    return fused_points(chosen, maps, images, count, generator)
+    there = [found and found.to(images.device) for found in maps]
+    return fused_points(chosen, there, images, count, generator)
 
 
 def aligned_depth_map(
     view: View, images: Photos, points: Tensor | None, longer_side: int = LONGER_SIDE
 ) -> DepthMap | None:
-    """The map of a view in world units; None without a map, or if it contradicts the points.
+    """The map of a view in world units, on the CPU; None without a map, or if it contradicts the
+    points.
 
     See `depth_points`.
 
@@ -113,7 +115,7 @@ def aligned_depth_map(
     known = z.isfinite()
     usable = usable_pixels(photo_for_map(view, images, longer_side))
     if usable is not None:
-        known &= usable
+        known &= usable.cpu()
     return DepthMap(camera, torch.where(known, 1.0 / z, 0.0))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -29,6 +29,10 @@ class DepthMap:
     camera: Camera
     inverse_depth: Tensor  # (H, W) float32, 1 / world units; 0: unknown
 
+    def to(self, device: torch.device) -> DepthMap:
+        """This map on ``device``; its camera stays where it is."""
+        return replace(self, inverse_depth=self.inverse_depth.to(device))
+
     def points(self, chosen: Tensor) -> Tensor:
         """(P, 3) float32: the points of the chosen pixels, (H, W) bool, in the world frame."""
         camera = self.camera
@@ -36,7 +40,7 @@ class DepthMap:
         depth = 1.0 / self.inverse_depth[y, x]
         right, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
         cam = torch.stack([right * depth, down * depth, depth], dim=1)
-        return transform_points(camera.world_from_cam.to(torch.float32), cam)
+        return transform_points(camera.world_from_cam.to(cam), cam)
 
 
 def map_size(width: int, height: int, longer_side: int = LONGER_SIDE) -> tuple[int, int]:
@@ -63,6 +67,6 @@ def check_aspect(file: Path, shape: tuple[int, ...], view: View) -> None:
 
 
 def photo_for_map(view: View, images: Photos, longer_side: int = LONGER_SIDE) -> LoadedImage:
-    """The photo of a view at the size of its depth map, on the CPU."""
+    """The photo of a view at the size of its depth map, on its device."""
     size = map_size(view.camera.width, view.camera.height, longer_side)
     return reduced_photo(view, images, *size)

@@ -33,51 +33,60 @@ def fused_points(
     """At most ``count`` points: those of the `confirmed_pixels`, merged by `merge_points`.
 
     Args:
-        maps: the depth map of each view; None if it has none.
+        maps: the depth map of each view, on the device of ``images``; None if it has none.
         generator: a random generator on the CPU.
+
+    Returns: the points on the CPU.
     """
-    confirmed = confirmed_pixels(maps, chosen.sources)
-    share = _PIXELS_PER_POINT * count / max(1, sum(int(pixels.sum()) for pixels in confirmed))
+    device = images.device
+    confirmed = confirmed_pixels(maps, chosen.sources, device)
+    number = int(torch.stack([pixels.sum() for pixels in confirmed]).sum())
+    share = _PIXELS_PER_POINT * count / max(1, number)
     used = [
-        pixels & (torch.rand(pixels.shape, generator=generator) < share) for pixels in confirmed
+        pixels & (torch.rand(pixels.shape, generator=generator) < share).to(device)
+        for pixels in confirmed
     ]
 
     def points_of(i: int) -> tuple[Tensor, Tensor, Tensor]:
         depth_map, pixels = maps[i], used[i]
         if depth_map is None:
-            return torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8), torch.zeros(0)
+            none = torch.zeros(0, 3, device=device)
+            return none, none.to(torch.uint8), none[:, 0]
         camera = depth_map.camera
         photo = reduced_photo(chosen.views[i], images, camera.width, camera.height)
         width = 1.0 / (depth_map.inverse_depth[pixels] * camera.fx)
         return depth_map.points(pixels), photo.rgb[pixels], width
 
-    points, colors, widths = zip(*in_threads(points_of, range(len(maps))), strict=True)
-    return merge_points(torch.cat(points), torch.cat(colors), torch.cat(widths), count)
+    found = in_threads(points_of, range(len(maps)), device)
+    points, colors, widths = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return merge_points(points, colors, widths, count).to(torch.device("cpu"))
 
 
 def confirmed_pixels(
-    maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]]
+    maps: Sequence[DepthMap | None], sources: Sequence[Sequence[int]], device: torch.device
 ) -> list[Tensor]:
     """For each map, (H, W) bool: the pixels whose depth the map of a source view confirms.
 
     A depth is confirmed if its point, projected into the source view, has the depth of the map
     there (geometric consistency, Schönberger et al. 2016).
+
+    ``device``: that of the maps and of the result.
     """
 
     def confirmed(i: int) -> Tensor:
         depth_map = maps[i]
         if depth_map is None:
-            return torch.zeros(0, 0, dtype=torch.bool)
+            return torch.zeros(0, 0, dtype=torch.bool, device=device)
         known = depth_map.inverse_depth > 0.0
         points = depth_map.points(known)
-        agrees = torch.zeros(len(points), dtype=torch.bool)
+        agrees = torch.zeros(len(points), dtype=torch.bool, device=device)
         for j in sources[i]:
             other = maps[j]
             if other is not None:
                 agrees |= _agrees(points, other)
         return known.clone().masked_scatter_(known, agrees)
 
-    return in_threads(confirmed, range(len(maps)))
+    return in_threads(confirmed, range(len(maps)), device)
 
 
 def _agrees(points: Tensor, depth_map: DepthMap) -> Tensor:
@@ -126,6 +135,6 @@ def _voxels(points: Tensor, widths: Tensor, multiple: float) -> tuple[Tensor, in
 
 def _means(values: Tensor, group: Tensor, n: int) -> Tensor:
     """(n, C) float32: the means of the rows of each group, summed in the order of the rows."""
-    totals = torch.zeros(n, values.shape[1], dtype=torch.float64)
+    totals = values.new_zeros(n, values.shape[1], dtype=torch.float64)
     totals.index_add_(0, group, values.to(torch.float64))
     return (totals / torch.bincount(group, minlength=n)[:, None]).to(torch.float32)

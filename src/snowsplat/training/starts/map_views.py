@@ -32,8 +32,8 @@ class MapViews:
     Attributes:
         views: training views.
         sources: for each view, indices into ``views``, the best one first; see `source_views`.
-        points: (P, 3) in the world frame: those of the dataset; without points, random ones within
-            its bounds.
+        points: (P, 3) in the world frame, on the CPU: those of the dataset; without points, random
+            ones within its bounds.
     """
 
     views: list[View]
@@ -58,7 +58,8 @@ def choose_views(
     views = dataset.train[:: math.ceil(pixels / max(limit, 1))]
     points = _points(dataset, generator)
     sample = points[torch.randperm(len(points), generator=generator)[:_SAMPLE]]
-    return MapViews(views, source_views([view.camera for view in views], sample, _SOURCES), points)
+    own = [view.camera for view in views]
+    return MapViews(views, source_views(own, sample.to(images.device), _SOURCES), points)
 
 
 def map_pixels(views: int, width: int, height: int, longer_side: int = LONGER_SIDE) -> int:

@@ -20,8 +20,8 @@ Result = TypeVar("Result")
 
 
 def reduced_photo(view: View, images: Photos, width: int, height: int) -> LoadedImage:
-    """The photo of a view at this size, which is not larger than the photo, on the CPU."""
-    photo = images.get(view, _reduction(view, width)).to(torch.device("cpu"))
+    """The photo of a view at this size, which is not larger than the photo, on its device."""
+    photo = images.get(view, _reduction(view, width))
     size = (height, width)
     if photo.planes.shape[1:] == size:
         return photo
@@ -48,12 +48,18 @@ def _reduction(view: View, width: int) -> int:
     return next((f for f in (4, 2) if view.camera.width >= f * width), 1)
 
 
-def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+def in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
+) -> list[Result]:
     """The results of a function of photos, in the order of the items, by `DECODERS` threads.
 
     Most of the time of a start is spent on one photo after another, by one thread: see
     `single_threaded`. Each result is computed by one thread, so it does not depend on their number.
+
+    ``device``: where the function computes. A GPU is kept busy by one thread that queues its work.
     """
+    if device.type == "cuda":
+        return [function(item) for item in items]
     with ThreadPoolExecutor(DECODERS, thread_name_prefix="snowsplat-start") as pool:
         return list(pool.map(function, items))
 

@@ -80,8 +80,9 @@ def depth_maps(
         points: (P, 3) in the world frame. Those that a view shows determine its range of depths.
         longer_side: the maximum size of the maps, in pixels.
     """
-    pictures = in_threads(lambda view: Picture.from_view(view, images, longer_side), views)
-    return swept_maps(pictures, depth_ranges(views, points), sources)
+    device = images.device
+    pictures = in_threads(lambda view: Picture.from_view(view, images, longer_side), views, device)
+    return swept_maps(pictures, depth_ranges(views, points.to(device)), sources)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Picture:
     @staticmethod
     def from_view(view: View, images: Photos, longer_side: int) -> Picture:
         photo = photo_for_map(view, images, longer_side)
-        luminance = photo.rgb.to(torch.float32) @ _LUMINANCE / 255.0
+        luminance = photo.rgb.to(torch.float32) @ _LUMINANCE.to(photo.planes.device) / 255.0
         height, width = luminance.shape
         return Picture(view.camera.scaled(width, height), luminance, usable_pixels(photo))
 
@@ -132,7 +133,8 @@ def swept_maps(
             return None
         return _swept(pictures[i], [pictures[j] for j in chosen], span)
 
-    return in_threads(swept, range(len(pictures)))
+    device = pictures[0].luminance.device if pictures else torch.device("cpu")
+    return in_threads(swept, range(len(pictures)), device)
 
 
 def _swept(picture: Picture, sources: list[Picture], span: tuple[float, float]) -> DepthMap:
@@ -152,7 +154,10 @@ def _swept(picture: Picture, sources: list[Picture], span: tuple[float, float]) 
 
 
 def depth_ranges(views: Sequence[View], points: Tensor) -> list[tuple[float, float] | None]:
-    """The range of inverse depths of each view, from the points, (P, 3), that it shows; or None."""
+    """The range of inverse depths of each view, from the points, (P, 3), that it shows; or None.
+
+    It is computed on the device of the points.
+    """
     points = points.to(torch.float64)
     return [_inverse_depths(view.camera, points) for view in views]
 
@@ -164,8 +169,8 @@ def _inverse_depths(camera: Camera, points: Tensor) -> tuple[float, float] | Non
     inverse = 1.0 / depth[inside & (depth > 0)]
     if len(inverse) < _FEWEST_POINTS:
         return None
-    low, high = inverse.quantile(torch.tensor([_OUTLIERS, 1.0 - _OUTLIERS], dtype=inverse.dtype))
-    return float(low) / _MARGIN, float(high) * _MARGIN
+    low, high = inverse.quantile(inverse.new_tensor([_OUTLIERS, 1.0 - _OUTLIERS])).tolist()
+    return low / _MARGIN, high * _MARGIN
 
 
 class _Level:
@@ -174,7 +179,7 @@ class _Level:
     def __init__(self, picture: Picture, sources: list[Picture]) -> None:
         self.image = picture.luminance
         self.sources = _stacked([source.luminance for source in sources])
-        self.source_from_pixel = torch.stack(
+        self.source_from_pixel = torch.stack(  # on the CPU
             [_source_from_pixel(picture.camera, source.camera) for source in sources]
         )
 
@@ -198,7 +203,7 @@ class _Level:
         return ops.plane_sweep(
             self.image,
             self.sources,
-            self.source_from_pixel,
+            self.source_from_pixel.to(self.image.device),
             low,
             high,
             planes=planes,
@@ -210,7 +215,7 @@ class _Level:
 def _stacked(images: list[Tensor]) -> Tensor:
     """(S, H, W): smaller images are extended with NaN, which `ops.plane_sweep` does not use."""
     height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
-    stack = torch.full((len(images), height, width), torch.nan)
+    stack = images[0].new_full((len(images), height, width), torch.nan)
     for row, image in zip(stack, images, strict=True):
         row[: image.shape[0], : image.shape[1]] = image
     return stack

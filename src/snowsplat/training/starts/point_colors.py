@@ -18,7 +18,7 @@ def point_pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     considered.
     """
     pixel, depth = camera.project(points.to(torch.float64))
-    size = torch.tensor([camera.width, camera.height])
+    size = pixel.new_tensor([camera.width, camera.height])
     inside = (depth > 0.0) & (pixel >= 0.5).all(1) & (pixel <= size - 0.5).all(1)
     return torch.where(inside[:, None], pixel, 0.5).to(torch.float32), inside
 
@@ -32,13 +32,13 @@ def point_colors(
 
     Args:
         images: loads the photo.
-        points: (P, 3) in the world frame, on the CPU.
-        background: (3,) colour in 0..1 behind transparent pixels.
+        points: (P, 3) in the world frame, on the device of the photo.
+        background: (3,) colour in 0..1 behind transparent pixels, on the device of the photo.
         downscale: the factor by which the photo is reduced: 1, 2 or 4.
 
     Raises: UserError: the photo is missing or damaged.
     """
-    photo = images.get(view, downscale).to(torch.device("cpu"))
+    photo = images.get(view, downscale)
     pixels, known = point_pixels(view.camera.downscaled(downscale), points)
     x, y = pixels.floor().to(torch.int64).unbind(1)
     if photo.mask is not None:

@@ -41,7 +41,7 @@ def random_points(
     xyz, rgb = [torch.zeros(0, 3)], [torch.zeros(0, 3, dtype=torch.uint8)]
     for view, number in zip(views, numbers, strict=True):
         camera = _reduced(view.camera)
-        photo = reduced_photo(view, images, camera.width, camera.height)
+        photo = reduced_photo(view, images, camera.width, camera.height).to(torch.device("cpu"))
         usable = usable_pixels(photo)
         if usable is None or not usable.any():
             usable = torch.ones(camera.height, camera.width, dtype=torch.bool)

@@ -27,7 +27,8 @@ def source_views(cameras: Sequence[Camera], points: Tensor, count: int) -> list[
     2018), multiplied by the ratio of the two depths.
 
     Args:
-        points: (P, 3) in the world frame, a sample of the scene. Occlusion is not considered.
+        points: (P, 3) in the world frame, a sample of the scene; computed on its device. Occlusion
+            is not considered.
         count: the maximum number of source views of a view.
 
     Returns: Indices into ``cameras``, the best one first. The list of a view is empty if no other
@@ -40,7 +41,7 @@ def source_views(cameras: Sequence[Camera], points: Tensor, count: int) -> list[
         inside = (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
         visible.append(inside & (depth > 0))
         depths.append(depth.clamp(min=1e-12))
-        rays.append(torch.nn.functional.normalize(points - camera.position, dim=1))
+        rays.append(torch.nn.functional.normalize(points - camera.position.to(points), dim=1))
     visible_, depth_, ray_ = torch.stack(visible), torch.stack(depths), torch.stack(rays)
 
     def chosen(i: int) -> list[int]:
@@ -48,11 +49,12 @@ def source_views(cameras: Sequence[Camera], points: Tensor, count: int) -> list[
         ratio = torch.minimum(depth_ / depth_[i], depth_[i] / depth_)
         weight = (_angle_weight(cosine.acos()) * ratio * (visible_ & visible_[i])).sum(1)
         weight[i] = 0.0
-        order = torch.argsort(weight, descending=True, stable=True)[:count].tolist()
-        least = max(_LEAST_WEIGHT * float(weight.max()), 1e-9)
-        return [j for j in order if float(weight[j]) >= least]
+        best = torch.argsort(weight, descending=True, stable=True)[:count]
+        weights = weight[best].tolist()
+        least = max(_LEAST_WEIGHT * weights[0], 1e-9)
+        return [j for j, w in zip(best.tolist(), weights, strict=True) if w >= least]
 
-    return in_threads(chosen, range(len(cameras)))
+    return in_threads(chosen, range(len(cameras)), points.device)
 
 
 def _angle_weight(angle: Tensor) -> Tensor:
