@@ -19,12 +19,9 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from snowsplat.ops.cuda.kernels import Kernel
-from snowsplat.ops.cuda.launches import launch_by
 from snowsplat.ops.native import LAUNCHERS
+from snowsplat.util import native_library
 from snowsplat.util.native_layout import Fields
-
-from .ops import emulation
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
 _ATEN = torch.ops.aten
@@ -106,9 +103,10 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         if isinstance(value, Tensor) and not isinstance(value, _OnGpu) and value.dim() > 0
     ]
     if there and here and func not in _COPIES:
+        shapes = [[tuple(tensor.shape) for tensor in side] for side in (there, here)]
         raise RuntimeError(
-            f"{func}: expected all tensors to be on the same device, but found "
-            f"{[tuple(t.shape) for t in there]} on {GPU} and {[tuple(t.shape) for t in here]} on cpu"
+            f"{func}: expected all tensors to be on the same device, but {shapes[0]} are on {GPU} "
+            f"and {shapes[1]} on the CPU"
         )
     kwargs = {name: value for name, value in kwargs.items() if name != "pin_memory"}
     device = kwargs.get("device")
@@ -129,10 +127,10 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return tree_map(placed, result)
 
 
-def _execute(kernel: Kernel, name: str, blocks: int, fields: Fields) -> None:
+def _launch(name: str, fields: Fields) -> int:
     for field, value in fields.items():
         assert not isinstance(value, Tensor) or isinstance(value, _OnGpu), f"{name}: {field}"
-    emulation.execute(kernel, name, blocks, {field: _held(value) for field, value in fields.items()})
+    return native_library.call(name, {field: _held(value) for field, value in fields.items()})
 
 
 class _Event:
@@ -144,7 +142,7 @@ class _Event:
 
 @contextmanager
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
-    """A GPU in this block, in all threads that start there; its kernels are emulated."""
+    """A GPU in this block, in all threads that start there; its kernels are those of the CPU."""
     run = threading.Thread.run
 
     def run_in_mode(self: threading.Thread) -> None:
@@ -155,6 +153,6 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device=None: (1 << 30, 1 << 30))
     monkeypatch.setattr(torch.cuda, "Event", _Event)
     monkeypatch.setattr(threading.Thread, "run", run_in_mode)
-    monkeypatch.setitem(LAUNCHERS, "cuda", lambda name, fields: launch_by(_execute, name, fields))
+    monkeypatch.setitem(LAUNCHERS, "cuda", _launch)
     with _Functions(), _Operations():
         yield GPU

@@ -13,11 +13,18 @@ from PIL import Image
 from snowsplat.data import ImageLoader, ImageSource, View
 from snowsplat.data.lens.models import lens_of
 from snowsplat.data.lens.views import lens_views
-from snowsplat.data.photos.decode import load_image, load_mask, load_views, resize_area
+from snowsplat.data.photos.decode import (
+    load_image,
+    load_mask,
+    load_views,
+    resize_area,
+    resize_area_on_gpu,
+)
 from snowsplat.data.photos.image_loader import available_memory
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import UserError
 
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 POSE = torch.eye(4, dtype=torch.float64)[:3]
 
 
@@ -75,6 +82,25 @@ def test_downscale_of_sizes_that_do_not_divide():
     centres = (np.arange(12) + 0.5) * 51 / 12
     assert np.abs(small[0, 0] - 5 * (centres - 0.5)).max() <= 0.5 + 1e-9
     assert resize_area(np.full((1, 7, 9), 255, np.uint8), 4, 3).min() == 255
+
+
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, needs_gpu])]
+)
+@pytest.mark.parametrize("kind", ["noise", "mask", "rows"])
+def test_a_gpu_reduces_to_the_same_values(kind, device):
+    """Means of whole pixels and of parts; constant rows have means at half of a level."""
+    random = np.random.default_rng(0)
+    for width, height in random.integers(1, 90, (40, 2)):
+        planes = random.integers(0, 256, (3, height, width)).astype(np.uint8)
+        if kind == "mask":
+            planes = 255 * (planes > 100).astype(np.uint8)
+        elif kind == "rows":
+            planes = planes[:, :, :1].repeat(width, 2)
+        for factor in (2, 4):
+            size = max(1, int(width) // factor), max(1, int(height) // factor)
+            found = resize_area_on_gpu(torch.from_numpy(planes).to(device), *size).cpu()
+            assert np.array_equal(found, resize_area(planes, *size)), (width, height, factor)
 
 
 def rgba(tmp_path):

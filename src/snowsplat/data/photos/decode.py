@@ -198,8 +198,9 @@ def box_downscale(image: LoadedImage, factor: int) -> LoadedImage:
     size = max(1, width // factor), max(1, height // factor)
 
     def reduced(planes: Tensor) -> Tensor:
-        if planes.device.type == "cpu":
-            return torch.from_numpy(resize_area(planes.numpy(), *size))
+        # PyTorch warns that its sums along a dimension may not be deterministic on a GPU.
+        if planes.device.type == "cpu" or torch.are_deterministic_algorithms_enabled():
+            return torch.from_numpy(resize_area(planes.cpu().numpy(), *size)).to(planes.device)
         return resize_area_on_gpu(planes, *size)
 
     mask = None if image.mask is None else reduced(image.mask[None].to(torch.uint8) * 255)

@@ -93,12 +93,14 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
         xyz = dataset.points.xyz.cpu()
         step = -(-len(xyz) // _SAMPLE)
         logs, half = _log_colors(views, xyz, step, images), _half(xyz[::step])
+        half = half.to(logs.device)
         whole, one, other = log_gains(logs), log_gains(logs[:, half]), log_gains(logs[:, ~half])
         products = one * other
         if products.isfinite().float().mean() > _LEAST_SHARE:
             spread = GAMMA / math.log(2.0) * math.sqrt(max(0.0, float(products.nanmean())))
-            gains = whole.nan_to_num().to(torch.float32)
-            return ExposureStart(gains, spread, message("points"), same_everywhere(logs, half))
+            gains = whole.nan_to_num().to("cpu", torch.float32)
+            everywhere = same_everywhere(logs, half, one, other)
+            return ExposureStart(gains, spread, message("points"), everywhere)
     values = [exif_exposure(view.image.path) for view in views]
     known = [value for value in values if value is not None]
     if len(views) > 1 and len(known) == len(views):
@@ -112,9 +114,7 @@ def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
 
 
 def _log_colors(views: Sequence[View], xyz: Tensor, step: int, images: Photos) -> Tensor:
-    """(V, P, 3) float64 on the CPU: logs of the colours of every ``step``-th point; NaN: not
-    usable.
-    """
+    """(V, P, 3) float64: logs of the colours of every ``step``-th point; NaN: not usable."""
     size = max(max(view.camera.width, view.camera.height) for view in views)
     downscale = next((factor for factor in (4, 2) if size >= factor * _SIDE), 1)
     images.prefetch(views, downscale)
@@ -125,7 +125,9 @@ def _log_colors(views: Sequence[View], xyz: Tensor, step: int, images: Photos) -
         known = known & _visible(view.camera, xyz)[::step]
         usable = known[:, None] & (colors >= _DARKEST) & (colors <= _BRIGHTEST)
         logs.append(torch.where(usable, colors.to(torch.float64).log(), torch.nan))
-    return torch.stack(logs).cpu()
+    found = torch.stack(logs)
+    # PyTorch warns that it has no deterministic median on a GPU.
+    return found.cpu() if torch.are_deterministic_algorithms_enabled() else found
 
 
 def _visible(camera: Camera, xyz: Tensor) -> Tensor:
@@ -146,17 +148,17 @@ def _half(xyz: Tensor) -> Tensor:
     return (xyz / side).floor().sum(1) % 2 == 0
 
 
-def same_everywhere(logs: Tensor, half: Tensor) -> bool:
+def same_everywhere(logs: Tensor, half: Tensor, one: Tensor, other: Tensor) -> bool:
     """Whether the gains of one half of the points make the colours of the other half more alike.
 
     Args:
         logs: (V, P, 3) float64, logs of colours; NaN where the colour is not known.
         half: (P,) bool.
+        one, other: `log_gains` of the points in ``half``, and of the others.
     """
     parts = logs[:, half], logs[:, ~half]
     before = sum(_unlike(part) for part in parts)
-    other_gains = log_gains(parts[1]), log_gains(parts[0])
-    after = sum(_unlike(part, gains) for part, gains in zip(parts, other_gains, strict=True))
+    after = _unlike(parts[0], other) + _unlike(parts[1], one)
     return after <= _MORE_ALIKE * before
 
 

@@ -256,9 +256,7 @@ class _Sample:
         colors = total / torch.bincount(own, minlength=len(cell))[:, None]
         scene_light = photo.rgb[near].to(torch.float32).mean(1).sort().values
         darker = torch.searchsorted(scene_light, colors.mean(1))
-        overcast = (darker > _DARKER * len(scene_light)) & _is_open(
-            cell, cells[near], up, axes
-        )
+        overcast = (darker > _DARKER * len(scene_light)) & _is_open(cell, cells[near], up, axes)
         plain = (contrast <= _PLAIN).all(1)[0]
         shown = len(cells.unique())
         return _Sample(camera, cell, colors, overcast, depth[visible], shown, pixels, plain)
