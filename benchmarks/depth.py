@@ -25,11 +25,10 @@ from PIL import Image
 from torch.nn.functional import interpolate, normalize
 
 from snowsplat import Trainer, load_dataset, recipe
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
+from snowsplat.scene.geometry import invert_rigid
 from snowsplat.scene.render import render
 from snowsplat.scene.surface_normals import normals_of_depth
 from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
@@ -60,13 +59,10 @@ def write_room(folder: Path, views: int, width: int, height: int) -> None:
         world = invert_rigid(pose).numpy()
         points.append((world[:, :3] @ (cam / lens.focal * seen)).T + world[:, 3])
     xyz = np.concatenate(points)
-    images = [
-        ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
-        for name, pose in truth.poses.items()
-    ]
     pinhole = lens_of("PINHOLE", width, height, (lens.focal, lens.focal, width / 2, height / 2))
     grey = np.full(xyz.shape, 128, np.uint8)
-    write_model(folder / "sparse" / "0", {1: pinhole}, images, xyz, grey)
+    posed = [(name, pinhole, pose) for name, pose in truth.poses.items()]
+    write_posed(folder / "sparse" / "0", posed, xyz, grey)
 
 
 def write_maps(folder: Path, kind: str) -> None:

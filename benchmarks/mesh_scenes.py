@@ -18,10 +18,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from tests.scenes.street import street
 from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
-from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
+from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, take_photos, walk
 from snowsplat.synthetic.scene import Scene
@@ -75,7 +74,8 @@ def write_dataset(folder: Path, scene: Procedural, width: int) -> Scene:
     lens, built = scene.lens(width), scene.build()
     truth = take_photos(folder / "images", lambda: built, lens, scene.poses)
     random = np.random.default_rng(0)
-    xyz, rgb, images = [], [], []
+    xyz, rgb, posed = [], [], []
+    pinhole = lens_of("PINHOLE", lens.width, lens.height, lens.params[:4])
     for name, pose in truth.poses.items():
         with Image.open(folder / "images" / name) as photo:
             pixels = np.asarray(photo)
@@ -87,12 +87,8 @@ def write_dataset(folder: Path, scene: Procedural, width: int) -> Scene:
         xyz.append(points + random.normal(0, _POINT_ERROR, points.shape))
         rgb.append(pixels[rows[seen], columns[seen]])
         moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
-        quat = quat_from_rotation(moved[:, :3])
-        images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
-    camera = lens_of("PINHOLE", lens.width, lens.height, lens.params[:4])
-    write_model(
-        folder / "sparse" / "0", {1: camera}, images, np.concatenate(xyz), np.concatenate(rgb)
-    )
+        posed.append((name, pinhole, moved))
+    write_posed(folder / "sparse" / "0", posed, np.concatenate(xyz), np.concatenate(rgb))
     return built
 
 

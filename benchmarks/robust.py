@@ -23,10 +23,9 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
-from snowsplat.scene.geometry import invert_rigid, quat_from_rotation
+from snowsplat.scene.geometry import invert_rigid
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene
@@ -62,13 +61,10 @@ def write_dataset(
     found = [
         _points(images / name, scene, lens, pose, random) for name, pose in truth.poses.items()
     ]
-    records = [
-        ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
-        for name, pose in truth.poses.items()
-    ]
     camera = lens_of("PINHOLE", lens.width, lens.height, lens.params[:4])
     xyz, rgb = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    write_model(folder / "sparse" / "0", {1: camera}, records, xyz, rgb)
+    posed = [(name, camera, pose) for name, pose in truth.poses.items()]
+    write_posed(folder / "sparse" / "0", posed, xyz, rgb)
 
 
 def _points(

@@ -17,10 +17,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
-from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
+from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import textures as paint
 from snowsplat.synthetic.lens import Lens
@@ -88,7 +87,8 @@ def write_museum_dataset(
     shoot = shooting(lens, poses, passing, used)
     truth = take_photos(folder / "images", lambda: scene, lens, poses, seed, report, shoot)
     random = np.random.default_rng(seed)
-    found, images = [], []
+    found, posed = [], []
+    pinhole = lens_of("PINHOLE", width, height, lens.params[:4])
     for i, (name, pose) in enumerate(truth.poses.items()):
         with Image.open(folder / "images" / name) as photo:
             pixels = np.asarray(photo)
@@ -98,12 +98,10 @@ def write_museum_dataset(
         blur = shutter.aperture * lens.focal * np.abs(1 / shutter.focus - 1 / depth)
         found.append(_features(pixels, depth, blur, lens, pose, points_per_view, random))
         moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
-        quat = quat_from_rotation(moved[:, :3])
-        images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
-    camera = lens_of("PINHOLE", width, height, lens.params[:4])
+        posed.append((name, pinhole, moved))
     xyz, rgb = (np.concatenate(part) for part in zip(*found, strict=True))
     turned = xyz @ DATASET_FROM_SCENE[:, :3].numpy().T
-    write_model(folder / "sparse" / "0", {1: camera}, images, turned, rgb)
+    write_posed(folder / "sparse" / "0", posed, turned, rgb)
     return folder
 
 

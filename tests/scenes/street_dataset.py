@@ -10,10 +10,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
-from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at, quat_from_rotation
+from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import roll, take_photos
@@ -60,18 +59,17 @@ def write_street_dataset(
     scene = street(length, seed)
     truth = take_photos(folder / "images", lambda: scene, lens, poses, seed, report)
     random = np.random.default_rng(seed)
-    xyz, rgb, images = [], [], []
+    xyz, rgb, posed = [], [], []
+    pinhole = lens_of("PINHOLE", width, height, lens.params[:4])
     for name, pose in truth.poses.items():
         with Image.open(folder / "images" / name) as photo:
             found = _points(scene, length, lens, pose, np.asarray(photo), points_per_view, random)
         xyz.append(found[0])
         rgb.append(found[1])
         moved = compose_rigid(pose, invert_rigid(DATASET_FROM_SCENE))
-        quat = quat_from_rotation(moved[:, :3])
-        images.append(ColmapImage(name, 1, (*quat.tolist(), *moved[:, 3].tolist())))
-    camera = lens_of("PINHOLE", width, height, lens.params[:4])
+        posed.append((name, pinhole, moved))
     turned = np.concatenate(xyz) @ DATASET_FROM_SCENE[:, :3].numpy().T
-    write_model(folder / "sparse" / "0", {1: camera}, images, turned, np.concatenate(rgb))
+    write_posed(folder / "sparse" / "0", posed, turned, np.concatenate(rgb))
     return folder
 
 

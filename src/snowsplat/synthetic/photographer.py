@@ -14,10 +14,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
-from snowsplat.scene.geometry import invert_rigid, look_at, quat_from_rotation
+from snowsplat.scene.geometry import invert_rigid, look_at
 from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic.lens import CentredLens, Lens
 from snowsplat.synthetic.scene import Scene
@@ -46,13 +45,8 @@ class Truth:
 
     def write(self, folder: Path) -> None:
         """Write a COLMAP text model without points."""
-        images = [
-            ColmapImage(name, 1, (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist()))
-            for name, pose in self.poses.items()
-        ]
-        camera = lens_of(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
-        nothing = np.zeros((0, 3))
-        write_model(folder, {1: camera}, images, nothing, nothing.astype(np.uint8), text=True)
+        lens = lens_of(self.lens.model, self.lens.width, self.lens.height, self.lens.params)
+        write_posed(folder, [(name, lens, pose) for name, pose in self.poses.items()], text=True)
 
 
 def write_synthetic_photos(

@@ -16,11 +16,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
-from snowsplat.data.lens.models import lens_of
+from snowsplat.data.colmap.model import write_posed
+from snowsplat.data.lens.models import pinhole_of
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import look_at, quat_from_rotation
+from snowsplat.scene.geometry import look_at
 
 _SUPERSAMPLING = 4  # rays along each side of a pixel
 _SURROUNDINGS = 6.0  # radius of the sphere around the scene
@@ -166,16 +165,12 @@ def _write_colmap(
     text: bool,
 ) -> None:
     folder.joinpath("images").mkdir(parents=True, exist_ok=True)
-    images = []
+    posed = []
     for i, camera in enumerate(cameras):
         name = f"view_{i:02d}.png"
         Image.fromarray(_render(scene, camera)[..., :3]).save(folder / "images" / name)
-        quat = quat_from_rotation(camera.cam_from_world[:, :3])
-        images.append(ColmapImage(name, 1, (*quat.tolist(), *camera.cam_from_world[:, 3].tolist())))
-    first = cameras[0]
-    intrinsics = (first.fx, first.fy, first.cx, first.cy)
-    shared = {1: lens_of("PINHOLE", first.width, first.height, intrinsics)}
-    write_model(folder / "sparse" / "0", shared, images, xyz, rgb, tracks, text=text)
+        posed.append((name, pinhole_of(camera), camera.cam_from_world))
+    write_posed(folder / "sparse" / "0", posed, xyz, rgb, tracks, text=text)
 
 
 def _write_blender(folder: Path, scene: _Scene, cameras: list[Camera]) -> None:

@@ -6,11 +6,12 @@ The format: https://colmap.github.io/format.html
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from snowsplat.data.colmap import binary as binary_files
 from snowsplat.data.colmap import text as text_files
@@ -22,7 +23,7 @@ from snowsplat.data.colmap.types import (
 from snowsplat.data.dataset import Points, usable_points
 from snowsplat.data.lens.lens import Lens
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.geometry import rotation_from_quat
+from snowsplat.scene.geometry import quat_from_rotation, rotation_from_quat
 from snowsplat.util.errors import UserError
 
 logger = logging.getLogger(__name__)
@@ -144,6 +145,33 @@ def write_model(
     folder.mkdir(parents=True, exist_ok=True)
     tracks = [()] * len(xyz) if tracks is None else tracks
     _FILES[text][0].write_model(folder, cameras, images, xyz, rgb, tracks)
+
+
+def write_posed(
+    folder: Path,
+    posed: Iterable[tuple[str, Lens, Tensor]],
+    xyz: np.ndarray | None = None,
+    rgb: np.ndarray | None = None,
+    tracks: Sequence[Sequence[tuple[int, int]]] | None = None,
+    *,
+    text: bool = False,
+) -> None:
+    """`write_model` of images whose poses are matrices; equal lenses become one camera.
+
+    Args:
+        posed: name, lens and ``cam_from_world`` (3, 4) of each image.
+        xyz, rgb: the points; None: there are none.
+    """
+    numbers: dict[Lens, int] = {}
+    images = []
+    for name, lens, pose in posed:
+        number = numbers.setdefault(lens, len(numbers) + 1)
+        quat = quat_from_rotation(pose[:, :3]).tolist()
+        images.append(ColmapImage(name, number, (*quat, *pose[:, 3].tolist())))
+    xyz = np.zeros((0, 3)) if xyz is None else xyz
+    rgb = np.zeros((0, 3), np.uint8) if rgb is None else rgb
+    cameras = {number: lens for lens, number in numbers.items()}
+    write_model(folder, cameras, images, xyz, rgb, tracks, text=text)
 
 
 def posed_camera(model: ColmapModel, image: ColmapImage) -> Camera:

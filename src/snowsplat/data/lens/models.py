@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from snowsplat.data.lens.lens import Equation, Image, Lens, Model
+
+if TYPE_CHECKING:
+    from snowsplat.scene.camera import Camera
 
 _TINY = 1e-12
 
@@ -162,6 +166,12 @@ COLMAP_MODELS = (
 )
 #: All models by name.
 MODELS = {model.name: model for model in (*COLMAP_MODELS, _opencv("BROWN", _BROWN, brown))}
+
+
+def pinhole_of(camera: Camera) -> Lens:
+    """The lens of a camera, which has no distortion."""
+    params = camera.fx, camera.fy, camera.cx, camera.cy
+    return lens_of("PINHOLE", camera.width, camera.height, params)
 
 
 def lens_of(model: str, width: int, height: int, params: Iterable[float]) -> Lens:

@@ -9,16 +9,11 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-
-from snowsplat.data.colmap.model import write_model
-from snowsplat.data.colmap.types import ColmapImage
+from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.dataset import Points, PosedImage
 from snowsplat.data.lens.brown import as_colmap
-from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.models import lens_of
+from snowsplat.data.lens.models import pinhole_of
 from snowsplat.project.dataset_folder import DatasetFolder
-from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import Origin, opposite
 
 logger = logging.getLogger(__name__)
@@ -44,8 +39,7 @@ def write_block_dataset(
     Raises: OSError: a file cannot be written.
     """
     shutil.rmtree(folder, ignore_errors=True)
-    cameras: dict[Lens, int] = {}
-    images = []
+    written = []
     worst = 0.0
     for image in posed:
         name = _file_name(image)
@@ -53,15 +47,10 @@ def write_block_dataset(
             _link(image.path, folder / f"images_{image.divided}" / name)
             continue
         camera, lens = image.camera, image.lens
-        if lens.is_pinhole:
-            intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-            lens = lens_of("PINHOLE", camera.width, camera.height, intrinsics)
-        lens, error = as_colmap(lens)
+        lens, error = as_colmap(pinhole_of(camera) if lens.is_pinhole else lens)
         worst = max(worst, error)
-        number = cameras.setdefault(lens, len(cameras) + 1)
         pose = camera.seen_from(opposite(origin)).cam_from_world
-        quat = quat_from_rotation(pose[:, :3]).tolist()
-        images.append(ColmapImage(name, number, (*quat, *pose[:, 3].tolist())))
+        written.append((name, lens, pose))
         _link(image.path, DatasetFolder(folder).images / name)
         if image.mask is not None:
             _link(image.mask, DatasetFolder(folder).masks / f"{name}.png")
@@ -77,14 +66,11 @@ def write_block_dataset(
             folder,
             worst,
         )
-    nothing = np.zeros((0, 3))
-    write_model(
-        DatasetFolder(folder).model,
-        {number: camera for camera, number in cameras.items()},
-        images,
-        nothing if points is None else points.xyz.double().numpy() + origin,
-        nothing.astype(np.uint8) if points is None else points.rgb.numpy(),
-    )
+    model = DatasetFolder(folder).model
+    if points is None:
+        write_posed(model, written)
+    else:
+        write_posed(model, written, points.xyz.double().numpy() + origin, points.rgb.numpy())
 
 
 def _file_name(image: PosedImage) -> str:

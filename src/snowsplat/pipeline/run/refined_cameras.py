@@ -11,15 +11,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from snowsplat.data import Dataset, View
-from snowsplat.data.colmap.model import posed_camera, read_model, write_model
-from snowsplat.data.colmap.types import ColmapImage
-from snowsplat.data.lens.lens import Lens
-from snowsplat.data.lens.models import lens_of
+from snowsplat.data.colmap.model import posed_camera, read_model, write_posed
+from snowsplat.data.lens.models import pinhole_of
 from snowsplat.project.training_folder import TrainingFolder
-from snowsplat.scene.geometry import quat_from_rotation
 from snowsplat.scene.origin import opposite
 from snowsplat.util.errors import UserError
 
@@ -30,21 +25,16 @@ def write_refined(output: TrainingFolder, views: Iterable[View], full: Dataset) 
     ``full``: the same dataset, with the photos at their full size.
     """
     sizes = {v.name: (v.camera.width, v.camera.height) for v in [*full.train, *full.test]}
-    numbers: dict[Lens, int] = {}
-    images = []
+    posed = []
     for view in views:
-        camera = view.camera.scaled(*sizes[view.name])
-        params = camera.fx, camera.fy, camera.cx, camera.cy
-        pinhole = lens_of("PINHOLE", camera.width, camera.height, params)
-        number = numbers.setdefault(pinhole, len(numbers) + 1)
-        pose = camera.seen_from(opposite(full.origin)).cam_from_world
-        numbers_of_pose = (*quat_from_rotation(pose[:, :3]).tolist(), *pose[:, 3].tolist())
-        images.append(ColmapImage(view.name, number, numbers_of_pose))
-    xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    if full.points is not None:
-        xyz, rgb = full.points.xyz.double().numpy() + full.origin, full.points.rgb.numpy()
-    folder = output.refined_model
-    write_model(folder, {number: camera for camera, number in numbers.items()}, images, xyz, rgb)
+        camera = view.camera.scaled(*sizes[view.name]).seen_from(opposite(full.origin))
+        posed.append((view.name, pinhole_of(camera), camera.cam_from_world))
+    folder, points = output.refined_model, full.points
+    if points is None:
+        write_posed(folder, posed)
+    else:
+        xyz = points.xyz.double().numpy() + full.origin
+        write_posed(folder, posed, xyz, points.rgb.numpy())
     return folder
 
 
