@@ -1,6 +1,7 @@
 """Starts Python programs in forks of a process that has loaded all modules: no time for imports.
 
-    python fork_server.py 3      the server; 3 is its end of a socket
+    python fork_server.py 3 import_all      the server; 3 is its end of a socket, and the function
+                                            of imports.py loads the modules
 
 A program has its own streams, environment, handling of Ctrl-C and exit code. If it starts Python
 itself, it can fork for that, too. Tests of imports, and of variables that are read by Python or
@@ -22,6 +23,7 @@ import sys
 import threading
 from collections.abc import Mapping
 from concurrent.futures import thread as pools
+from contextlib import suppress
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,6 +40,7 @@ def popen(
     stdout: int = subprocess.PIPE,
     stderr: int = subprocess.PIPE,
     forks: bool = False,
+    group: bool = False,
 ) -> Process | subprocess.Popen:
     """``python arguments``: ``-m module …``, ``-c code …`` or ``script …``.
 
@@ -49,10 +52,12 @@ def popen(
         stderr: or STDOUT, or a file descriptor.
         forks: the program starts Python with `subprocess.Popen`; these processes are its forks.
             It must not have computed anything in several threads before.
+        group: the program has its own process group, where forks are possible.
     """
     texts = [str(argument) for argument in arguments]
     if hasattr(os, "pidfd_open"):
-        return Process(texts, dict(env), stdin, stdout, stderr, forks)
+        request = {"argv": texts, "env": dict(env), "forks": forks, "group": group}
+        return Process(_server(), request, stdin, stdout, stderr)
     command = [sys.executable, *texts]
     return subprocess.Popen(command, env=env, stdin=stdin, stdout=stdout, stderr=stderr, text=True)
 
@@ -73,32 +78,20 @@ class Process:
     """A process that the server started. Its methods are those of `subprocess.Popen`."""
 
     def __init__(
-        self,
-        arguments: list[str],
-        env: dict[str, str],
-        stdin: int,
-        stdout: int,
-        stderr: int,
-        forks: bool = False,
+        self, server: Server | _This, request: dict, stdin: int, stdout: int, stderr: int
     ) -> None:
-        self.args = arguments
+        self._server = server
+        self.args = request["argv"]
         self.returncode: int | None = None
-        self.stdin = self.stdout = self.stderr = None
+        self.stdin = None
         if stdin == subprocess.PIPE:
             theirs, self.stdin = _pipe("w")
         else:
             theirs = os.open(os.devnull, os.O_RDONLY)
-        if stdout == subprocess.PIPE:
-            out, self.stdout = _pipe("r")
-        else:
-            out = os.dup(stdout)
-        if stderr == subprocess.PIPE:
-            err, self.stderr = _pipe("r")
-        else:
-            err = os.dup(out if stderr == subprocess.STDOUT else stderr)
-        request = {"argv": arguments, "env": env, "cwd": os.getcwd(), "forks": forks}
+        out, self.stdout = _outward(stdout)
+        err, self.stderr = _outward(out if stderr == subprocess.STDOUT else stderr)
         streams = [theirs, out, err]
-        self.pid = _server().ask(request, streams)
+        self.pid = server.ask({"cwd": os.getcwd()} | request, streams)
         for stream in streams:
             os.close(stream)
         # Until the server is asked for its exit code, the number belongs to this process.
@@ -152,7 +145,7 @@ class Process:
 
     def _ended_within(self, timeout: float | None) -> int | None:
         if self.returncode is None and select.select([self._handle], [], [], timeout)[0]:
-            self.returncode = _server().ask({"ended": self.pid})
+            self.returncode = self._server.ask({"ended": self.pid})
             os.close(self._handle)
         return self.returncode
 
@@ -164,28 +157,42 @@ def _pipe(mode: str):
     return theirs, open(ours, mode, encoding="utf-8")
 
 
-class _Server:
-    """The process that forks, and the socket to it."""
+def _outward(stream: int):
+    """The descriptor of the other process for PIPE, DEVNULL or a descriptor, and our end."""
+    if stream == subprocess.PIPE:
+        return _pipe("r")
+    if stream == subprocess.DEVNULL:
+        return os.open(os.devnull, os.O_WRONLY), None
+    return os.dup(stream), None
 
-    def __init__(self) -> None:
+
+class Server:
+    """The process that forks, and the socket to it.
+
+    Args:
+        load: the function of imports.py that loads the modules.
+    """
+
+    def __init__(self, load: str, env: Mapping[str, str] = ENVIRONMENT) -> None:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._lock = threading.Lock()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, __file__, str(theirs.fileno())],
-                env=ENVIRONMENT | {"OPENBLAS_NUM_THREADS": "1"},  # forks would lack its threads
+                [sys.executable, __file__, str(theirs.fileno()), load],
+                env={**env, "OPENBLAS_NUM_THREADS": "1"},  # forks would lack its threads
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # so that the streams of programs are not a terminal's
                 pass_fds=[theirs.fileno()],
             )
-        atexit.register(self._end)
+        atexit.register(self.close)
 
     def ask(self, request: dict, streams: list[int] | None = None) -> int:
         with self._lock:
             socket.send_fds(self._socket, [json.dumps(request).encode()], streams or [])
             return int(self._socket.recv(_LARGEST_REQUEST))
 
-    def _end(self) -> None:
+    def close(self) -> None:
+        """End the process."""
         self._socket.close()
         self._process.wait()
 
@@ -206,8 +213,8 @@ class _This:
 
 
 @functools.cache
-def _server() -> _Server | _This:
-    return _Server()
+def _server() -> Server | _This:
+    return Server("import_all")
 
 
 def _fork_instead_of_start() -> None:
@@ -215,18 +222,15 @@ def _fork_instead_of_start() -> None:
 
     def start(command, env=None, stdin=None, stdout=None, stderr=None, **_: object) -> Process:
         assert command[0] == sys.executable
-        streams = [sys.stdout, sys.stderr]
-        for i, stream in enumerate((stdout, stderr)):
-            if stream == subprocess.DEVNULL:
-                streams[i] = null
-            elif stream is not None:
-                streams[i] = stream
+        streams = [
+            sys.stdout if stdout is None else stdout,
+            sys.stderr if stderr is None else stderr,
+        ]
         numbers = [s if isinstance(s, int) else s.fileno() for s in streams]
         environment = dict(os.environ if env is None else env)
-        return Process(command[1:], environment, stdin or subprocess.DEVNULL, *numbers, forks=True)
+        request = {"argv": command[1:], "env": environment, "forks": True, "group": False}
+        return Process(_This(), request, stdin or subprocess.DEVNULL, *numbers)
 
-    null = os.open(os.devnull, os.O_WRONLY)
-    globals()["_server"] = functools.cache(_This)
     subprocess.Popen = start
 
 
@@ -252,6 +256,9 @@ def _serve(ours: socket.socket) -> dict:
             ours.send(b"%d" % _exit_code_of(request["ended"]))
             continue
         pid = os.fork()
+        if request["group"]:  # in both processes, so that either can rely on it
+            with suppress(OSError):  # it has already ended
+                os.setpgid(pid, pid)
         if pid == 0:
             ours.close()
             _take(streams)
@@ -314,7 +321,7 @@ def _run_and_exit(request: dict) -> None:
 if __name__ == "__main__":
     # Ctrl-C ends the tests, and then the server.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from imports import import_all
+    import imports
 
-    import_all()
+    getattr(imports, sys.argv[2])()
     _run_and_exit(_serve(socket.socket(fileno=int(sys.argv[1]))))

@@ -1,7 +1,11 @@
-"""Loads all modules of the command line, for a process whose forks run it."""
+"""Loads modules, for a process whose forks run commands or tests: see fork_server.py."""
 
 import gc
-from contextlib import suppress
+import importlib
+import io
+from contextlib import redirect_stdout, suppress
+
+_LIBRARIES = ("torch", "numpy", "PIL.Image", "hypothesis", "safetensors.torch", "zstandard", "rich")
 
 
 def import_all() -> None:
@@ -36,5 +40,17 @@ def import_all() -> None:
             snowsplat.cli.main.parse([name])
     Image.init()  # imports the readers of all formats
     # Forks need not examine, and thereby copy, the objects that exist now.
+    gc.collect()
+    gc.freeze()
+
+
+def import_libraries() -> None:
+    """Import pytest and the libraries; not the package, which is another one in each fork."""
+    import pytest
+
+    for name in _LIBRARIES:
+        importlib.import_module(name)
+    with redirect_stdout(io.StringIO()):
+        pytest.main(["--version"])  # imports its plugins
     gc.collect()
     gc.freeze()

@@ -129,12 +129,12 @@ def test_the_model_with_most_images_is_used(dataset_copy, caplog, kind):
         dataset = load_dataset(folder)
     assert len(dataset.train) + len(dataset.test) == 9
     assert "sparse/3 (9 images), not sparse/1 (3), sparse/0 (2)" in caplog.text
-    assert "sparse/3" in dataset.description
+    assert "sparse/3" in str(dataset.description)
 
 
 @pytest.mark.parametrize(("kind", "name"), [("colmap-bin", "binary"), ("colmap-txt", "text")])
 def test_the_description_names_the_model_and_its_kind(pristine, kind, name):
-    assert load_dataset(pristine[kind]).description == f"COLMAP model sparse/0 ({name})"
+    assert str(load_dataset(pristine[kind]).description) == f"COLMAP model sparse/0 ({name})"
 
 
 def test_a_model_directly_in_sparse(dataset_copy):
@@ -150,7 +150,7 @@ def test_a_model_in_colmap_sparse(dataset_copy):
     folder = dataset_copy("colmap-bin")
     (folder / "colmap").mkdir()
     (folder / "sparse").rename(folder / "colmap/sparse")
-    assert load_dataset(folder).description == "COLMAP model colmap/sparse/0 (binary)"
+    assert str(load_dataset(folder).description) == "COLMAP model colmap/sparse/0 (binary)"
 
 
 def test_missing_images_are_skipped_and_counted(dataset_copy, caplog):

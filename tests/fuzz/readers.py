@@ -54,6 +54,7 @@ from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
 from snowsplat.scene.camera_json import read_cameras, write_cameras
 from snowsplat.scene.gaussians import SH_REST_COUNTS, Gaussians
 from snowsplat.sfm import make_dataset
+from snowsplat.sfm.ingest.content.sharpness import BLACK
 from snowsplat.sfm.ingest.inputs import Gathered
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photos import mask_files, photo_files
@@ -616,7 +617,7 @@ _PHOTO = Photo("a.jpg", "a.jpg", 80, 60, "g", None, 70.5, (1.0, 2.0, 3.0), False
 def _make_stages(folder: Path) -> None:
     stages = Stages(folder / "sfm.json", make_dataset.STAGES)
     stages.about = {"inputs": ["x"]}
-    gathered = asdict(Gathered([_PHOTO], [LeftOut("b.jpg", "photos", "is black")], []))
+    gathered = asdict(Gathered([_PHOTO], [LeftOut("b.jpg", "photos", BLACK)], []))
     stages.run("photos", {"size": None}, [folder], lambda: gathered)
 
 

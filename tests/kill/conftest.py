@@ -1,7 +1,6 @@
-"""Small inputs, and a process that starts commands; see `harness`."""
+"""Small inputs, and what starts commands; see `harness`."""
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from ..fork_server import popen
 from ..sfm.colmap import scenes
-from .harness import Zygote
+from .harness import Runner
 
 if sys.platform != "linux":
     collect_ignore = ["test_kills.py", "test_pressure.py"]  # fork, process groups, mounts
@@ -30,6 +29,5 @@ def photos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def zygote(tmp_path_factory) -> Iterator[Zygote]:
-    with Zygote(tmp_path_factory.mktemp("zygote"), popen) as zygote:
-        yield zygote
+def runner(tmp_path_factory) -> Runner:
+    return Runner(tmp_path_factory.mktemp("runner"), popen)

@@ -8,22 +8,27 @@ the correct result.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
+import pty
 import random
 import shutil
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
+import termios
+import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import safetensors
@@ -62,10 +67,8 @@ class Ended:
         return self.code == -signal.SIGKILL
 
 
-class Zygote:
-    """Starts commands from a process that has loaded all modules, so kills do not hit imports.
-
-    Use it as a context manager.
+class Runner:
+    """Runs commands in forks of a process that has loaded all modules, so kills do not hit imports.
 
     Args:
         folder: the working folder, for logs and temporary files.
@@ -75,21 +78,7 @@ class Zygote:
     def __init__(self, folder: Path, popen: Callable[..., Any]) -> None:
         self.folder, self.temporary = folder, folder / "tmp"
         self.temporary.mkdir(parents=True, exist_ok=True)
-        self._process = popen(
-            Path(__file__).with_name("zygote.py"),
-            folder,
-            env={**os.environ, "PYTHONPATH": _SOURCE, "TMPDIR": str(self.temporary)},
-            stdin=subprocess.PIPE,
-            stderr=2,  # that of the tests
-        )
-
-    def __enter__(self) -> Zygote:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(timeout=60)
+        self._popen = popen
 
     def run(
         self,
@@ -111,44 +100,69 @@ class Zygote:
             columns: width of its terminal; None: no terminal.
             while_it_runs: called with its process id once it is started.
         """
-        log = self.folder / "log.txt"
-        changes = self.folder / "log.txt.changes"
+        changes = self.folder / "changes.txt"
         changes.unlink(missing_ok=True)
-        job = {
+        run = {
             "argv": [str(word) for word in argv],
-            "log": str(log),
-            "watched": [str(self.folder)],
+            "folder": str(self.folder),
+            "changes": str(changes),
             "at": at,
             "delay": delay,
             "limits": limits or {},
-            "columns": columns,
         }
+        environment = {**os.environ, "PYTHONPATH": _SOURCE, "TMPDIR": str(self.temporary)}
+        environment.pop("COLUMNS", None)  # set by pytest-xdist; would replace the terminal's width
         start = time.monotonic()
-        pid = self._ask(job)["pid"]
-        try:
-            while_it_runs(pid)
-            if after is not None:
-                time.sleep(max(0.0, start + after - time.monotonic()))
-                _kill(pid)
-        except BaseException:
-            _kill(pid)
-            raise
-        finally:
-            code = self._answer()["code"]
-        seconds = time.monotonic() - start
-        _wait_for_the_group(pid)
+        with _output(self.folder / "log.txt", columns) as out:
+            process = self._popen(
+                Path(__file__).with_name("watched_command.py"),
+                json.dumps(run),
+                env=environment,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                group=True,
+            )
+            try:
+                while_it_runs(process.pid)
+                if after is not None:
+                    time.sleep(max(0.0, start + after - time.monotonic()))
+                    _kill(process.pid)
+            except BaseException:
+                _kill(process.pid)
+                raise
+            finally:
+                code = process.wait()
+            seconds = time.monotonic() - start
+            _wait_for_the_group(process.pid)
         count = int(changes.read_text() or 0) if changes.is_file() else 0
-        return Ended(code, log.read_bytes().decode(errors="replace"), count, seconds)
+        text = (self.folder / "log.txt").read_bytes().decode(errors="replace")
+        return Ended(code, text, count, seconds)
 
-    def _ask(self, job: dict) -> dict:
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(job) + "\n")
-        self._process.stdin.flush()
-        return self._answer()
 
-    def _answer(self) -> dict:
-        assert self._process.stdout is not None
-        return json.loads(self._process.stdout.readline())
+@contextmanager
+def _output(log: Path, columns: int | None) -> Iterator[int]:
+    """A descriptor for output: that of a file, or of a terminal whose output is copied to it."""
+    with log.open("wb") as file:
+        if columns is None:
+            yield file.fileno()
+            return
+        ours, theirs = pty.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        copying = threading.Thread(target=_copy, args=(ours, file))
+        copying.start()
+        try:
+            yield theirs
+        finally:
+            os.close(theirs)
+            copying.join()
+            os.close(ours)
+
+
+def _copy(terminal: int, file: BinaryIO) -> None:
+    with suppress(OSError):  # the other end is closed
+        while text := os.read(terminal, 65536):
+            file.write(text)
+    file.flush()
 
 
 def _kill(group: int) -> None:
@@ -321,7 +335,7 @@ class Tally:
 class Killer:
     """Kills jobs at random times that depend on a seed."""
 
-    zygote: Zygote
+    runner: Runner
     seed: int
     tallies: dict[str, Tally] = field(default_factory=dict)
     _references: dict[str, tuple[Path, Ended]] = field(default_factory=dict)
@@ -329,10 +343,10 @@ class Killer:
     def reference(self, job: Job) -> tuple[Path, Ended]:
         """The output folder and the result of an undisturbed run."""
         if job.name not in self._references:
-            folder = self.zygote.folder / f"whole {job.name}"
+            folder = self.runner.folder / f"whole {job.name}"
             folder.mkdir()
             job.prepare(folder / job.output)
-            ended = self.zygote.run(job.command(folder / job.output, False))
+            ended = self.runner.run(job.command(folder / job.output, False))
             if ended.code != 0:
                 raise Defect(f"{job.name}, undisturbed: exit code {ended.code}\n{ended.text}")
             check_whole(folder)
@@ -363,7 +377,7 @@ class Killer:
         tally = self.tallies.setdefault(job.name, Tally())
         moments = random.Random(f"{self.seed} {job.name} {number}")
         whole, undisturbed = self.reference(job)
-        folder = self.zygote.folder / f"killed {job.name} {number}"
+        folder = self.runner.folder / f"killed {job.name} {number}"
         folder.mkdir()
         output = folder / job.output
         job.prepare(output)
@@ -371,7 +385,7 @@ class Killer:
         try:
             for i in range(kills):
                 moment = _moment(moments, undisturbed)
-                ended = self.zygote.run(job.command(output, i > 0), **moment)
+                ended = self.runner.run(job.command(output, i > 0), **moment)
                 history.append(f"{moment} -> {ended.code}")
                 if not ended.killed:
                     if ended.code != 0:
@@ -381,11 +395,11 @@ class Killer:
                 tally.kills += 1
                 tally.files += check_whole(folder)
                 job.check_killed(output, whole / job.output)
-            ended = self.zygote.run(job.command(output, True))
+            ended = self.runner.run(job.command(output, True))
             if ended.code != 0:
                 raise Defect(f"exit code {ended.code} of the final run\n{ended.text}")
             check_whole(folder)
-            left = leftovers(folder, self.zygote.temporary)
+            left = leftovers(folder, self.runner.temporary)
             if left:
                 raise Defect(f"left behind: {', '.join(left)}")
             job.check_done(output, whole / job.output)

@@ -26,8 +26,8 @@ from .harness import (
 
 
 @pytest.fixture(scope="module")
-def killer(zygote) -> Killer:
-    return Killer(zygote, seed=1)
+def killer(runner) -> Killer:
+    return Killer(runner, seed=1)
 
 
 def test_convert(killer, tmp_path):
@@ -48,79 +48,79 @@ def test_make(killer, photos):
     assert not killer.kill(make_jobs(photos), 3)
 
 
-def test_train_killed_at_its_start(zygote, dataset):
+def test_train_killed_at_its_start(runner, dataset):
     """It is killed before each of the first changes of files, and the folder is recognised."""
-    out = zygote.folder / "begun"
+    out = runner.folder / "begun"
     command = ["train", dataset, "-o", out, "--iterations", 3, "--device", "cpu", "--threads", 1]
     for at in range(1, 8):
-        ended = zygote.run([*command, "--resume"], at=at)
+        ended = runner.run([*command, "--resume"], at=at)
         assert ended.killed, ended.text
-    done = zygote.run([*command, "--resume"])
+    done = runner.run([*command, "--resume"])
     assert done.code == 0, done.text
     assert not list(out.rglob("*.tmp"))
 
 
-def test_a_scene_is_written_after_a_kill_prevented_it(zygote, dataset, tmp_path):
+def test_a_scene_is_written_after_a_kill_prevented_it(runner, dataset, tmp_path):
     """The run is killed after the checkpoint of step 20 and before the scene of step 20."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--save-iterations", 20, "--device", "cpu", "--threads", 1]
-    assert zygote.run(command).code == 0
+    assert runner.run(command).code == 0
     early = out / "point_cloud/iteration_20/point_cloud.ply"
     whole = digest(early)
     early.unlink()
     (out / "checkpoints/step_000030.safetensors").unlink()
-    done = zygote.run([*command, "--resume"])
+    done = runner.run([*command, "--resume"])
     assert done.code == 0, done.text
     assert digest(early) == whole
 
 
-def test_an_old_checkpoint_left_by_a_kill_is_removed(zygote, dataset, tmp_path):
+def test_an_old_checkpoint_left_by_a_kill_is_removed(runner, dataset, tmp_path):
     """The run is killed after writing the last checkpoint and before removing the third last."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
-    assert zygote.run(command).code == 0
+    assert runner.run(command).code == 0
     remaining = names_in(out / "checkpoints")
     assert remaining == {"step_000020.safetensors", "step_000030.safetensors"}
     shutil.copy(
         out / "checkpoints/step_000020.safetensors", out / "checkpoints/step_000010.safetensors"
     )
-    done = zygote.run([*command, "--resume"])
+    done = runner.run([*command, "--resume"])
     assert done.code == 0, done.text
     assert names_in(out / "checkpoints") == remaining
 
 
-def test_damaged_checkpoints_are_not_overwritten(zygote, dataset, tmp_path):
+def test_damaged_checkpoints_are_not_overwritten(runner, dataset, tmp_path):
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--iterations", 20, "--checkpoint-every", 10]
     command += ["--device", "cpu", "--threads", 1]
-    assert zygote.run(command).code == 0
+    assert runner.run(command).code == 0
     shutil.rmtree(out / "point_cloud")
     for path in (out / "checkpoints").iterdir():
         path.write_bytes(path.read_bytes()[:-1])
     before = {name: (out / name).read_bytes() for name in names_in(out)}
-    ended = zygote.run([*command, "--resume"])
+    ended = runner.run([*command, "--resume"])
     assert ended.code == 2
     assert "contains checkpoints but no complete checkpoint to resume" in ended.text
     assert {name: (out / name).read_bytes() for name in names_in(out)} == before
 
 
-def test_a_timed_run_with_more_steps_than_planned(zygote, dataset, tmp_path):
+def test_a_timed_run_with_more_steps_than_planned(runner, dataset, tmp_path):
     """The final checkpoint is beyond the plan that is stored in it."""
     out = tmp_path / "out"
     command = ["train", dataset, "-o", out, "--minutes", 0.02, "--checkpoint-every", 1]
     command += ["--device", "cpu", "--threads", 1]
-    assert zygote.run(command).code == 0
+    assert runner.run(command).code == 0
     newest = checkpoint.latest(out / "checkpoints")
     assert newest is not None
     newest.meta["training"]["iterations"] = newest.step
     checkpoint.save(out / "checkpoints", newest.step + 3, newest.tensors, newest.meta)
-    done = zygote.run([*command, "--resume"])
+    done = runner.run([*command, "--resume"])
     assert done.code == 0, done.text
 
 
-def test_make_keeps_checkpoints_until_the_scene_is_recorded(killer, zygote, photos, tmp_path):
+def test_make_keeps_checkpoints_until_the_scene_is_recorded(killer, runner, photos, tmp_path):
     """The run is killed as soon as they are removed; the stage must be recorded as finished."""
     (job,) = make_jobs(photos)
     whole, _ = killer.reference(job)
@@ -145,11 +145,11 @@ def test_make_keeps_checkpoints_until_the_scene_is_recorded(killer, zygote, phot
             pass  # without a delay, since the record may be written soon afterwards
         os.killpg(pid, signal.SIGKILL)
 
-    assert zygote.run(command, while_it_runs=kill_when_gone).killed
+    assert runner.run(command, while_it_runs=kill_when_gone).killed
     assert "scene" in json.loads((out / "make.json").read_text())["stages"]
     # The state after an earlier kill.
     checkpoints.mkdir()
-    again = zygote.run(command)
+    again = runner.run(command)
     assert again.code == 0, again.text
     assert re.search(r"scene .*done before", again.text)
     assert not checkpoints.exists()

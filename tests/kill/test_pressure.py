@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -14,16 +15,16 @@ import pytest
 
 from snowsplat.training.core import checkpoint
 
-from .harness import Ended, Zygote, check_whole, digest, leftovers, names_in
+from .harness import Ended, check_whole, digest, leftovers, names_in
 
 CPU = ("--device", "cpu", "--threads", 1)
 
 
 @pytest.fixture(scope="module")
-def trained(zygote, dataset) -> Path:
+def trained(runner, dataset) -> Path:
     """A training run with checkpoints of steps 20 and 30; read-only for the tests."""
-    out = zygote.folder / "trained"
-    ended = zygote.run(
+    out = runner.folder / "trained"
+    ended = runner.run(
         ["train", dataset, "-o", out, "--iterations", 30, "--checkpoint-every", 10, "--eval", *CPU]
     )
     assert ended.code == 0, ended.text
@@ -31,12 +32,12 @@ def trained(zygote, dataset) -> Path:
 
 
 @pytest.fixture
-def place(zygote, tmp_path) -> Iterator[Path]:
+def place(runner, tmp_path) -> Iterator[Path]:
     """The output folder; checks that nothing remains in the folder for temporary files."""
     folder = tmp_path / "place"
     folder.mkdir()
     yield folder
-    assert not leftovers(zygote.temporary)
+    assert not leftovers(runner.temporary)
 
 
 @contextmanager
@@ -103,11 +104,11 @@ SUBCOMMANDS = ["convert", "train", "resume", "render", "video", "evaluate", "sfm
 
 
 @pytest.mark.parametrize("subcommand", SUBCOMMANDS)
-def test_a_read_only_folder(subcommand, zygote, place, trained, dataset, photos):
+def test_a_read_only_folder(subcommand, runner, place, trained, dataset, photos):
     shutil.copytree(trained, place / "trained")
     before = {name: digest(place / name) for name in names_in(place)}
     with read_only(place):
-        ended = zygote.run(commands(place, trained, dataset, photos)[subcommand])
+        ended = runner.run(commands(place, trained, dataset, photos)[subcommand])
     if subcommand == "evaluate":  # the figures are printed
         assert (ended.code, "metrics.json was not written" in ended.text) == (0, True)
     else:
@@ -116,14 +117,14 @@ def test_a_read_only_folder(subcommand, zygote, place, trained, dataset, photos)
 
 
 @pytest.mark.parametrize("subcommand", SUBCOMMANDS)
-def test_a_full_disk(subcommand, zygote, place, trained, dataset, photos):
+def test_a_full_disk(subcommand, runner, place, trained, dataset, photos):
     # There is hardly more space than the existing files need.
     used = sum((trained / name).stat().st_size // 4096 + 1 for name in names_in(trained)) * 4
     with full(place, used + 60 + 4 * len(names_in(trained))):
         shutil.copytree(trained, place / "trained")
         fill(place)
         before = {name: digest(place / name) for name in names_in(place)}
-        ended = zygote.run(commands(place, trained, dataset, photos)[subcommand])
+        ended = runner.run(commands(place, trained, dataset, photos)[subcommand])
         if subcommand == "evaluate":
             assert (ended.code, "metrics.json was not written" in ended.text) == (0, True)
         else:
@@ -134,52 +135,52 @@ def test_a_full_disk(subcommand, zygote, place, trained, dataset, photos):
         assert not changed, f"{subcommand} changed {changed}"
 
 
-def test_a_disk_that_becomes_full_during_training(zygote, place, dataset):
+def test_a_disk_that_becomes_full_during_training(runner, place, dataset):
     """The last checkpoint stays valid. With free space, the resumed run produces the same scene."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 60, "--checkpoint-every", 10, *CPU]
-    assert zygote.run(command).code == 0
+    assert runner.run(command).code == 0
     scene = out / "point_cloud/iteration_60/point_cloud.ply"
     whole = digest(scene)
     size = max(path.stat().st_size for path in out.glob("checkpoints/*"))
     shutil.rmtree(out)
     # Space for two and a half checkpoints and the other files.
     with full(place, 32 + int(2.5 * size) // 1024):
-        refused(zygote.run(command), rf"{out}/checkpoints/step_\S+: No space left on device")
+        refused(runner.run(command), rf"{out}/checkpoints/step_\S+: No space left on device")
         check_whole(place)
         newest = checkpoint.latest(out / "checkpoints")
         assert newest is not None
         assert not leftovers(place)
         subprocess.run(["mount", "-o", "remount,size=10m", place], check=True)
-        again = zygote.run([*command, "--resume"])
+        again = runner.run([*command, "--resume"])
         assert again.code == 0, again.text
         assert f"step {newest.step} of 60" in again.text
         assert digest(scene) == whole
 
 
-def test_a_disk_too_full_for_the_first_scene(zygote, place, dataset):
+def test_a_disk_too_full_for_the_first_scene(runner, place, dataset):
     """The training run has no result, so nothing is kept, and the same command starts again."""
     out = place / "out"
     command = ["train", dataset, "-o", out, "--iterations", 20, "--save-iterations", 10, *CPU]
     with full(place, 90):
-        refused(zygote.run(command), rf"{out}/point_cloud/\S+: No space left on device")
+        refused(runner.run(command), rf"{out}/point_cloud/\S+: No space left on device")
         assert not out.exists()
         subprocess.run(["mount", "-o", "remount,size=10m", place], check=True)
-        again = zygote.run(command)
+        again = runner.run(command)
         assert again.code == 0, again.text
 
 
-def test_a_disk_that_becomes_full_during_sfm(zygote, place, photos):
+def test_a_disk_that_becomes_full_during_sfm(runner, place, photos):
     """Finished stages are kept; with free space the same command resumes."""
     out = place / "garden"
     command = ["sfm", photos, "-o", out, "--quality", "draft", "--threads", 1]
     with full(place, 700):
         refused(
-            zygote.run(command), rf"{out}: the disk is full; free some space, then run the same"
+            runner.run(command), rf"{out}: the disk is full; free some space, then run the same"
         )
         assert list(json.loads((out / "sfm.json").read_text())["stages"]) == ["photos"]
         subprocess.run(["mount", "-o", "remount,size=50m", place], check=True)
-        again = zygote.run(command)
+        again = runner.run(command)
         assert again.code == 0, again.text
         assert again.text.count("done before") == 1
         assert not leftovers(place)
@@ -205,11 +206,11 @@ def has_checkpoint(out: Path) -> Callable[[], bool]:
     return lambda: any(out.glob("checkpoints/step_*"))
 
 
-def test_a_training_run_whose_folder_is_moved_continues(zygote, place, dataset):
+def test_a_training_run_whose_folder_is_moved_continues(runner, place, dataset):
     """The training run creates a new folder, so that hours of work are not lost."""
     out, elsewhere = place / "out", place / "elsewhere"
     command = ["train", dataset, "-o", out, "--iterations", 400, "--checkpoint-every", 10, "--eval"]
-    ended = zygote.run(
+    ended = runner.run(
         [*command, *CPU],
         while_it_runs=when(has_checkpoint(out), lambda: out.rename(elsewhere)),
     )
@@ -220,24 +221,24 @@ def test_a_training_run_whose_folder_is_moved_continues(zygote, place, dataset):
     assert not leftovers(place)
     assert checkpoint.latest(elsewhere / "checkpoints") is not None
     assert (out / "point_cloud/iteration_400/point_cloud.ply").is_file()
-    assert zygote.run(["evaluate", out, *CPU]).code == 0
+    assert runner.run(["evaluate", out, *CPU]).code == 0
 
 
-def test_a_training_run_whose_photos_are_removed(zygote, place, dataset):
+def test_a_training_run_whose_photos_are_removed(runner, place, dataset):
     """The photos are removed at the start or before the run resumes. Saved files are kept."""
     mine, out = place / "dataset", place / "out"
     shutil.copytree(dataset, mine)
     command = ["train", mine, "-o", out, "--iterations", 40, "--checkpoint-every", 10, *CPU]
-    assert zygote.run(command).code == 0
+    assert runner.run(command).code == 0
     before = {name: digest(out / name) for name in names_in(out)}
     (mine / "images").rename(place / "moved")
-    ended = zygote.run(["train", "-o", out, "--resume", "--iterations", 60, *CPU])
+    ended = runner.run(["train", "-o", out, "--resume", "--iterations", 60, *CPU])
     refused(ended, rf"{mine}/images")
     assert {name: digest(out / name) for name in names_in(out)} == before
 
     (place / "moved").rename(mine / "images")
     begun = (place / "two" / "config.json").exists
-    ended = zygote.run(
+    ended = runner.run(
         ["train", mine, "-o", place / "two", "--iterations", 40, *CPU],
         while_it_runs=when(begun, lambda: shutil.rmtree(mine / "images")),
     )
@@ -247,17 +248,17 @@ def test_a_training_run_whose_photos_are_removed(zygote, place, dataset):
 
 
 @pytest.mark.parametrize("subcommand", ["sfm", "make"])
-def test_photos_or_the_folder_are_removed_during_sfm(subcommand, zygote, place, photos):
+def test_photos_or_the_folder_are_removed_during_sfm(subcommand, runner, place, photos):
     mine, out = place / "photos", place / "out"
     shutil.copytree(photos, mine)
     command = [subcommand, mine, "-o", out, "--quality", "draft", "--threads", 1]
     inner = out / "dataset" if subcommand == "make" else out
     begun = (inner / "distorted" / "database.db").exists
     # The photos have been copied already, so it may succeed.
-    ended = zygote.run(command, while_it_runs=when(begun, lambda: shutil.rmtree(inner / "input")))
+    ended = runner.run(command, while_it_runs=when(begun, lambda: shutil.rmtree(inner / "input")))
     refused(ended, r"input|images")
     shutil.rmtree(out, ignore_errors=True)
-    ended = zygote.run(command, while_it_runs=when(begun, lambda: out.rename(place / "moved")))
+    ended = runner.run(command, while_it_runs=when(begun, lambda: out.rename(place / "moved")))
     refused(ended, rf"{out}\S*: No such file or directory")
     check_whole(place / "moved")
 
@@ -266,11 +267,11 @@ def test_photos_or_the_folder_are_removed_during_sfm(subcommand, zygote, place, 
 
 
 @pytest.mark.parametrize("subcommand", ["convert", "train", "resume", "render", "video", "sfm"])
-def test_a_limit_of_the_size_of_files(subcommand, zygote, place, trained, dataset, photos):
+def test_a_limit_of_the_size_of_files(subcommand, runner, place, trained, dataset, photos):
     shutil.copytree(trained, place / "trained")
     before = {name: digest(place / name) for name in names_in(place)}
     limit = {"sfm": 50_000, "resume": 5000}.get(subcommand, 500)
-    ended = zygote.run(
+    ended = runner.run(
         commands(place, trained, dataset, photos)[subcommand], limits={"RLIMIT_FSIZE": limit}
     )
     refused(ended, r"File too large")
@@ -281,11 +282,11 @@ def test_a_limit_of_the_size_of_files(subcommand, zygote, place, trained, datase
 
 
 @pytest.mark.parametrize("subcommand", SUBCOMMANDS)
-def test_a_limit_of_open_files(subcommand, zygote, place, trained, dataset, photos):
+def test_a_limit_of_open_files(subcommand, runner, place, trained, dataset, photos):
     """The limit is so low that hardly any file can be opened."""
     shutil.copytree(trained, place / "trained")
     before = names_in(place)
-    ended = zygote.run(
+    ended = runner.run(
         commands(place, trained, dataset, photos)[subcommand], limits={"RLIMIT_NOFILE": 1}
     )
     refused(ended, r"Too many open files")
@@ -315,12 +316,12 @@ def bars(text: str) -> list[str]:
     return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", bar) for bar in found]
 
 
-def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
+def test_a_narrow_terminal(runner, place, trained, dataset, photos):
     all_commands = commands(place, trained, dataset, photos)
     shutil.copytree(trained, place / "trained")
     longer = ["train", dataset, "-o", place / "t", "--iterations", 1000, *CPU]
     for command in (longer, all_commands["sfm"], all_commands["video"], all_commands["evaluate"]):
-        ended = zygote.run(command, columns=24)
+        ended = runner.run(command, columns=24)
         assert ended.code == 0, ended.text
         assert "Traceback" not in ended.text
         for bar in bars(ended.text):
@@ -330,28 +331,26 @@ def test_a_narrow_terminal(zygote, place, trained, dataset, photos):
             assert steps, ended.text
             assert all(steps), bars(ended.text)  # numbers are not truncated
             assert ended.text.count("\x1b[?25l") == ended.text.count("\x1b[?25h") == 1  # cursor
-    ended = zygote.run(["train", dataset, "-o", place / "t", *CPU], columns=24)
+    ended = runner.run(["train", dataset, "-o", place / "t", *CPU], columns=24)
     assert ended.code == 2
     assert len(shown(ended.text.strip())) == 1
 
 
-def test_view_of_a_missing_scene(zygote, place, trained):
+def test_view_of_a_missing_scene(runner, place, trained):
     """`view` is the only subcommand that writes nothing: a missing scene is a one-line error."""
     shutil.copytree(trained, place / "trained")
     shutil.rmtree(place / "trained" / "point_cloud")
-    refused(zygote.run(["view", place / "trained", "--no-browser"]), "contains no scene")
+    refused(runner.run(["view", place / "trained", "--no-browser"]), "contains no scene")
 
 
-def test_zygote_has_the_result_of_the_command(zygote, trained, tmp_path):
+def test_a_run_has_the_result_of_the_command(runner, trained, tmp_path):
     """The file is the same as that of a separate process."""
-    assert isinstance(zygote, Zygote)
-    for folder in (zygote.folder / "by zygote", tmp_path):
-        folder.mkdir(exist_ok=True)
-    assert zygote.run(["convert", trained, zygote.folder / "by zygote" / "a.spz"]).code == 0
+    (runner.folder / "forked").mkdir()
+    assert runner.run(["convert", trained, runner.folder / "forked" / "a.spz"]).code == 0
     source = Path(checkpoint.__file__).parents[2]
     subprocess.run(
-        ["python", "-m", "snowsplat", "convert", trained, tmp_path / "a.spz"],
+        [sys.executable, "-m", "snowsplat", "convert", trained, tmp_path / "a.spz"],
         env={**os.environ, "PYTHONPATH": str(source)},
         check=True,
     )
-    assert digest(tmp_path / "a.spz") == digest(zygote.folder / "by zygote" / "a.spz")
+    assert digest(tmp_path / "a.spz") == digest(runner.folder / "forked" / "a.spz")

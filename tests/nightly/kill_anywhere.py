@@ -25,7 +25,7 @@ from kill.harness import (
     Defect,
     Job,
     Killer,
-    Zygote,
+    Runner,
     convert_jobs,
     make_jobs,
     sfm_jobs,
@@ -75,15 +75,14 @@ def main() -> int:
     share = sum(_SHARES[subcommand] for subcommand in flags.subcommands)
     defects: list[Defect] = []
     start = time.monotonic()
-    with Zygote(folder / "work", popen) as zygote:
-        killer = Killer(zygote, flags.seed)
-        for subcommand in flags.subcommands:
-            selected = [job for job in everything if job.subcommand == subcommand]
-            found = killer.kill(selected, math.ceil(flags.kills * _SHARES[subcommand] / share))
-            print_tally(killer, subcommand)
-            for defect in found:
-                print(f"DEFECT {defect}", flush=True)
-            defects += found
+    killer = Killer(Runner(folder / "work", popen), flags.seed)
+    for subcommand in flags.subcommands:
+        selected = [job for job in everything if job.subcommand == subcommand]
+        found = killer.kill(selected, math.ceil(flags.kills * _SHARES[subcommand] / share))
+        print_tally(killer, subcommand)
+        for defect in found:
+            print(f"DEFECT {defect}", flush=True)
+        defects += found
     kills = sum(tally.kills for tally in killer.tallies.values())
     print(f"{kills} kills in {time.monotonic() - start:.0f} s, {len(defects)} defects")
     if not defects:

@@ -34,7 +34,7 @@ def test_photos_are_counted_with_what_is_known_of_them(tmp_path):
 def test_a_video_is_described(tmp_path):
     write_video(tmp_path / "walk.mp4", pan(20))
     (line,) = describe(tmp_path / "walk.mp4")["videos"].values()
-    assert line.endswith("of 20 frames will be used")
+    assert str(line).endswith("of 20 frames will be used")
 
 
 def test_a_folder_without_photos_and_poses_is_refused(tmp_path):

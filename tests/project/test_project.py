@@ -12,8 +12,9 @@ from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.project.edit_record import EditRecord, edited_file, record_file
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import Project, is_output
-from snowsplat.project.training_folder import DatasetSettings, TrainingFolder
+from snowsplat.project.training_folder import UNEXPLAINED, DatasetSettings, TrainingFolder
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 TRAINING = {"sh_degree": 3, "background": "white", "iterations": 7}
 
@@ -113,7 +114,9 @@ def test_damaged_record_of_make(made, record):
 def test_photos_that_were_left_out_at_every_stage(made):
     dataset = DatasetFolder(made / "dataset")
     dataset.path.mkdir()
-    unreadable = [LeftOut("/p", "photos", why) for why in ("a broken link", "is empty")]
+    unreadable = [
+        LeftOut("/p", "photos", why) for why in (message("a broken link"), message("is empty"))
+    ]
     results = {
         "photos": {"left_out": [asdict(each) for each in unreadable]},
         "poses": {"unregistered": {"2.jpg": "it matches no other photo"}},
@@ -121,11 +124,11 @@ def test_photos_that_were_left_out_at_every_stage(made):
     stages = {name: {"result": result} for name, result in results.items()}
     dataset.record.write_text(json.dumps({"stages": stages}))
     training = TrainingFolder(made / "scene")
-    unexplained = LeftOut("3.jpg", "training", "the scene does not explain it")
+    unexplained = LeftOut("3.jpg", "training", UNEXPLAINED)
     training.write_metrics(7, "test", {"psnr": 20.0}, [unexplained])
     assert Project.open(made).left_out == [
         *unreadable,
-        LeftOut("2.jpg", "poses", "it matches no other photo"),
+        LeftOut("2.jpg", "poses", message("it matches no other photo")),
         unexplained,
     ]
     training.write_metrics(7, "train", {"psnr": 21.0})  # the list is kept

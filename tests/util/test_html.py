@@ -96,7 +96,7 @@ def test_pictures_open_large_by_click_and_key(tmp_path):
     [(0.0, "0.0 s"), (5.12, "5.1 s"), (99, "99 s"), (130, "2 min 10 s"), (6000, "1 h 40 min")],
 )
 def test_duration(seconds, words):
-    assert duration(seconds) == words
+    assert str(duration(seconds)) == words
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from snowsplat.data.photos.decode import ImageSource
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import HERE, Origin
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import Message
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +107,7 @@ class Dataset:
     test: list[View]  # sorted by name
     points: Points | None  # None: the dataset has no points; `bounds` is estimated from cameras
     extent: float  # world units; see `scene_extent`
-    description: str = ""  # the files it was read from, for messages
+    description: str | Message = ""  # the files it was read from, for messages
     origin: Origin = HERE  # of cameras and points, in the world frame of the files
     metres_per_unit: float | None = None  # true length of a world unit; None: unknown
 

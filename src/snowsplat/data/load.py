@@ -26,6 +26,7 @@ from snowsplat.project.training_folder import DatasetSettings
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.origin import Origin
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import Message
 from snowsplat.util.names import first_names
 from snowsplat.util.safe_json import is_file
 
@@ -105,7 +106,7 @@ class DatasetFiles:
     images: list[tuple[PosedImage, ImageSize]]
     circles: Mapping[Lens, float]
     points: Points | None
-    description: str
+    description: str | Message
     test_names: set[str]
     origin: Origin
     metres_per_unit: float | None

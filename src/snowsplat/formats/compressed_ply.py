@@ -30,6 +30,7 @@ from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.ply import is_antialiased, placement_in, scene_comments
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.files import write_bytes
+from snowsplat.util.messages import message
 from snowsplat.util.ply import PlyTable, header_of, open_table
 
 _CHUNK = 256
@@ -174,7 +175,8 @@ def _encode(path: Path, gaussians: GaussianArrays) -> list[bytes]:
     n, k = sh_rest.shape[:2]
     cut = packing.Cut(path, "compressed PLY", n)
     packing.cut_scales(cut, log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT, step=0)
-    cut.note("SH", (np.abs(sh_rest) > _SH_LIMIT).any((1, 2)), "at most 4", rare=True)
+    beyond = (np.abs(sh_rest) > _SH_LIMIT).any((1, 2))
+    cut.note(message("SH"), beyond, message("at most 4"), rare=True)
     log_scales = np.clip(log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
     colors = 0.5 + SH_C0 * sh_dc[:, 0]
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from snowsplat.scene.origin import HERE, Origin, origin_of
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     from snowsplat.scene.gaussians import Gaussians
@@ -112,16 +113,16 @@ class GaussianArrays:
         """(N,) bool: see `snowsplat.Gaussians.usable_rows`."""
         return ~np.any(list(self._unusable().values()), axis=0)
 
-    def _unusable(self) -> dict[str, np.ndarray]:
+    def _unusable(self) -> dict[Message, np.ndarray]:
         """(N,) bool by what is wrong."""
         rows = {
-            "positions": ~np.isfinite(self.means).all(1),
-            "scales": (np.isnan(self.log_scales) | (self.log_scales == np.inf)).any(1),
-            "rotations": ~np.isfinite(self.quats).all(1),
-            "opacities": np.isnan(self.opacity_logits),
+            message("positions"): ~np.isfinite(self.means).all(1),
+            message("scales"): (np.isnan(self.log_scales) | (self.log_scales == np.inf)).any(1),
+            message("rotations"): ~np.isfinite(self.quats).all(1),
+            message("opacities"): np.isnan(self.opacity_logits),
         }
         sh = np.isfinite(self.sh_dc).all((1, 2)) & np.isfinite(self.sh_rest).all((1, 2))
-        return rows | {"colours": ~sh}
+        return rows | {message("colours"): ~sh}
 
     def _with(self, *arrays: np.ndarray) -> GaussianArrays:
         own: dict[str, Any] = dict(zip(_ARRAYS, arrays, strict=True))
@@ -158,15 +159,23 @@ def without_unusable(path: Path, gaussians: GaussianArrays) -> GaussianArrays:
     return gaussians.select(gaussians.usable_rows())
 
 
-def unusable(gaussians: GaussianArrays) -> str | None:
-    """How many Gaussians are not usable, and why, as text; None if all are."""
+def unusable(gaussians: GaussianArrays) -> Message | None:
+    """How many Gaussians are not usable, and why; None if all are."""
     # In most files all values are finite. Then all sums are finite, which is a much faster test.
     with np.errstate(all="ignore"):
         if all(np.isfinite(array.sum()) for array in gaussians):
             return None
-    reasons = {what: int(rows.sum()) for what, rows in gaussians._unusable().items()}
     count = int((~gaussians.usable_rows()).sum())
     if not count:
         return None
-    found = ", ".join(f"{what} of {n:,}" for what, n in reasons.items() if n)
-    return f"{count:,} of {len(gaussians.means):,} Gaussians are not finite ({found})"
+    found = [
+        message("{what} of {n:,}", what=what, n=int(rows.sum()))
+        for what, rows in gaussians._unusable().items()
+        if rows.any()
+    ]
+    return message(
+        "{count:,} of {all:,} Gaussians are not finite ({found})",
+        count=count,
+        all=len(gaussians.means),
+        found=found,
+    )

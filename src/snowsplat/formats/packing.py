@@ -17,6 +17,7 @@ import numpy as np
 from snowsplat.formats.damage import Unsupported
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.scene.sh_constants import SH_C0
+from snowsplat.util.messages import Message, message
 
 logger = logging.getLogger(__name__)
 
@@ -75,9 +76,9 @@ class Cut:
 
     def __init__(self, path: Path, format: str, count: int) -> None:
         self._path, self._format, self._count = path, format, count
-        self._found: list[str] = []
+        self._found: list[Message] = []
 
-    def note(self, what: str, rows: Any, details: str = "", *, rare: bool = False) -> None:
+    def note(self, what: Message, rows: Any, details: Message, *, rare: bool = False) -> None:
         """Note values that were cut.
 
         Args:
@@ -89,7 +90,9 @@ class Cut:
         """
         count = int(np.count_nonzero(rows))
         if count > (_RARE * self._count if rare else 0):
-            self._found.append(f"{what} of {count:,}{f' ({details})' if details else ''}")
+            self._found.append(
+                message("{what} of {n:,} ({details})", what=what, n=count, details=details)
+            )
 
     def report(self, advice: str) -> None:
         """Log what was noted, and what to do."""
@@ -98,7 +101,7 @@ class Cut:
                 "%s: cut to the range of %s: %s of %s Gaussians; %s",
                 self._path,
                 self._format,
-                ", ".join(self._found),
+                message("{found}", found=self._found),
                 f"{self._count:,}",
                 advice,
             )
@@ -114,11 +117,13 @@ def cut_scales(cut: Cut, log_scales: np.ndarray, low: float, high: float, step: 
         return
     longest = log_scales.max(1)
     largest, smallest = float(np.exp(longest.max())), float(np.exp(longest.min()))
-    details = f"up to {largest:.4g}, at most {math.exp(high):.4g}"
-    cut.note("the large scales", longest > high + step, details)
+    details = message("up to {found:.4g}, at most {limit:.4g}", found=largest, limit=math.exp(high))
+    cut.note(message("the large scales"), longest > high + step, details)
     thick = (log_scales.min(1) < low - step) & (longest < low + math.log(10))
-    details = f"down to {smallest:.4g}, at least {math.exp(low):.4g}"
-    cut.note("the small scales", thick, details, rare=True)
+    details = message(
+        "down to {found:.4g}, at least {limit:.4g}", found=smallest, limit=math.exp(low)
+    )
+    cut.note(message("the small scales"), thick, details, rare=True)
 
 
 def linear_values(cut: Cut, gaussians: GaussianArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -39,6 +39,7 @@ from snowsplat.formats.spz_container import (
 )
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.files import write_bytes
+from snowsplat.util.messages import message
 
 __all__ = ["WRITTEN_VERSIONS", "is_spz", "parse_spz", "read_spz", "spz_version", "write_spz"]
 
@@ -207,11 +208,13 @@ def write_spz(path: Path | str, gaussians: GaussianArrays, version: int = 3) -> 
     header = Header(version, len(means), degree, bits, flags)
     write_bytes(path, pack(header, [column.tobytes() for column in columns]))
     if len(means) and 2.0**-bits > 0.5 * math.exp(min(80.0, float(np.median(log_scales.max(1))))):
-        cut.note("positions", np.ones(len(means), bool), f"in steps of {2.0**-bits:.2g}")
+        details = message("in steps of {size:.2g}", size=2.0**-bits)
+        cut.note(message("positions"), np.ones(len(means), bool), details)
     packing.cut_scales(cut, log_scales, *_SCALE_RANGE, step=1 / 32)
     beyond = (np.abs(sh_dc) > _COLOR_LIMIT + 0.5 / _COLOR_STEP).any((1, 2))
-    cut.note("colours", beyond, "from -0.44 to 1.44", rare=True)
-    cut.note("SH", (np.abs(sh_rest) > 1 + _SH_STEPS[1] / 128).any((1, 2)), "at most 1", rare=True)
+    cut.note(message("colours"), beyond, message("from -0.44 to 1.44"), rare=True)
+    beyond = (np.abs(sh_rest) > 1 + _SH_STEPS[1] / 128).any((1, 2))
+    cut.note(message("SH"), beyond, message("at most 1"), rare=True)
     cut.report(_advice(log_scales))
 
 
@@ -240,7 +243,8 @@ def _fractional_bits(means: np.ndarray) -> int:
 def _pack_positions(cut: packing.Cut, means: np.ndarray, bits: int) -> np.ndarray:
     limit = (1 << 23) - 1
     steps = np.rint(means.astype(np.float64) * (1 << bits))
-    cut.note("positions", (np.abs(steps) > limit).any(1), f"at most {limit / (1 << bits):.6g}")
+    details = message("at most {limit:.6g}", limit=limit / (1 << bits))
+    cut.note(message("positions"), (np.abs(steps) > limit).any(1), details)
     fixed = np.clip(steps, -limit, limit)
     return fixed.astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 

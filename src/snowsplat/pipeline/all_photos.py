@@ -26,6 +26,7 @@ from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.rates import DecayRates
 from snowsplat.training.settings.schedule import Schedule
 from snowsplat.training.settings.stored import config_from_json
+from snowsplat.util.messages import Message, message
 
 #: The steps, relative to those of the training.
 SHARE = 0.12
@@ -44,7 +45,7 @@ class LastPart:
     steps: int = 0
     photos: int = 0  # their number
     left_out: int = 0  # the number of photos that the scene does not explain
-    why_not: str = ""  # why there was no last part; "" if there was one
+    why_not: Message | None = None  # why there was no last part; None if there was one
 
 
 def train_on_all(
@@ -66,7 +67,7 @@ def train_on_all(
     Raises: UserError: scene, settings, dataset or a photo are missing or damaged.
     """
     if folder.masks.is_dir():
-        return LastPart(why_not="something moves in the photos"), None
+        return LastPart(why_not=message("something moves in the photos")), None
     scene = load_trained(folder.path, iteration=iteration, compute=compute)
     left_out = {each.photo for each in folder.left_out()}
     used = [view for view in scene.dataset.train if view.name not in left_out]
@@ -77,7 +78,7 @@ def train_on_all(
         pace = sum(each.seconds for each in last) / max(1, sum(each.steps for each in last))
         steps = min(steps, int(seconds / pace)) if pace > 0 else 0
     if steps < _LOOKS * len(views):
-        return LastPart(why_not="it would use each photo less than twice"), None
+        return LastPart(why_not=message("it would use each photo less than twice")), None
     background = torch.tensor(scene.background, device=scene.gaussians.means.device)
     with ImageLoader(views, device=background.device) as images:
         wrong = unexplained_views(

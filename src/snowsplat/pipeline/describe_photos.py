@@ -18,9 +18,11 @@ from snowsplat.sfm.ingest.search.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES, 
 from snowsplat.sfm.ingest.video.clip import max_frame_count, read_clip
 from snowsplat.util.duration import duration
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message, message
 
 # So many files that are not used are named; the others are counted.
 _NAMED = 5
+_NO_PHOTO = message("has no photo")  # a mask
 
 
 def describe_photos(sources: Sources) -> dict[str, Any]:
@@ -32,7 +34,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
     """
     path = sources.inputs[0]
     headers, left_out = _headers(sources.photos), list(sources.left_out)
-    unusable = {name: header for name, header in headers.items() if isinstance(header, str)}
+    unusable = {name: header for name, header in headers.items() if isinstance(header, Message)}
     usable = [header for header in headers.values() if isinstance(header, Header)]
     left_out += [LeftOut(name, "photos", why) for name, why in unusable.items()]
     photos = survey(sources)
@@ -45,9 +47,11 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
         **(_of_photos(usable, sources.photos) if sources.photos else {}),
         **({"videos": _of_videos(sources.videos)} if sources.videos else {}),
         **_first([(each.photo, each.reason) for each in left_out], "not_used"),
-        **_first([(shown(p), "has no photo") for p in sources.unused_masks], "unused_masks"),
+        **_first(
+            [(shown(p), message("has no photo")) for p in sources.unused_masks], "unused_masks"
+        ),
         **({} if doubt is None else {"doubtful": doubt}),
-        "camera_poses": f"none; to estimate them takes about {time}",
+        "camera_poses": message("none; to estimate them takes about {time}", time=time),
         "next": f"snowsplat make {path}",
     }
 
@@ -64,18 +68,20 @@ def describe_zip(path: Path) -> dict[str, Any]:
         "photos": sum(suffix in PHOTO_SUFFIXES for suffix in suffixes),
         "videos": sum(suffix in VIDEO_SUFFIXES for suffix in suffixes),
         "files": len(suffixes),
-        "next": f"snowsplat make {path}, which unpacks it into a folder beside it",
+        "next": message(
+            "snowsplat make {path}, which unpacks it into a folder beside it", path=path
+        ),
     }
 
 
-def _headers(photos: Sequence[Source]) -> dict[str, Header | str]:
+def _headers(photos: Sequence[Source]) -> dict[str, Header | Message]:
     """By file: its header, or the reason why the photo is unusable."""
-    found: dict[str, Header | str] = {}
+    found: dict[str, Header | Message] = {}
     for source in photos:
         try:
             found[shown(source.path)] = read_header(source.path)
         except Unusable as error:
-            found[shown(source.path)] = str(error)
+            found[shown(source.path)] = error.message
     return found
 
 
@@ -99,23 +105,27 @@ def _counts(names: Any) -> dict[str, int]:
     return dict(Counter(names).most_common(_NAMED))
 
 
-def _of_videos(sources: Sequence[Source]) -> dict[str, str]:
+def _of_videos(sources: Sequence[Source]) -> dict[str, Message]:
     described = {}
     for source in sources:
         clip = read_clip(source.path)
         used = max_frame_count(clip, None, None)
-        described[shown(source.path)] = (
-            f"{clip.width}x{clip.height}, {duration(clip.seconds)}, "
-            f"{used} of {clip.packets} frames will be used"
+        described[shown(source.path)] = message(
+            "{width}x{height}, {time}, {used} of {frames} frames will be used",
+            width=clip.width,
+            height=clip.height,
+            time=duration(clip.seconds),
+            used=used,
+            frames=clip.packets,
         )
     return described
 
 
-def _first(reasons: Sequence[tuple[str, str]], key: str) -> dict[str, Any]:
+def _first(reasons: Sequence[tuple[str, Message]], key: str) -> dict[str, Any]:
     """An entry for the first files and the number of all; none if there are no files."""
     if not reasons:
         return {}
     named: dict[str, Any] = dict(reasons[:_NAMED])
     if len(reasons) > _NAMED:
-        named["and"] = f"{len(reasons) - _NAMED} more"
+        named["and"] = message("{n} more", n=len(reasons) - _NAMED)
     return {key: named}

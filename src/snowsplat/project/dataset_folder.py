@@ -20,6 +20,7 @@ from typing import Any
 
 from snowsplat.project.inside import Inside
 from snowsplat.project.left_out import LeftOut
+from snowsplat.util.messages import as_message
 from snowsplat.util.safe_json import read_json
 
 #: The folders that undistortion writes.
@@ -70,6 +71,12 @@ class DatasetFolder:
 def left_out_of(photos: Mapping[str, Any], poses: Mapping[str, Any]) -> list[LeftOut]:
     """The photos that these stages have left out; their results are those of the record."""
     return [
-        *(LeftOut(**values) for values in photos.get("left_out", [])),
-        *(LeftOut(photo, "poses", why) for photo, why in poses.get("unregistered", {}).items()),
+        *(
+            LeftOut(each["photo"], each["stage"], as_message(each["reason"]))
+            for each in photos.get("left_out", [])
+        ),
+        *(
+            LeftOut(photo, "poses", as_message(why))
+            for photo, why in poses.get("unregistered", {}).items()
+        ),
     ]

@@ -46,6 +46,7 @@ from snowsplat.util.files import (
     write_json,
     write_text,
 )
+from snowsplat.util.messages import message
 from snowsplat.util.run_lock import LOCK
 from snowsplat.util.safe_json import from_json, read_json
 
@@ -56,7 +57,7 @@ Color = tuple[float, float, float]
 #: Folders inside the folder of `make`: the dataset, and the output folder of its training.
 DATASET, SCENE = "dataset", "scene"
 #: Why the training has left a photo out.
-UNEXPLAINED = "the scene does not explain it"
+UNEXPLAINED = message("the scene does not explain it")
 _SCENE = re.compile(r"iteration_(\d+)")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from snowsplat.project.studio_scene import StudioScene, is_studio_scene
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import as_message
 from snowsplat.util.safe_json import printable
 
 _DEFAULT = "snowsplat_scenes"
@@ -46,7 +47,7 @@ class Library:
             try:
                 os.stat(path)
             except (OSError, ValueError) as error:
-                why = getattr(error, "strerror", None) or "no such file or folder"
+                why = as_message(getattr(error, "strerror", None) or "No such file or directory")
                 raise UserError("{path}: {why}", path=printable(str(path))[:200], why=why) from None
         title = safe_title(title)
         name = safe_name(title)

@@ -17,6 +17,7 @@ from snowsplat.studio.picture_requests import SUFFIXES
 from snowsplat.studio.requests import File, Studio, json_object
 from snowsplat.studio.scene_requests import summary
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import as_message
 from snowsplat.util.safe_json import printable
 from snowsplat.util.theme import THEME
 
@@ -84,9 +85,9 @@ def listing(path: Path) -> dict[str, Any]:
         entries = sorted(path.iterdir(), key=lambda entry: entry.name.casefold())
     except (OSError, ValueError) as error:
         raise UserError(
-            "{path}: {getattr}",
+            "{path}: {error}",
             path=printable(str(path)),
-            getattr=getattr(error, "strerror", None) or "no such folder",
+            error=as_message(getattr(error, "strerror", None) or "No such file or directory"),
         ) from None
     shown = [entry for entry in entries if not entry.name.startswith(".")]
     folders = [entry.name for entry in shown if is_folder(entry)]

@@ -44,7 +44,6 @@ _REPORT_POLICY = (
 _TOOLS = (
     '<link rel="stylesheet" href="../../../theme.css" />'
     '<link rel="stylesheet" href="../../../tools.css" />'
-    '<script src="../../../chinese.js"></script><script src="../../../told.js"></script>'
     '<script type="module" src="../../../tools.js" data-page="{page}" data-edited="{edited}" '
     'data-version="{version}"></script>'
 )

@@ -15,6 +15,7 @@ from snowsplat.project.studio_scene import PART, StudioScene
 from snowsplat.studio.library import safe_name
 from snowsplat.util.byte_size import format_bytes
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 # While it arrives, a file has its size and time in its name: that of another one is not continued.
 _PART_NAME = re.compile(rf"(?P<name>.+)\.(?P<size>\d+)-(?P<modified>\d+){re.escape(PART)}", re.S)

@@ -139,10 +139,17 @@ def survey_photos(scene: StudioScene, settings: Any = None) -> dict[str, Any]:
             seconds[quality] += predicted_seconds(photos, preset.photos, quality, speed)
     facts = describe_photos(sources) | {"poses": sources.posed is not None}
     return {
-        "facts": facts,
+        "facts": {name: _in_languages(value) for name, value in facts.items()},
         "count": photos.count,
         "seconds": {quality: round(value) for quality, value in seconds.items()},
     }
+
+
+def _in_languages(value: Any) -> Any:
+    """A fact with its texts in each language: see `in_languages`."""
+    if isinstance(value, dict):
+        return {name: _in_languages(each) for name, each in value.items()}
+    return in_languages(value) if isinstance(value, Message) else value
 
 
 def _preview(scene: StudioScene, settings: Any) -> dict[str, Any]:

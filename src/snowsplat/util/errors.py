@@ -27,6 +27,17 @@ class UserError(Exception):
         return str(self.message)
 
 
+#: What systems say of files, as `message_of` finds it.
+SYSTEM_ERRORS = (
+    message("No such file or directory"),
+    message("Not a directory"),
+    message("Permission denied"),
+    message("No space left on device"),
+    message("Read-only file system"),
+    message("Input/output error"),
+)
+
+
 def message_of(error: OSError, cause: str | None = None) -> Message:
     """An error of the system in one line: the file, and what is wrong.
 

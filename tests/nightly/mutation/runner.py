@@ -5,14 +5,21 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from mutation.mutants import Mutant
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from fork_server import Process, Server
 
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGE = ROOT / "src" / "snowsplat"
@@ -89,20 +96,12 @@ class Runner:
             "OMP_NUM_THREADS": "1",
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._folder / "hypothesis"),
         }
-        self._process = subprocess.Popen(
-            [sys.executable, Path(__file__).with_name("zygote.py")],
-            cwd=self.root,
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self._environment = environment
+        self._server = Server("import_libraries", environment)
 
     def close(self) -> None:
         """End the process and remove the copy."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+        self._server.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def coverage(self, tests: Sequence[str]) -> Coverage:
@@ -157,7 +156,7 @@ class Runner:
         isa: str | None = None,
         coverage: str | None = None,
     ) -> Outcome:
-        """Run tests until one fails; see zygote.py.
+        """Run tests until one fails; see run_tests.py.
 
         Args:
             tests: files and folders.
@@ -168,22 +167,40 @@ class Runner:
             coverage: file to which the executed lines are written; if set, all tests run, even if
                 one fails.
         """
-        process = self._process
-        assert process.stdin is not None
-        assert process.stdout is not None
-        temporary = self._folder / "temporary"
+        temporary, outcome = self._folder / "temporary", self._folder / "outcome.json"
         run = {
             "tests": list(tests),
             "order": order,
             "marked": marked,
             "isa": isa,
             "cpu_seconds": cpu_seconds,
-            "seconds": seconds,
             "temporary": str(temporary),
+            "outcome": str(outcome),
             "coverage": coverage,
         }
-        process.stdin.write(json.dumps(run) + "\n")
-        process.stdin.flush()
-        answer = json.loads(process.stdout.readline())
+        (self._folder / "run.json").write_text(json.dumps(run))
+        outcome.unlink(missing_ok=True)
+        request = {
+            "argv": [str(Path(__file__).with_name("run_tests.py")), str(self._folder / "run.json")],
+            "env": self._environment,
+            "cwd": str(self.root),
+            "forks": False,
+            "group": True,
+        }
+        null = subprocess.DEVNULL
+        start, in_time = time.monotonic(), True
+        process = Process(self._server, request, null, null, null)
+        try:
+            process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            in_time = False
+        with suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)  # also the processes that the tests have started
+        code = process.wait()
         shutil.rmtree(temporary, ignore_errors=True)
-        return Outcome(**answer)
+        found = {"outcome": "crashed", "by": None}
+        if outcome.exists():
+            found = json.loads(outcome.read_text())
+        elif not in_time or code in (-signal.SIGXCPU, -signal.SIGKILL):
+            found["outcome"] = "timed out"
+        return Outcome(**found, seconds=time.monotonic() - start)

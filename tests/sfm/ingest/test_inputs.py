@@ -15,6 +15,7 @@ from snowsplat.sfm.ingest.search.sources import find_sources
 from snowsplat.sfm.options import GatherOptions
 from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 
 from ..pictures import HEIGHT, WIDTH, blurred, exif, pan, photo, wall, write_photos, write_video
 
@@ -164,7 +165,7 @@ def test_a_completely_masked_photo_is_skipped(tmp_path):
     (root / "masks").mkdir()
     Image.new("L", (WIDTH, HEIGHT)).save(root / "masks" / "1.png")
     made = gathered(root, tmp_path / "out")
-    assert made.left_out == [not_used(root / "1.jpg", "is completely masked out")]
+    assert made.left_out == [not_used(root / "1.jpg", message("is completely masked out"))]
     assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
 
 
@@ -177,7 +178,7 @@ def test_unusable_photos_are_skipped_and_named(tmp_path):
     made = gathered(root, tmp_path / "out")
     assert [p.name for p in made.photos] == ["0.jpg", "2.jpg", "3.jpg"]
     assert files(tmp_path / "out" / "input") == ["0.jpg", "2.jpg", "3.jpg"]
-    reasons = {os.path.basename(each.photo): each.reason for each in made.left_out}
+    reasons = {os.path.basename(each.photo): str(each.reason) for each in made.left_out}
     assert reasons.keys() == {"1.jpg", "text.jpg", "cap.png"}
     assert "truncated" in reasons["1.jpg"]
     assert "not an image of a known format" in reasons["text.jpg"]
@@ -270,7 +271,7 @@ def test_broken_links_are_named(tmp_path):
     made = gathered(root, tmp_path / "out")
     (found,) = made.left_out
     assert found.photo == str(root)
-    assert "missing: x.jpg and 1 more" in found.reason
+    assert "missing: x.jpg and 1 more" in str(found.reason)
     for photo_file in root.glob("[0-9].jpg"):
         photo_file.unlink()
     with pytest.raises(UserError, match="has links to files that are missing: x.jpg"):
@@ -421,6 +422,6 @@ def test_an_animation_is_named(tmp_path, ending):
     pages[0].save(root / f"a.{ending}", save_all=True, append_images=pages[1:])
     made = gathered(root, tmp_path / "out")
     assert len(made.photos) == 4
-    assert [each.reason for each in made.left_out] == [
+    assert [str(each.reason) for each in made.left_out] == [
         "is an animation of 4 pictures, of which one is used; save the others as photos or a video"
     ]

@@ -59,9 +59,10 @@ def read(models: list[Path], photos: PhotoFolder) -> Reconstruction:
     model = read_model(folder)
     if not model.images:
         raise UserError("{folder}: the COLMAP model has no images; run COLMAP again", folder=folder)
-    found = Reconstruction(
-        description=f"COLMAP model {name} ({'text' if model.text else 'binary'})"
-    )
+    description = message("COLMAP model {name} (binary)", name=name)
+    if model.text:
+        description = message("COLMAP model {name} (text)", name=name)
+    found = Reconstruction(description=description)
     names = _add_images(found, workspace_of(folder, root, photos.images), photos.images, model)
     warn_of_unusable(folder, found.unusable, len(found.images))
     own = points_with_tracks(model, names)

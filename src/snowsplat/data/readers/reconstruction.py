@@ -21,7 +21,7 @@ from snowsplat.data.photos.decode import IMAGE_SUFFIXES, is_photo
 from snowsplat.data.readers import parse
 from snowsplat.scene.camera import Camera
 from snowsplat.util.errors import SettingError, UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -145,7 +145,7 @@ class Reconstruction:
 
     images: list[PosedImage] = field(default_factory=list)
     points: Points | None = None
-    description: str = ""
+    description: str | Message = ""
     metres_per_unit: float | None = None
     total: int = 0
     missing: list[str] = field(default_factory=list)
@@ -241,9 +241,17 @@ def program(
         warn_of_unusable(cameras, found.unusable, len(found.images))
         _report_missing(name, cameras, folder, found)
         aligned = len(found.images) + len(found.missing)
-        found.description = f"{name} {cameras.name}, {aligned} of {found.total} photos aligned"
+        found.description = message(
+            "{program} {file}, {aligned} of {all} photos aligned",
+            program=name,
+            file=cameras.name,
+            aligned=aligned,
+            all=found.total,
+        )
         if found.points_from:
-            found.description += f", points from {found.points_from}"
+            found.description = message(
+                "{cameras}, points from {file}", cameras=found.description, file=found.points_from
+            )
         found.metres_per_unit = metres_per_unit
         return found
 

@@ -112,7 +112,7 @@ _COLUMNS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "published_ssim": ("SSIM", _decimals(3)),
     "published_lpips": ("LPIPS", _decimals(3)),
     "gaussians": ("Gaussians", lambda value: f"{value:,}"),
-    "seconds": ("time", duration),
+    "seconds": ("time", lambda value: str(duration(value))),
     "memory": ("memory GB", lambda value: f"{value / 1e9:.2f}"),
 }
 

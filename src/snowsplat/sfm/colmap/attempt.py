@@ -29,6 +29,7 @@ from snowsplat.sfm.colmap.pairs.pair_matching import match_pairs, verify_pairs
 from snowsplat.sfm.colmap.pairs.retrieval import FEATURES, similarity
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import Mapper
+from snowsplat.util.messages import Message
 
 #: "plain": the incremental mapper with COLMAP's own order of registration.
 AnyMapper = Mapper | Literal["plain"]
@@ -68,7 +69,7 @@ class Attempt:
     mapping: Mapping  # for further work on the models
     models: list[pycolmap.Reconstruction]
     agreement: float  # of the first model with its matches; see `agreement_of`
-    excluded: dict[str, str]  # name -> reason, for photos that had a pose in a wrong place
+    excluded: dict[str, Message]  # name -> reason, for photos that had a pose in a wrong place
     doubts: list[str]  # about the lenses, as text for users
     description: str  # as text for users
 
@@ -177,7 +178,7 @@ class AttemptRunner:
             models = mapping.extend(models)
             added = models[0].num_reg_images() - before
             weak = f", {added} of them with weak matches" if added else ""
-        check, excluded, doubts, agreement = "", dict[str, str](), list[str](), 0.0
+        check, excluded, doubts, agreement = "", dict[str, Message](), list[str](), 0.0
         if models:
             repaired = repair(models[0], mapping, matched.max_error)
             excluded = repaired.excluded

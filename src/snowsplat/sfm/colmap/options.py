@@ -8,6 +8,7 @@ from typing import Any
 
 from snowsplat.sfm.options import EffortName
 from snowsplat.util.machine import processor_count
+from snowsplat.util.messages import Message
 
 # The camera models of COLMAP that can be undistorted to pinhole cameras.
 CAMERA_MODELS = (
@@ -36,7 +37,7 @@ class SfmResult:
     """The quality of the poses in ``distorted/sparse/0``. All fields can be stored as JSON."""
 
     registered: list[str]  # names of photos with a pose, sorted
-    unregistered: dict[str, str]  # name -> the reason, as text for users
+    unregistered: dict[str, Message]  # name -> the reason
     points: int
     observations: int
     # Pixels of the photos in input/, mean over the points that at least three photos see.

@@ -13,13 +13,14 @@ from snowsplat.sfm.colmap.options import SfmResult
 from snowsplat.sfm.colmap.process.check_model import can_be_read
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import inside, quoted
 
 
 def result_of(
     models: Sequence[pycolmap.Reconstruction],
     photos: Sequence[Photo],
-    unregistered: dict[str, str],
+    unregistered: dict[str, Message],
     pairs: str,
     attempts: list[str],
     exif: bool = True,
@@ -99,9 +100,8 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
             )
     if not names & {photo.name for photo in photos}:
         raise _cannot_skip(f"the model in {numbered[0]} has none of the photos in {files.photos}")
-    unregistered = {
-        p.name: "it is not in the existing model" for p in photos if p.name not in names
-    }
+    missing = message("it is not in the existing model")
+    unregistered = {photo.name: missing for photo in photos if photo.name not in names}
     return result_of(models, photos, unregistered, "not matched: the model existed already", [])
 
 

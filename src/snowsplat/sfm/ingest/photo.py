@@ -7,6 +7,7 @@ from pathlib import Path
 
 from snowsplat.project.left_out import LeftOut
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message
 
 Direction = tuple[float, float, float]
 
@@ -47,6 +48,6 @@ class Photo:
     circle: float | None = None  # radius in pixels, if the picture is a disc, as of a fisheye lens
 
 
-def not_used(path: Path, reason: str) -> LeftOut:
+def not_used(path: Path, reason: Message) -> LeftOut:
     """A photo, video or folder that is not used. ``reason`` continues its name."""
     return LeftOut(shown(path), "photos", reason)

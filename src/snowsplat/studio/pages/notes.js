@@ -1,7 +1,7 @@
 // The tool that writes annotations.
 
 import { button, make } from "./page.js";
-import { say, told } from "./text.js";
+import { say } from "./text.js";
 
 const MOST = 25; // the limit of the viewer
 
@@ -63,7 +63,7 @@ export function addNotes({ edits, scene, overlay, world, placement, presentView,
         },
         point(/** @type {number[]} */ point) {
             const { notes } = edits.present;
-            if (notes.length >= MOST) return tell(told(`a scene has at most ${MOST} annotations`));
+            if (notes.length >= MOST) return tell(say("edit_notes_most", MOST));
             const view = presentView();
             const note = {
                 title: say("edit_note_new", notes.length + 1),

@@ -106,16 +106,18 @@ function startForm(
     return form;
 }
 
+const isText = (/** @type {any} */ value) => typeof value !== "object" || "zh" in value;
+
 function factsOf(/** @type {import("./types.js").Survey["facts"]} */ facts) {
     const words = (/** @type {import("./types.js").Fact} */ value) => {
         if (value === true) return say("given");
-        if (typeof value !== "object") return told(String(value));
+        if (isText(value)) return told(value);
         const parts = Object.entries(value).map(([name, what]) => [
             name
                 .split("/")
                 .pop()
                 ?.replace(/^(\d+)x(\d+)$/, "$1 × $2"),
-            told(String(what)),
+            told(what),
         ]);
         return parts.length === 1 && parts[0][1] === String(facts.photos)
             ? parts[0][0]

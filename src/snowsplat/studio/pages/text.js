@@ -225,6 +225,7 @@ const TEXTS = {
     edit_size: ["Size × {0}: one unit is one metre", "尺寸 × {0}：一个单位为一米"],
     edit_start: ["Start with this view", "以此视角开始"],
     edit_start_set: ["The scene will start with this view", "场景将以此视角开始"],
+    edit_notes_most: ["A scene has at most {0} annotations", "一个场景最多有 {0} 个标注"],
     edit_save: ["Save", "保存"],
     edit_saving: ["Saving…", "正在保存…"],
     edit_back: ["Back to the original", "恢复原场景"],
@@ -251,15 +252,13 @@ export function speak(language) {
 }
 
 /**
- * A text of the program in the chosen language. Parts of some messages are English; `told.js` may know these.
- * @param {import("./types.js").Told} text
+ * A text of the program in the chosen language.
+ * @param {import("./types.js").Told | number | boolean} text
  * @returns {string}
  */
 export const told = text => {
-    const { en, zh } = typeof text === "string" ? { en: text, zh: text } : text;
-    if (!column) return en;
-    const known = /** @type {any} */ (globalThis).snowsplatChinese(en);
-    return known === en ? zh : known;
+    if (typeof text !== "object") return String(text);
+    return column ? text.zh : text.en;
 };
 
 /**

@@ -7,6 +7,7 @@ import pytest
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
 from snowsplat.sfm.colmap.database import Pair
 from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.util.messages import Message
 
 
 def photos(count):
@@ -26,7 +27,9 @@ def test_each_photo_without_a_pose_has_its_own_reason():
     pairs += [Pair(1, 6, 400, False), Pair(7, 8, 90, False)]
     evidence = Evidence(features, pairs, 0.2, 36)
     models = [{"0.jpg", "1.jpg", "2.jpg"}, {"7.jpg", "8.jpg"}]
-    reasons = explain(photos(10), evidence, models, {"9.jpg": "its place is wrong"})
+    wrong = {"9.jpg": Message("its place is wrong")}
+    found = explain(photos(10), evidence, models, wrong)
+    reasons = {photo: str(why) for photo, why in found.items()}
     assert list(reasons) == [f"{i}.jpg" for i in (3, 4, 5, 6, 7, 8, 9)]
     assert "hardly any detail (12 features)" in reasons["3.jpg"]
     assert reasons["4.jpg"] == "it matches no other photo"

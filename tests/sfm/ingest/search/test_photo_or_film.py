@@ -19,7 +19,7 @@ def found(root):
     """Names of the used files, and what is said of the others."""
     sources = find_sources([root])
     used = [source.path.name for source in sources.files]
-    return used, {each.photo.rpartition("/")[2]: each.reason for each in sources.left_out}
+    return used, {each.photo.rpartition("/")[2]: str(each.reason) for each in sources.left_out}
 
 
 def test_a_video_and_its_thumbnail(tmp_path, video):

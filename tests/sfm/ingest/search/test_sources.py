@@ -43,7 +43,7 @@ def test_symbolic_links_and_cycles(tmp_path):
     found = find_sources([root])
     expected = ["0.jpg", "1.jpg", "2.jpg", "linked/0.jpg", "linked/1.jpg", "linked/2.jpg"]
     assert [s.name for s in found.files] == expected
-    assert [(each.photo, each.reason) for each in found.left_out] == [
+    assert [(each.photo, str(each.reason)) for each in found.left_out] == [
         (str(root), "has links to files that are missing: broken.jpg; copy the files here"),
         (str(root / "one more.jpg"), "is the same picture as 0.jpg"),
     ]

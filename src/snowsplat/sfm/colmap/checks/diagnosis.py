@@ -10,7 +10,7 @@ from snowsplat.sfm.colmap.database import Pair, displacement_of, feature_counts,
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import MIN_PHOTOS
 from snowsplat.util.errors import UserError
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, message, plural
 
 # A photo with fewer features is too dark, blurred or plain.
 _FEW_FEATURES = 60
@@ -89,8 +89,8 @@ def explain(
     photos: Sequence[Photo],
     evidence: Evidence,
     models: Sequence[set[str]],
-    excluded: Mapping[str, str],
-) -> dict[str, str]:
+    excluded: Mapping[str, Message],
+) -> dict[str, Message]:
     """Why photos have no pose: name -> reason, for each photo that is not in the first model.
 
     Args:
@@ -106,19 +106,28 @@ def explain(
         if photo.name in models[0]:
             continue
         other_model = next((model for model in models[1:] if photo.name in model), None)
-        others = f"{len(matches)} other photo{'' if len(matches) == 1 else 's'}"
+        others = plural("{n} other photo", "{n} other photos", n=len(matches))
         if photo.name in excluded:
             reason = excluded[photo.name]
         elif other_model is not None:
-            reason = f"it is in a separate group of {len(other_model)} photos"
+            reason = message("it is in a separate group of {count} photos", count=len(other_model))
         elif features < _FEW_FEATURES:
-            reason = f"it shows hardly any detail ({features} features): too dark, blurred or plain"
+            reason = message(
+                "it shows hardly any detail ({features} features): too dark, blurred or plain",
+                features=features,
+            )
         elif not matches:
-            reason = "it matches no other photo"
+            reason = message("it matches no other photo")
         elif max(matches) < _WEAK_PAIR:
-            reason = f"it has too few matches with {others} (at most {max(matches)})"
+            reason = message(
+                "it has too few matches with {others} (at most {most})",
+                others=others,
+                most=max(matches),
+            )
         else:
-            reason = f"its matches with {others} are not consistent with the model"
+            reason = message(
+                "its matches with {others} are not consistent with the model", others=others
+            )
         reasons[photo.name] = reason
     return reasons
 

@@ -18,6 +18,7 @@ from snowsplat.sfm.colmap.checks.parts import find_parts, unconfirmed_photos
 from snowsplat.sfm.colmap.database import copy_for_mapping, remove_database
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
 from snowsplat.sfm.options import MIN_PHOTOS
+from snowsplat.util.messages import Message, message, plural
 
 _ROUNDS = 3  # a new model is made at most this number of times
 
@@ -28,7 +29,7 @@ class Repaired:
 
     model: pycolmap.Reconstruction
     contradicting: int  # number of photos whose pose contradicted their matches
-    excluded: dict[str, str]  # name -> reason, for those of these photos that have no pose now
+    excluded: dict[str, Message]  # name -> reason, for those of these photos that have no pose now
     pairs: list[CheckedPair] | None  # `check_pairs` of the model; None: it has changed since
 
     @property
@@ -65,7 +66,7 @@ def repair(model: pycolmap.Reconstruction, mapping: Mapping, max_error: float) -
     names: dict[int, str] = {}  # image id -> file name
     # The image ids of the pairs with false matches, of all rounds.
     false_pairs: set[tuple[int, int]] = set()
-    wrong: dict[int, str] = {}  # image id -> reason, for all photos that had a wrong pose
+    wrong: dict[int, Message] = {}  # image id -> reason, for all photos that had a wrong pose
     # Models, their wrong photos, and their pairs.
     found: list[tuple[pycolmap.Reconstruction, set[int], list[CheckedPair] | None]] = []
     while True:
@@ -163,23 +164,25 @@ def _false_pairs(pairs: Sequence[CheckedPair], parts: Sequence[set[int]]) -> set
 
 def _doubts(
     model: pycolmap.Reconstruction, pairs: Sequence[CheckedPair], photos: Collection[int]
-) -> dict[int, str]:
+) -> dict[int, Message]:
     """Why ``photos``, those of `unconfirmed_photos`, have a doubtful pose: image id -> text."""
     reasons = {}
     for photo in sorted(photos):
         own = [pair for pair in pairs if pair.counts and photo in (pair.first, pair.second)]
         best = max(own, key=lambda pair: pair.support)
-        reasons[photo] = (
-            f"no other photo confirms its place: {len(own)} photos have matches with it, and at "
-            f"best {best.support:.0%} of the matches agree with its pose "
-            f"({model.image(best.other(photo)).name})"
+        reasons[photo] = message(
+            "no other photo confirms its place: {count} photos have matches with it, and at best "
+            "{share:.0%} of the matches agree with its pose ({other})",
+            count=len(own),
+            share=best.support,
+            other=model.image(best.other(photo)).name,
         )
     return reasons
 
 
 def _reasons(
     model: pycolmap.Reconstruction, pairs: Sequence[CheckedPair], parts: Sequence[set[int]]
-) -> dict[int, str]:
+) -> dict[int, Message]:
     """Why the photos of all parts but the first are in a wrong place: image id -> text."""
     part = _part_of(parts)
     reasons = {}
@@ -193,9 +196,15 @@ def _reasons(
             own = [pair for pair in tears if photo in (pair.first, pair.second)]
             worst = max(own or tears, key=lambda pair: pair.matches - pair.hits)
             one, other = (model.image(i).name for i in (worst.first, worst.second))
-            with_it = "" if len(photos) == 1 else f", with {len(photos) - 1} other photos,"
-            reasons[photo] = (
-                f"it was{with_it} in a place that its matches contradict: {one} and {other} have "
-                f"{worst.matches} matches, but only {worst.hits} points in common"
+            reasons[photo] = plural(
+                "it was in a place that its matches contradict: {one} and {other} have {matches} "
+                "matches, but only {hits} points in common",
+                "it was, with other photos ({n} in all), in a place that its matches contradict: "
+                "{one} and {other} have {matches} matches, but only {hits} points in common",
+                n=len(photos),
+                one=one,
+                other=other,
+                matches=worst.matches,
+                hits=worst.hits,
             )
     return reasons

@@ -157,7 +157,9 @@ def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> S
         raise UserError(as_message(answer["user_error"]))
     if "result" not in answer:
         raise Crashed(code)
-    return SfmResult(**answer["result"])
+    result = answer["result"]
+    reasons = {name: as_message(why) for name, why in result["unregistered"].items()}
+    return SfmResult(**result | {"unregistered": reasons})
 
 
 def _communicate(

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from snowsplat.sfm.ingest.video.clip import top_boxes
+from snowsplat.util.messages import Message, message
 
 # Reasons why a photo is unusable.
-STITCHED = "is a stitched panorama, not of all directions"
-NOT_TWICE_AS_WIDE = "is not twice as wide as high, as a 360° panorama is"
+STITCHED = message("is a stitched panorama, not of all directions")
+NOT_TWICE_AS_WIDE = message("is not twice as wide as high, as a 360° panorama is")
 _TWO_EYES = "shows two pictures, for two eyes"
 
 # XMP, as an attribute or as an element: https://developers.google.com/streetview/spherical-metadata
@@ -66,7 +67,7 @@ class Panorama:
         return round(self.above * height), round(self.below * height)
 
 
-def panorama_in_xmp(xmp: bytes, width: int, height: int) -> Panorama | str | None:
+def panorama_in_xmp(xmp: bytes, width: int, height: int) -> Panorama | Message | None:
     """The panorama, or `STITCHED`, if the XMP packet of a photo says so.
 
     ``width``, ``height``: of the photo, which may be smaller than the XMP packet says.

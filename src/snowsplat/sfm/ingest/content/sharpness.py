@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from snowsplat.data.photos.image_file import scaled_size
+from snowsplat.util.messages import Message, message
 
 #: Longest side in pixels of the copies that are compared for sharpness. A blur of half a pixel of
 #: the copy is still detected, while noise of the sensor and of compression is mostly averaged out.
@@ -37,10 +38,10 @@ _BLACK, _WHITE = 64, 191
 _SMALLEST = 8  # pixels: smaller copies have no detail that could be measured
 
 # Reasons why an image is unusable.
-BLACK = "is completely black"
-WHITE = "is completely white"
-FLAT = "is completely of one colour"
-BLURRED = "is too blurred"
+BLACK = message("is completely black")
+WHITE = message("is completely white")
+FLAT = message("is completely of one colour")
+BLURRED = message("is too blurred")
 
 
 def grey_copy(image: Image.Image, side: int) -> np.ndarray:
@@ -69,7 +70,7 @@ def sharpness(grey: np.ndarray) -> float:
     return (squares - total * total / detail.size) / detail.size
 
 
-def why_unusable(grey: np.ndarray) -> str | None:
+def why_unusable(grey: np.ndarray) -> Message | None:
     """The reason why an image is unusable for SfM, or None. ``grey``: a copy of `CONTENT_SIDE`."""
     low, high = np.quantile(grey, [0.005, 0.995])
     if high - low < _MIN_RANGE:

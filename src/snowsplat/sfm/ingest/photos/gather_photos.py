@@ -39,6 +39,7 @@ from snowsplat.sfm.ingest.search.names import free_names
 from snowsplat.sfm.ingest.search.sources import Source
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message, message
 from snowsplat.util.natural_order import natural_key
 
 
@@ -77,11 +78,14 @@ def plan_photos(
             if panoramas:
                 header = _as_panorama(header)
         except Unusable as error:
-            left_out.append(not_used(source.path, str(error)))
+            left_out.append(not_used(source.path, error.message))
         else:
             if header.animated > 1:
-                reason = f"is an animation of {header.animated} pictures, of which one is used; "
-                reason += "save the others as photos or a video"
+                reason = message(
+                    "is an animation of {n} pictures, of which one is used; save the others as "
+                    "photos or a video",
+                    n=header.animated,
+                )
                 left_out.append(not_used(source.path, reason))
             name = header.file_name(source.name, longest)
             read += [(_page_name(name, page), source, header, page) for page in header.pages]
@@ -129,11 +133,11 @@ def write_photos(
         in_place: the photos are in ``input/`` already; write only the masks.
     """
 
-    def work(plan: Planned) -> tuple[Photo, MaskLook | None] | str:
+    def work(plan: Planned) -> tuple[Photo, MaskLook | None] | Message:
         try:
             return _write_photo(plan, dataset, longest, in_place)
         except Unusable as error:
-            return str(error)
+            return error.message
 
     photos, looks = [], []
     pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="snowsplat-photos")
@@ -141,7 +145,7 @@ def write_photos(
         for done, (plan, outcome) in enumerate(
             zip(planned, pool.map(work, planned), strict=True), 1
         ):
-            if isinstance(outcome, str):
+            if isinstance(outcome, Message):
                 left_out.append(not_used(plan.source.path, outcome))
             else:
                 photos.append(outcome[0])

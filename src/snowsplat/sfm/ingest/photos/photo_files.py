@@ -21,6 +21,7 @@ from snowsplat.data.photos.colour_profile import is_transparent, plain_pixels
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS, reason_of, scaled_size
 from snowsplat.sfm.ingest.content.panorama import STITCHED, Panorama, panorama_in_xmp
 from snowsplat.sfm.ingest.photos.exif import ExifInfo, exif_for_copy, read_exif
+from snowsplat.util.errors import Problem
 
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF", "BMP", "PPM", *OPTIONAL_FORMATS)
 # Formats that COLMAP reads, by file extension.
@@ -36,7 +37,7 @@ _ANIMATIONS = ("WEBP", "PNG", "AVIF")
 _SMALLEST_SIDE = 32  # pixels; smaller images are icons
 
 
-class Unusable(Exception):
+class Unusable(Problem):
     """The photo cannot be used; the message is the reason. Other photos are not affected."""
 
 
@@ -123,9 +124,9 @@ def read_header(path: Path) -> Header:
                 pages=_pages(image),  # the last, because it reads another page
             )
     except Exception as error:  # Pillow may raise any exception for a damaged file
-        raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
+        raise Unusable("cannot be decoded ({error})", error=reason_of(error)) from None
     if min(header.width, header.height) < _SMALLEST_SIDE:
-        raise Unusable(f"has only {header.width}x{header.height} pixels")
+        raise Unusable("has only {width}x{height} pixels", width=header.width, height=header.height)
     if panorama == STITCHED:
         raise Unusable(STITCHED)
     return header
@@ -189,7 +190,7 @@ def decode(path: Path, header: Header, longest: int | None, page: int = 0) -> Im
             if header.exif.orientation != 1:
                 image = ImageOps.exif_transpose(image)
     except Exception as error:  # as in `read_header`
-        raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
+        raise Unusable("cannot be decoded ({error})", error=reason_of(error)) from None
     if image.mode == "RGBA" and image.getchannel("A").getextrema()[0] == 255:
         image = image.convert("RGB")
     return resize_photo(image, header.size(longest))
@@ -206,7 +207,7 @@ def decode_small(path: Path, side: int) -> Image.Image:
             opened.draft("RGB", scaled_size(opened.width, opened.height, 2 * side))
             return plain_pixels(opened, path)
     except Exception as error:  # as in `read_header`
-        raise Unusable(f"cannot be decoded ({reason_of(error)})") from None
+        raise Unusable("cannot be decoded ({error})", error=reason_of(error)) from None
 
 
 def resize_photo(image: Image.Image, size: tuple[int, int]) -> Image.Image:

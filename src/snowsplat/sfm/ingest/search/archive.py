@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import new_folder, shown
-from snowsplat.util.messages import message
+from snowsplat.util.messages import Message, as_message, message
 
 # Other archives, by their first bytes. They are named, not unpacked.
 _OTHERS = {b"Rar!": "RAR", b"7z\xbc\xaf": "7z", b"\x1f\x8b": "gzip", b"\xfd7zXZ": "xz"}
@@ -98,8 +98,11 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     except UserError:
         raise
     except Exception as error:  # zipfile raises many kinds of exceptions for damaged files
-        system = error.strerror if isinstance(error, OSError) else None
-        reason = system or " ".join(str(error).split())[:80] or message("it is damaged")
+        reason = as_message(error)
+        if isinstance(error, OSError):
+            reason = as_message(error.strerror or error)
+        elif not isinstance(error, Problem):
+            reason = Message(" ".join(str(error).split())[:80]) or message("it is damaged")
         raise UserError(
             "{path}: cannot be unpacked ({reason}); copy it again, or unpack it to a folder",
             path=shown(path),
@@ -114,7 +117,7 @@ def _directory_bytes(path: Path) -> int:
         tail = file.read()
     end = tail.rfind(b"PK\x05\x06")
     if not 0 <= end <= len(tail) - 22:
-        raise zipfile.BadZipFile("it is truncated")
+        raise Problem("it is truncated")
     (length,) = struct.unpack_from("<I", tail, end + 12)
     large = tail.rfind(b"PK\x06\x06")
     if length == 0xFFFFFFFF and 0 <= large <= len(tail) - 56:

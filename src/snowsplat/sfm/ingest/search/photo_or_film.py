@@ -14,6 +14,7 @@ from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, read_header
 from snowsplat.sfm.ingest.video.clip import film_size, why_no_video
 from snowsplat.sfm.options import MIN_PHOTOS
+from snowsplat.util.messages import Message, message
 
 
 @dataclass
@@ -34,16 +35,18 @@ def photos_or_films(root: Path, photos: Sequence[str], videos: Sequence[str]) ->
     if not videos:
         return Chosen(list(photos), [])
     films = {_stem(video): video for video in videos}
-    thumbnails: dict[str, str] = {}
+    thumbnails: dict[str, Message] = {}
     others = 0
     for photo in photos:
         film = films.get(_stem(photo))
         if film is not None and _is_thumbnail(root / photo, root / film):
-            thumbnails[photo] = f"is the thumbnail of {film}"
+            thumbnails[photo] = message("is the thumbnail of {film}", film=film)
             continue
         others += 1
         if others == MIN_PHOTOS:
-            reason = "is a video in a folder of photos; add it as an input to use its frames"
+            reason = message(
+                "is a video in a folder of photos; add it as an input to use its frames"
+            )
             return Chosen(list(photos), [], [not_used(root / video, reason) for video in videos])
     unreadable = {video: why for video in videos if (why := why_no_video(root / video))}
     readable = [video for video in videos if video not in unreadable]
@@ -51,7 +54,7 @@ def photos_or_films(root: Path, photos: Sequence[str], videos: Sequence[str]) ->
     if not readable:
         # Without photos, reading the videos raises the error that says what is wrong.
         return Chosen(list(photos), [], left_out) if photos else Chosen([], [*videos])
-    few = "is beside a video, and too few for a scene; the video is used"
+    few = message("is beside a video, and too few for a scene; the video is used")
     unused = [not_used(root / photo, thumbnails.get(photo, few)) for photo in photos]
     return Chosen([], readable, [*unused, *left_out])
 

@@ -23,6 +23,8 @@ from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
 from snowsplat.sfm.ingest.video.clip import ONLY_SOUND, why_no_video
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message, as_message, message, plural
+from snowsplat.util.names import first_names
 
 
 def _suffixes(names: str) -> frozenset[str]:
@@ -50,6 +52,12 @@ _MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
 _MAP = re.compile(
     r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
 )
+_KINDS_OF_MAPS = {
+    "depth": message("is a depth map of another photo"),
+    "confidence": message("is a confidence map of another photo"),
+    "normal": message("is a normal map of another photo"),
+    "disparity": message("is a disparity map of another photo"),
+}
 
 
 @dataclass(frozen=True)
@@ -129,7 +137,8 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
     def add(source: Source) -> None:
         real = source.path.resolve()
         if real in seen:
-            left_out.append(not_used(source.path, f"is the same file as {shown(seen[real])}"))
+            same = message("is the same file as {file}", file=shown(seen[real]))
+            left_out.append(not_used(source.path, same))
         else:
             seen[real] = source.path
             files.append(source)
@@ -213,10 +222,10 @@ def _search(root: Path) -> _Folder:
         found.left_out.append(not_used(root, links))
     found.videos = [file for file in files if _is_video_name(file)]
     copies = find_copies(root, photos)
-    no_views = {name: f"is the same picture as {used}" for name, used in copies.items()}
-    no_views |= {
-        map_: f"is a {kind} of another photo" for map_, kind in _maps_beside(photos).items()
+    no_views = {
+        name: message("is the same picture as {photo}", photo=used) for name, used in copies.items()
     }
+    no_views |= _maps_beside(photos)
     found.left_out += [not_used(root / name, reason) for name, reason in no_views.items()]
     photos = [photo for photo in photos if photo not in no_views]
     found.masks = find_masks(root, photos)
@@ -229,7 +238,7 @@ def _format_name(name: str) -> str:
     return PurePosixPath(name).suffix[1:].upper()
 
 
-def _unread_photos(files: Iterable[str], read: Sequence[str]) -> str | None:
+def _unread_photos(files: Iterable[str], read: Sequence[str]) -> Message | None:
     """What to say about the photos among ``files`` that are in such a format; None: there are none.
 
     Cameras save a raw photo and a JPEG of it. Therefore a photo that is also among those that are
@@ -244,31 +253,39 @@ def _unread_photos(files: Iterable[str], read: Sequence[str]) -> str | None:
     if not counts:
         return None
     listed = " and ".join(f"{count:,} {name}" for name, count in counts.most_common())
-    noun = "photo" if counts.total() == 1 else "photos"
-    return f"has {listed} {noun}, which cannot be read; save them as JPEG or PNG first"
+    return plural(
+        "has {listed} photo, which cannot be read; save it as JPEG or PNG first",
+        "has {listed} photos, which cannot be read; save them as JPEG or PNG first",
+        n=counts.total(),
+        listed=listed,
+    )
 
 
 def _stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix("")).casefold()
 
 
-def _broken_links(broken: Sequence[str]) -> str | None:
+def _broken_links(broken: Sequence[str]) -> Message | None:
     """The reason why photos and videos are not used that are broken links; None if none is."""
     links = [name for name in broken if _is_photo_name(name) or _is_video_name(name)]
     if not links:
         return None
-    others = f" and {len(links) - 1} more" if len(links) > 1 else ""
-    return f"has links to files that are missing: {shown(links[0])}{others}; copy the files here"
+    return message(
+        "has links to files that are missing: {links}; copy the files here",
+        links=first_names(links, 1),
+    )
 
 
-def _why_not_searched(name: str, siblings: Sequence[str]) -> str | None:
+def _why_not_searched(name: str, siblings: Sequence[str]) -> Message | None:
     """Why a folder is not searched; None if it is."""
     kind, original = folder_kind(name), original_of(name, siblings, divided=False)
     if kind == "maps":
-        return "is a folder of maps, not of photos"
+        return message("is a folder of maps, not of photos")
     if kind == "thumbnails":
-        return "is a folder of small copies"
-    return None if original is None else f"is a folder of changed copies of those in {original}"
+        return message("is a folder of small copies")
+    if original is None:
+        return None
+    return message("is a folder of changed copies of those in {folder}", folder=original)
 
 
 def _masks_and_outputs(folder: Path, names: list[str]) -> list[str]:
@@ -284,12 +301,12 @@ def _is_video_name(file: str) -> bool:
     return PurePosixPath(file).suffix.lower() in VIDEO_SUFFIXES
 
 
-def _maps_beside(photos: Sequence[str]) -> dict[str, str]:
+def _maps_beside(photos: Sequence[str]) -> dict[str, Message]:
     """Photos that are maps by their names, as IMG_depth.png beside IMG.jpg, and what they are."""
     stems = {str(PurePosixPath(photo).with_suffix("")) for photo in photos}
     matches = {photo: _MAP.fullmatch(photo) for photo in photos}
     return {
-        photo: f"{match['kind']} map"
+        photo: _KINDS_OF_MAPS[match["kind"].lower()]
         for photo, match in matches.items()
         if match is not None and match["stem"] in stems
     }
@@ -332,7 +349,9 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
             head = file.read(32)
     except OSError as error:
         raise UserError(
-            "{path}: cannot be read ({strerror})", path=shown(path), strerror=error.strerror
+            "{path}: cannot be read ({error})",
+            path=shown(path),
+            error=as_message(error.strerror or error),
         ) from None
     suffix = path.suffix.lower()
     if suffix in _UNREAD_SUFFIXES:  # many are TIFF files with a small preview

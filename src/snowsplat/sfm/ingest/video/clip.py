@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message, message
 
 # Container formats that cameras, phones and programs write, as FFmpeg names them.
 _FORMATS = (
@@ -103,23 +104,23 @@ def _check_boxes(path: Path) -> None:
 
 
 #: Why a recording of sound, perhaps with a cover picture, is no video.
-ONLY_SOUND = "has only sound, no video"
+ONLY_SOUND = message("has only sound, no video")
 
 
-class NoVideoError(ValueError):
+class NoVideoError(Problem):
     """A file has sound or pictures, but no video; the message says so."""
 
 
-def why_no_video(path: Path) -> str | None:
+def why_no_video(path: Path) -> Message | None:
     """Why a file is no readable video, e.g. "has only sound"; None if it is one."""
     import av
 
     try:
         open_video(path).close()
     except NoVideoError as error:
-        return str(error)
+        return error.message
     except (av.FFmpegError, OSError, ValueError):
-        return "is not a readable video, it may be truncated or damaged"
+        return message("is not a readable video, it may be truncated or damaged")
     return None
 
 
@@ -249,7 +250,7 @@ def video_stream(container: InputContainer) -> VideoStream:
     pictures = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
     films = [stream for stream in container.streams.video if not stream.disposition & pictures]
     if not films:
-        raise NoVideoError(ONLY_SOUND if container.streams.audio else "has no video")
+        raise NoVideoError(ONLY_SOUND if container.streams.audio else message("has no video"))
 
     def moves(stream: VideoStream) -> tuple[bool, bool]:
         codec = stream.codec_context

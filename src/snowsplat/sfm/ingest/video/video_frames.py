@@ -51,13 +51,14 @@ from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved
 from snowsplat.sfm.ingest.video.tone import rgb_image
 from snowsplat.sfm.progress import Report
 from snowsplat.util.files import shown
+from snowsplat.util.messages import Message, message
 
 if TYPE_CHECKING:
     from av import VideoFrame
 
 logger = logging.getLogger(__name__)
 
-SAME_VIEW = "shows the same view as the previous frame"
+SAME_VIEW = message("shows the same view as the previous frame")
 
 # The smallest motion in a window, as a fraction of the longest side: nearly the same view.
 _MIN_STEP = 0.01
@@ -86,7 +87,7 @@ class Frames:
 
     kept: list[Frame] = field(default_factory=list)
     # The sharpest frames of windows without a candidate: time (s) and reason.
-    skipped: list[tuple[float, str]] = field(default_factory=list)
+    skipped: list[tuple[float, Message]] = field(default_factory=list)
     read: int = 0  # number of decoded frames
     notes: list[str] = field(default_factory=list)  # lines for the user
     panoramas: bool = False  # the frames show all directions
@@ -172,7 +173,7 @@ class _Candidates:
         crop: Crop | None,
         fixed: np.ndarray | None,
     ) -> None:
-        self.skipped: list[tuple[float, str]] = []  # time (s) and reason
+        self.skipped: list[tuple[float, Message]] = []  # time (s) and reason
         self._clip, self._folder, self._max_frames, self._size = clip, folder, max_frames, size
         self._crop, self._fixed = crop, fixed
         self._count = max(max_frames, _MIN_COUNT)

@@ -1,44 +1,30 @@
-"""Runs pytest in forks of a process that has imported torch, because the import takes long.
+"""Runs pytest: ``run_tests.py RUN``, in a fork of a process that has imported torch; see `runner`.
 
-    python zygote.py      one line of JSON per run on stdin, one line with the outcome on stdout
-
-A run is a JSON object with these keys:
+RUN is a file with a JSON object, which has these keys:
 
     tests                   files and folders of tests
     order                   names of the tests to run, in this order; null: all
     marked                  the value of pytest's option -m
     isa                     the instruction set; null: the best one
-    cpu_seconds, seconds    limits of the processor time and of the wall time
+    cpu_seconds             a limit of the processor time
     temporary               a folder for temporary files
+    outcome                 the file for the outcome
     coverage                a file for the executed lines; null: stop at the first failure instead
-
-The package itself is imported after the fork, because it is different in each run.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gc
-import importlib
-import io
 import json
 import os
 import resource
-import select
-import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import coverage
 import pytest
 
-_IMPORTS = ("torch", "numpy", "PIL.Image", "hypothesis", "safetensors.torch", "zstandard", "rich")
 _MOST_MEMORY = 12 << 30  # bytes of address space; torch alone uses a few GiB
-_CRASHED, _SURVIVED, _DETECTED = "crashed", "survived", "detected"
-_TIMED_OUT = "timed out"
 
 
 class _Plugin:
@@ -104,15 +90,12 @@ def _cpu_seconds() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def _child(run: dict, answer: int) -> None:
+def _run(run: dict) -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (run["cpu_seconds"], run["cpu_seconds"] + 1))
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, _MOST_MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if run["isa"]:
         os.environ["SNOWSPLAT_ISA"] = run["isa"]
-    null = os.open(os.devnull, os.O_RDWR)
-    for descriptor in (0, 1, 2):
-        os.dup2(null, descriptor)
     # Python compares the size and the modification time (in seconds) of a source file with those
     # in its .pyc file. A fault may change neither, so no .pyc files are written.
     sys.dont_write_bytecode = run["coverage"] is None
@@ -129,8 +112,8 @@ def _child(run: dict, answer: int) -> None:
         recorded.stop()
         _write_coverage(Path(run["coverage"]), plugin, recorded.get_data())
     passed = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
-    outcome = _SURVIVED if code in passed else _DETECTED
-    os.write(answer, json.dumps({"outcome": outcome, "by": plugin.failed}).encode())
+    outcome = "survived" if code in passed else "detected"
+    Path(run["outcome"]).write_text(json.dumps({"outcome": outcome, "by": plugin.failed}))
 
 
 def _write_coverage(path: Path, plugin: _Plugin, data: coverage.CoverageData) -> None:
@@ -146,49 +129,8 @@ def _write_coverage(path: Path, plugin: _Plugin, data: coverage.CoverageData) ->
     path.write_text(json.dumps({"seconds": ran, "lines": lines}))
 
 
-def _run(run: dict) -> dict:
-    reading, writing = os.pipe()
-    start = time.monotonic()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            os.setpgid(0, 0)
-            os.close(reading)
-            _child(run, writing)
-        finally:
-            os._exit(0)
-    os.close(writing)
-    handle = os.pidfd_open(pid)
-    in_time = bool(select.select([handle], [], [], run["seconds"])[0])
-    os.close(handle)
-    with contextlib.suppress(OSError):
-        os.killpg(pid, signal.SIGKILL)  # also the processes that the tests have started
-    _, status = os.waitpid(pid, 0)
-    with os.fdopen(reading, "rb") as pipe:
-        text = pipe.read()
-    if text:
-        outcome = json.loads(text)
-    elif not in_time or os.waitstatus_to_exitcode(status) in (-signal.SIGXCPU, -signal.SIGKILL):
-        outcome = {"outcome": _TIMED_OUT, "by": None}
-    else:
-        outcome = {"outcome": _CRASHED, "by": None}
-    return outcome | {"seconds": time.monotonic() - start}
-
-
-def serve() -> None:
-    """Execute runs until stdin is closed."""
-    for name in _IMPORTS:
-        importlib.import_module(name)
-    with contextlib.redirect_stdout(io.StringIO()):
-        pytest.main(["--version"])  # imports its plugins
-    gc.collect()
-    # pytest collects garbage at the end of a run. The objects that exist now are excluded.
-    gc.freeze()
-    # Linux ends this process if its parent ends (1 is PR_SET_PDEATHSIG).
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
-    for line in sys.stdin:
-        print(json.dumps(_run(json.loads(line))), flush=True)
-
-
 if __name__ == "__main__":
-    serve()
+    try:
+        _run(json.loads(Path(sys.argv[1]).read_text()))
+    finally:
+        os._exit(0)  # without an outcome, the run has crashed
