@@ -37,7 +37,7 @@ class WrongPart(UserError):
     """
 
     def __init__(self, path: Path | str, received: int) -> None:
-        super().__init__("{path}: {n} bytes of it have arrived", path=path, n=received)
+        super().__init__(message("{path}: {n} bytes of it have arrived", path=path, n=received))
         self.received = received
 
 
