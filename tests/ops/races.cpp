@@ -114,12 +114,12 @@ std::vector<F> frame(const Scene& s) {
   const int64_t pixels = kWidth * kHeight;
   std::vector<F> image(size_t(3 * pixels)), alpha(image.size() / 3), d_image(image.size());
   const F background[4] = {0, 0, 0, 0};
-  rasterize_fwd({tiles, sorted, 3, background, image.data(), alpha.data()});
+  rasterize_fwd({tiles, sorted, 3, background, image.data(), alpha.data(), nullptr});
   double means[2];
   photometric(
       {3, kWidth, kHeight, image.data(), s.target.data(), 0.8, -0.2, d_image.data(), means});
-  rasterize_bwd({tiles, sorted, 3, nullptr, image.data(), d_image.data(), alpha.data(), nullptr,
-                 nullptr, grad.data(), abs_grad.data()});
+  rasterize_bwd({tiles, sorted, 3, nullptr, image.data(), d_image.data(), nullptr, alpha.data(),
+                 nullptr, nullptr, grad.data(), abs_grad.data()});
 
   Tensor centres(s.means), scales(s.log_scales), quats(s.quats), logits(s.logits), dc(s.dc);
   Tensor rest(s.rest);

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.ops import reference
+from snowsplat.ops import reference, scratch
 from snowsplat.ops.splats import Splats2D
+from snowsplat.util.native_layout import SEGMENT
 
 from .scenes import (
     EMULATED_LENGTH,
@@ -390,7 +391,69 @@ def test_native_agrees_with_the_reference_when_splats_are_many(
     compare(native, random_splats(11, 500, 20, 18, pixels=5.0, opacity=opacity), 20, 18)
 
 
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 31, 32, 33, 64, 65, 255, 256, 257, 1000])
+@pytest.fixture
+def used_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """New memory has numbers, so that one that is read but never written has an effect.
+
+    With NaN as the transmittance, a pixel would be finished.
+    """
+    take = scratch.empty
+
+    def empty(*arguments: Any) -> Tensor:
+        tensor = take(*arguments)
+        return tensor.fill_(0.7) if tensor.is_floating_point() else tensor
+
+    monkeypatch.setattr(scratch, "empty", empty)
+
+
+@pytest.mark.usefixtures("used_memory")
+@pytest.mark.parametrize("in_order", [False, True])
+@pytest.mark.parametrize(("channels", "with_depth"), [(2, False), (3, True), (9, False)])
+def test_tiles_of_several_segments(
+    native: Variant, channels: int, with_depth: bool, in_order: bool, request: Any
+) -> None:
+    """A GPU cuts long tiles. Here there are tiles with one to four segments.
+
+    In the fullest tile, most pixels are finished in the first segment, and some in no segment.
+    """
+    if in_order:
+        request.getfixturevalue("sums_in_order")
+    splats = random_splats(7, 1700, 40, 20, channels, pixels=3.0, opacity=(0.005, 0.03))
+    x = splats.packed[:, 0]
+    splats.packed[:, 0] = (40 * (x / 40).clamp(0, 1) ** 2).float()
+    opaque = (splats.packed[:, :2] < 12).all(dim=1)
+    splats.packed[opaque, 5] = 0.3
+    compare(native, splats, 40, 20, with_depth=with_depth)
+
+
+@pytest.mark.usefixtures("used_memory")
+@pytest.mark.parametrize("in_order", [False, True])
+@pytest.mark.parametrize("visited", [SEGMENT - 1, SEGMENT, SEGMENT + 1, 2 * SEGMENT, 600])
+def test_a_tile_that_is_finished_at_the_end_of_a_segment(
+    native: Variant, visited: int, in_order: bool, request: Any
+) -> None:
+    """The splats behind the finished pixels are in the same and in other segments."""
+    if in_order:
+        request.getfixturevalue("sums_in_order")
+    opacities = [0.0055] * (visited - 3) + [0.95] * 3 + [0.5] * (SEGMENT + 10)
+    splats = flat_stack(opacities, colors=uniform(generator(visited), -0.2, 1.0, len(opacities), 3))
+    compare(native, splats, 19, 6)
+
+
+@pytest.mark.usefixtures("used_memory")
+@pytest.mark.parametrize("in_first", [0, SEGMENT - 1, SEGMENT, 2 * SEGMENT])
+def test_a_tile_that_begins_at_the_end_of_a_segment(native: Variant, in_first: int) -> None:
+    """Three tiles; the second is empty."""
+    count = in_first + SEGMENT + 50
+    splats = random_splats(3, count, 8, 8, pixels=0.5, opacity=(0.02, 0.03))
+    splats.packed[:, :2] = splats.packed[:, :2].clamp(3, 5) + 4
+    splats.packed[in_first:, 0] += 32
+    compare(native, splats, 48, 16)
+
+
+@pytest.mark.parametrize(
+    "count", [0, 1, 7, 8, 9, 31, 32, 33, 64, 65, 255, 256, 257, 512, 513, 1000]
+)
 def test_native_agrees_with_the_reference_for_a_tile_of_any_length(
     native: Variant, count: int
 ) -> None:

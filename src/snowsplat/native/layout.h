@@ -20,6 +20,7 @@ namespace snow {
 constexpr int kTile = 16;            // edge of a tile in pixels
 constexpr int kGroupChannels = 4;    // maximum number of channels of one rasterization pass
 constexpr int kSlotWidth = 16;       // numbers of an instance's gradient: ≤ 4 colours, 6 moments
+constexpr int kSegment = 256;        // instances of a tile that a block of rasterize_bwd processes
 constexpr int kPackedHeader = 8;     // columns of Splats2D before the colours
 constexpr int kPackedStride = 16;    // columns of Splats2D with three colours
 constexpr int kPoseSums = 16;        // 9 rotation, 3 translation, 3 position, 1 focal length
@@ -83,6 +84,7 @@ constexpr LayoutText<Capacity> layout_in() {
   layout.constant("tile", kTile);
   layout.constant("group_channels", kGroupChannels);
   layout.constant("slot_width", kSlotWidth);
+  layout.constant("segment", kSegment);
   layout.constant("packed_header", kPackedHeader);
   layout.constant("packed_stride", kPackedStride);
   layout.constant("pose_sums", kPoseSums);

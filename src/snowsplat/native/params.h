@@ -250,7 +250,12 @@ struct RasterizeForwardParams {
   const T* background;  // (channels,)
   T* image;             // out, (channels, height, width)
   T* alpha;             // out, (height, width), or null
-  SNOW_FIELDS(n, frame, channels, background, image, alpha)
+  // CUDA: out, (rasterize_boundaries, 1 + max(channels, 3), 256), or null if there is no backward
+  // pass: of each pixel of a tile, in front of the first instance of a segment, the transmittance
+  // (its negative if the pixel is finished) and the colour of the segments before. The first segment
+  // of a tile has none. That of the instances from index i on is at index i / kSegment - 1.
+  T* states;
+  SNOW_FIELDS(n, frame, channels, background, image, alpha, states)
 };
 
 // rasterize_median has the same parameters. The image is (2, channels, height, width): the channels of
@@ -274,6 +279,7 @@ struct RasterizeBackwardParams {
   const uint32_t* instance_slot;  // (instances,), or null if `slots` is null
   const T* image;                 // (channels, height, width), output of the forward pass
   const T* grad_image;            // the same shape
+  const T* states;                // of the forward pass; null: additive, or CPU
   const T* alpha;                 // (height, width)
   const T* grad_alpha;            // (height, width), or null
   T* slots;                       // out, (instances, 16) gradients, which splats_reduce adds;
@@ -281,8 +287,8 @@ struct RasterizeBackwardParams {
                                   // fixed on the CPU; CUDA adds atomically
   T* grad_packed;                 // (splats, stride)
   T* abs_grad;                    // as for splats_reduce, if `slots` is null; or null
-  SNOW_FIELDS(n, frame, channels, instance_slot, image, grad_image, alpha, grad_alpha, slots,
-              grad_packed, abs_grad)
+  SNOW_FIELDS(n, frame, channels, instance_slot, image, grad_image, states, alpha, grad_alpha,
+              slots, grad_packed, abs_grad)
 };
 
 // splats_reduce (CUDA): the gradient of a splat as the sum over its instances.

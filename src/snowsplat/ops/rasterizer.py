@@ -97,6 +97,7 @@ def rasterize_median(splats: Splats2D, width: int, height: int) -> tuple[Tensor,
         background=packed.new_zeros(channels),
         image=planes,
         alpha=alpha,
+        states=None,
     )
     return planes[0].permute(1, 2, 0), planes[1].permute(1, 2, 0), alpha
 
@@ -210,6 +211,19 @@ def _bin_splats(
     return _Frame(params, tiles, instances, instance_slot, slot_range)
 
 
+def _pixel_states(frame: _Frame, channels: int) -> Tensor:
+    """Memory for the states of pixels at which the backward pass begins within a tile.
+
+    The backward pass of a GPU cuts the list of a tile into segments, because otherwise the longest
+    list would decide how long it takes. In float32, an instance needs 16 bytes for up to three
+    channels, and 20 bytes for four.
+    """
+    packed = frame.params["packed"]
+    boundaries = query_size("rasterize_boundaries", packed.device, frame.instances)
+    shape = (boundaries, 1 + max(channels, 3), TILE * TILE)
+    return scratch.empty(shape, packed.dtype, packed.device)
+
+
 def _sort_by_depth(
     packed: Tensor, width: int, height: int, columns: Tensor, records: Tensor
 ) -> Tensor:
@@ -281,18 +295,23 @@ class _Rasterize(torch.autograd.Function):
         planes = scratch.empty((count, height, width), packed.dtype, packed.device)
         alpha = scratch.empty((height, width), packed.dtype, packed.device)
         frame = _bin_splats(packed, width, height, groups[0][1], additive, capacity)
+        has_states = ctx.needs_input_grad[0] and not additive
+        states = []
         for first, columns in groups:
+            group_channels = min(GROUP_CHANNELS, count - first)
+            states.append(_pixel_states(frame, group_channels) if has_states else None)
             launch(
                 variant("rasterize_fwd", packed),
                 n=frame.tiles,
                 frame=frame.params if first == 0 else _with_channels(frame, columns),
-                channels=min(GROUP_CHANNELS, count - first),
+                channels=group_channels,
                 background=background[first:],
                 image=planes[first:],
                 alpha=alpha if first == 0 else None,
+                states=states[-1],
             )
         ctx.save_for_backward(planes, alpha)
-        ctx.frame, ctx.groups, ctx.channels = frame, groups, channels
+        ctx.frame, ctx.groups, ctx.states, ctx.channels = frame, groups, states, channels
         ctx.abs_grad = abs_grad
         ctx.set_materialize_grads(False)
         return planes, alpha
@@ -310,7 +329,8 @@ class _Rasterize(torch.autograd.Function):
             grad_alpha = None  # alpha is always 0
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
         grad_packed = _grad_packed(
-            ctx.frame, ctx.groups, planes, grad_planes, alpha, grad_alpha, ctx.abs_grad
+            *(ctx.frame, ctx.groups, ctx.states),
+            *(planes, grad_planes, alpha, grad_alpha, ctx.abs_grad),
         )
         grad_background = None
         if ctx.needs_input_grad[1]:
@@ -321,6 +341,7 @@ class _Rasterize(torch.autograd.Function):
 def _grad_packed(
     frame: _Frame,
     groups: list[tuple[int, Tensor]],
+    states: list[Tensor | None],
     planes: Tensor,
     grad_planes: Tensor,
     alpha: Tensor,
@@ -339,7 +360,7 @@ def _grad_packed(
         slots = scratch.empty((frame.instances, SLOT_WIDTH), packed.dtype, packed.device)
     else:
         grad_packed.zero_()
-    for first, columns in groups:
+    for (first, columns), group_states in zip(groups, states, strict=True):
         channels = min(GROUP_CHANNELS, len(planes) - first)
         launch(
             variant("rasterize_bwd", packed),
@@ -349,6 +370,7 @@ def _grad_packed(
             instance_slot=frame.instance_slot,
             image=planes[first:],
             grad_image=grad_planes[first:],
+            states=group_states,
             alpha=alpha,
             grad_alpha=grad_alpha if first == 0 else None,
             slots=slots,

@@ -18,6 +18,7 @@ from typing import Any
 TILE = 16  # edge of a tile in pixels
 GROUP_CHANNELS = 4  # maximum number of channels of one rasterization pass
 SLOT_WIDTH = 16  # numbers of the gradient of an instance
+SEGMENT = 256  # instances of a tile that a block of `rasterize_bwd` processes on a GPU
 PACKED_HEADER = 8  # columns of `Splats2D.packed` before the colours
 PACKED_STRIDE = 16  # the number of columns of `Splats2D.packed` is a multiple of this
 POSE_SUMS = 16  # for the gradient of a pose: 9 for R, 3 for t, 3 for the position, 1 for log f

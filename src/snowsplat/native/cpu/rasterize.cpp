@@ -538,3 +538,5 @@ SNOW_ENTRY(rasterize_block_bytes, SizeQueryParams) { return (void)p, sizeof(Tile
 SNOW_ENTRY(rasterize_block_bytes_f64, SizeQueryParams) { return (void)p, sizeof(Tile<VecD>::Bits); }
 // 1: the caller allocates slots for all instances; 0: rasterize_bwd adds to the rows of the splats.
 SNOW_ENTRY(rasterize_has_slots, SizeQueryParams) { return (void)p, 0; }
+// The places in a list of n instances at which the backward pass cuts tiles into segments, at most.
+SNOW_ENTRY(rasterize_boundaries, SizeQueryParams) { return (void)p, 0; }

@@ -1,5 +1,6 @@
 // Rasterization: composites the splats of each 16×16 tile front to back, and computes the gradient.
-// One block processes one tile, one warp a rectangle of 8×4 pixels, one thread a pixel.
+// One block processes one tile, in the backward pass one segment of its list; one warp a rectangle of
+// 8×4 pixels, one thread a pixel.
 //
 // Culling   Instances are loaded into shared memory in batches. 32 instances are tested at a time:
 //           each lane tests one of them against the rectangle of the warp, exactly. The warp
@@ -10,8 +11,11 @@
 // Backward  The splats are processed front to back again. S is the dot product of g = ∂L/∂C and the
 //           contribution of the splats behind the current one. At the start all splats are behind,
 //           so S₀ = g·C is known. The derivative with respect to log α is w·(g·c) − α S/(1 − α).
-//           It needs no division by T, no last index per pixel, and no state of the forward pass
-//           except the image.
+//           It needs no division by T and no last index per pixel.
+// Segments  The list of a tile is cut after every 256 instances, and each part is processed by a
+//           block of its own in the backward pass; otherwise the longest list would decide the time.
+//           At each cut, the forward pass stores T and the colour C' of the splats in front, so the
+//           segment behind begins with S = g·(C − C').
 //
 // The gradient of a splat is a sum over pixels. Most of its cost is the addition of numbers of
 // different threads. It is done with one thread per splat, as in the bucketed backward pass of
@@ -61,8 +65,8 @@ struct PixelPosition {
   bool inside;
   int64_t pixel_count, index;  // pixels of the image; index of this pixel in a channel
 
-  SNOW_INLINE PixelPosition(int width, int height) {
-    const int tiles_x = (width + kTile - 1) / kTile, tile = int(blockIdx.x);
+  SNOW_INLINE PixelPosition(int width, int height, int tile) {
+    const int tiles_x = (width + kTile - 1) / kTile;
     left = tile % tiles_x * kTile + warp_id() % kRectsAcross * kRectWidth;
     top = tile / tiles_x * kTile + warp_id() / kRectsAcross * kRectHeight;
     x = left + lane_id() % kRectWidth, y = top + lane_id() / kRectWidth;
@@ -171,6 +175,15 @@ struct ForwardMemory {
   uint32_t ends[kWarps];
 };
 
+// The state of the thread's pixel in front of the instance at index `begin`, with which a segment
+// begins: the signed transmittance, then C colours, kBlock numbers apart. The segments of all tiles,
+// without the first of each, begin at least kSegment instances apart, so no two have the same place.
+template <int C, class T>
+SNOW_INLINE T* pixel_state(T* states, uint32_t begin) {
+  return states + int64_t(begin / kSegment - 1) * ((1 + C) * kBlock) + threadIdx.x;
+}
+static_assert(kSegment == kForwardBatch, "the forward pass stores a state before each batch");
+
 // kCount: the value of a pixel is the number of splats that are composited. kMedian: the values are
 // those of the splat at which the transmittance falls below 1/2, and after them, those of
 // kFrontToBack without a background.
@@ -178,9 +191,9 @@ enum class Blend { kFrontToBack, kAdditive, kCount, kMedian };
 
 template <int C, Blend kBlend, class T>
 SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* background, T* image,
-                         T* alpha, ForwardMemory<T>& memory) {
+                         T* alpha, T* states, ForwardMemory<T>& memory) {
   uint8_t* const instance_blocks = static_cast<uint8_t*>(f.instance_blocks);
-  const PixelPosition position(int(f.width), int(f.height));
+  const PixelPosition position(int(f.width), int(f.height), int(blockIdx.x));
   const int thread = int(threadIdx.x), warp = warp_id(), lane = lane_id();
   Pixel<T> pixel(position);
   T color[kBlend == Blend::kMedian ? 2 * C : C] = {};
@@ -190,6 +203,12 @@ SNOW_INLINE void forward(const FrameParams<T>& f, int channels, const T* backgro
   for (; base < end; base += kForwardBatch) {
     // Also waits until all threads have finished the last batch.
     if (!__syncthreads_or(pixel.unfinished())) break;
+    if (kBlend == Blend::kFrontToBack && states && base > f.tile_start[blockIdx.x]) {
+      T* const state = pixel_state<C>(states, base);
+      state[0] = pixel.signed_transmittance;
+#pragma unroll
+      for (int k = 0; k < C; k++) state[(1 + k) * kBlock] = color[k];
+    }
     const int count = end - base < kForwardBatch ? int(end - base) : kForwardBatch;
     if (thread < count) {
       const SplatTerms<T> s = load<C>(f, base + uint32_t(thread), memory.batch, thread);
@@ -275,9 +294,9 @@ template <Blend kBlend, class T>
 SNOW_INLINE void forward_of_channels(const RasterizeForwardParams<T>& p, ForwardMemory<T>& memory) {
   const int channels = int(p.channels);
   if (channels <= 3)
-    forward<3, kBlend>(p.frame, channels, p.background, p.image, p.alpha, memory);
+    forward<3, kBlend>(p.frame, channels, p.background, p.image, p.alpha, p.states, memory);
   else
-    forward<4, kBlend>(p.frame, channels, p.background, p.image, p.alpha, memory);
+    forward<4, kBlend>(p.frame, channels, p.background, p.image, p.alpha, p.states, memory);
 }
 
 constexpr int kGroup = kWarp / kRectHeight;  // splats that a warp processes at a time
@@ -307,6 +326,7 @@ struct BackwardMemory {
   WarpScratch<T> scratch[kWarps];
   Touching list[kWarps];
   uint8_t touched[kBackwardBatch];  // for each instance, the byte that the forward pass stored
+  int packed_columns[kSlotWidth];   // of each sum, see `packed_column`
 };
 
 // Sums over pixels for one splat: of C colours, then the six moments (see BlendMoments).
@@ -405,21 +425,25 @@ struct PixelGradient {
   T behind, grad[C], grad_alpha;
 
   // Reads the gradients of the thread's pixel, and stores the gradients of its colours for step 2.
+  // `state`: that of the pixel, or null at the first instance of a tile and in the additive mode.
   SNOW_INLINE PixelGradient(const PixelPosition& position, const RasterizeBackwardParams<T>& p,
-                            PixelGrads<T>& grads)
+                            const T* state, PixelGrads<T>& grads)
       : pixel(position), behind(0), grad_alpha(0) {
+    if (state) pixel.signed_transmittance = state[0];
 #pragma unroll
     for (int k = 0; k < C; k++) {
       grad[k] = T(0);
       if (position.inside && k < int(p.channels)) {
         grad[k] = p.grad_image[k * position.pixel_count + position.index];
-        behind += grad[k] * p.image[k * position.pixel_count + position.index];
+        const T in_front = state ? state[(1 + k) * kBlock] : T(0);
+        behind += grad[k] * (p.image[k * position.pixel_count + position.index] - in_front);
       }
       grads.one[k][threadIdx.x] = grad[k];
     }
     if (position.inside && p.grad_alpha) {
       grad_alpha = p.grad_alpha[position.index];
-      behind += grad_alpha * p.alpha[position.index];
+      const T in_front = T(1) - pixel.transmittance();
+      behind += grad_alpha * (p.alpha[position.index] - in_front);
     }
   }
 
@@ -445,8 +469,8 @@ struct PixelGradient {
 // Steps 1 and 2 for the 32 instances from index `first` of the batch on. Composites the instances
 // that touch the rectangle of the warp, and stores the sums over its pixels in the warp's scratch.
 template <int C, bool kAdditive, class T>
-SNOW_INLINE void sum_over_pixels(const PixelPosition& position, PixelGradient<C, T>& gradient,
-                                 int count, int first, BackwardMemory<T>& memory) {
+SNOW_INLINE void sum_over_pixels(PixelGradient<C, T>& gradient, int count, int first,
+                                 BackwardMemory<T>& memory) {
   const int warp = warp_id(), lane = lane_id();
   // In step 2: the index of the thread's splat within the group, and the row of the rectangle.
   const int slot = lane % kGroup, row = lane / kGroup;
@@ -469,8 +493,10 @@ SNOW_INLINE void sum_over_pixels(const PixelPosition& position, PixelGradient<C,
     Sums<C, T> rows;
     if (slot < group) {
       const Four<T> mean_conic = memory.batch.mean_conic[list[done + slot]];
-      rows.add_row(row_pairs, row_grads, centre<T>(position.left) - mean_conic.x,
-                   centre<T>(position.top + row) - mean_conic.y);
+      // The pixel of the thread is in this row, at column `slot`; the subtraction is exact.
+      static_assert(kGroup == kRectWidth, "a thread per pixel and a thread per splat and row");
+      const Pixel<T>& pixel = gradient.pixel;
+      rows.add_row(row_pairs, row_grads, pixel.x - T(slot) - mean_conic.x, pixel.y - mean_conic.y);
     }
     sums.add_group(rows, done / kGroup);
     __syncwarp();
@@ -481,14 +507,16 @@ SNOW_INLINE void sum_over_pixels(const PixelPosition& position, PixelGradient<C,
 // The sum that a thread adds in step 3, which uses 16 threads per instance, one per sum.
 struct SumPosition {
   int instance, column;  // the instance, of 16 at a time; the index of the sum
-  int packed_column;     // the column of the packed gradient to which the sum belongs
 
-  SNOW_INLINE SumPosition(int channels, const int64_t* columns)
-      : instance(int(threadIdx.x) / kSlotWidth), column(int(threadIdx.x) % kSlotWidth),
-        packed_column(column < channels    ? int(columns[column])
-                      : column == channels ? 5
-                                           : column - channels - 1) {}
+  SNOW_INLINE SumPosition()
+      : instance(int(threadIdx.x) / kSlotWidth), column(int(threadIdx.x) % kSlotWidth) {}
 };
+
+// The column of the packed gradient to which a sum belongs.
+SNOW_INLINE int packed_column(int sum, int channels, const int64_t* columns) {
+  if (sum < channels) return int(columns[sum]);
+  return sum == channels ? 5 : sum - channels - 1;
+}
 
 // Step 3 for the 32 instances from index `first` of the batch on. Adds the sums of the warps in
 // order. Writes the gradient of each instance to its slot, or adds it to the row of its splat. All
@@ -518,27 +546,68 @@ SNOW_INLINE void add_warps(const RasterizeBackwardParams<T>& p, const SumPositio
     } else {
       sum = gradient_of<C>(sum, position.column - C, memory.batch.mean_conic[i],
                            memory.batch.opacity_color[i]);
-      if (warps && position.packed_column >= 0 && sum != T(0)) {
-        atomicAdd(p.grad_packed + target[h] * p.frame.stride + position.packed_column, sum);
-        if (p.abs_grad && position.packed_column < 2)
-          atomicAdd(p.abs_grad + 2 * int64_t(target[h]) + position.packed_column, abs(sum));
+      const int column = memory.packed_columns[position.column];
+      if (warps && column >= 0 && sum != T(0)) {
+        atomicAdd(p.grad_packed + target[h] * p.frame.stride + column, sum);
+        if (p.abs_grad && column < 2)
+          atomicAdd(p.abs_grad + 2 * int64_t(target[h]) + column, abs(sum));
       }
     }
   }
   __syncthreads();
 }
 
+// The last tile whose list begins before an instance, which is not the first of all. All threads of
+// the block search together; 65,536 tiles need two rounds.
+SNOW_INLINE int tile_before(const uint32_t* tile_start, int tiles, uint32_t instance) {
+  int first = 0;
+  while (tiles > 1) {
+    const int step = (tiles + kBlock - 1) / kBlock, at = int(threadIdx.x) * step;
+    const bool begins = at < tiles && tile_start[first + at] < instance;
+    const int passed = (__syncthreads_count(begins) - 1) * step;
+    first += passed;
+    tiles = tiles - passed < step ? tiles - passed : step;
+  }
+  return first;
+}
+
+// The instances of a tile that a block of the backward pass processes.
+struct Segment {
+  int tile;
+  uint32_t begin, end;  // empty if there is none for the block
+  bool is_first;        // of its tile
+
+  // The first blocks have the segments other than the first of a tile. Block k has the one that
+  // begins at one of kSegment instances from (k + 1) kSegment on, if there is one. There is at most
+  // one, and its tile begins before these instances. The other blocks have the first segments of all
+  // tiles. All threads of the block must take part.
+  SNOW_INLINE Segment(const uint32_t* tile_start, int tiles)
+      : tile(int(blockIdx.x) - (int(gridDim.x) - tiles)), begin(0), end(0), is_first(tile >= 0) {
+    const uint32_t range = (blockIdx.x + 1) * uint32_t(kSegment);
+    if (!is_first) {
+      if (range >= tile_start[tiles]) return;
+      tile = tile_before(tile_start, tiles, range);
+    }
+    const uint32_t start = tile_start[tile], last = tile_start[tile + 1];
+    begin = start;
+    if (!is_first) begin += (range - start + kSegment - 1) / kSegment * kSegment;
+    if (begin < last) end = last - begin < kSegment ? last : begin + kSegment;
+  }
+};
+
+// The gradients of the instances from index `begin` to `end` of a tile. `state`: see PixelGradient.
 template <int C, bool kAdditive, class T>
-SNOW_INLINE void backward(const RasterizeBackwardParams<T>& p, BackwardMemory<T>& memory) {
+SNOW_INLINE void add_instances(const RasterizeBackwardParams<T>& p, int tile, uint32_t begin,
+                               uint32_t end, const T* state, BackwardMemory<T>& memory) {
   const FrameParams<T>& f = p.frame;
   const uint8_t* const instance_blocks = static_cast<const uint8_t*>(f.instance_blocks);
-  const PixelPosition position(int(f.width), int(f.height));
+  const PixelPosition position(int(f.width), int(f.height), tile);
   const int thread = int(threadIdx.x);
-  PixelGradient<C, T> gradient(position, p, memory.grads);
-  const SumPosition sum_position(C, f.columns);
+  PixelGradient<C, T> gradient(position, p, state, memory.grads);
+  const SumPosition sum_position;
+  if (thread < kSlotWidth) memory.packed_columns[thread] = packed_column(thread, C, f.columns);
 
-  const uint32_t end = f.tile_end[blockIdx.x];
-  for (uint32_t base = f.tile_start[blockIdx.x]; base < end; base += kBackwardBatch) {
+  for (uint32_t base = begin; base < end; base += kBackwardBatch) {
     const int count = end - base < kBackwardBatch ? int(end - base) : kBackwardBatch;
     if (thread < count) {
       load<C>(f, base + uint32_t(thread), memory.batch, thread);
@@ -546,15 +615,30 @@ SNOW_INLINE void backward(const RasterizeBackwardParams<T>& p, BackwardMemory<T>
     }
     __syncthreads();
     for (int first = 0; first < count; first += kWarp) {
-      sum_over_pixels<C, kAdditive>(position, gradient, count, first, memory);
+      sum_over_pixels<C, kAdditive>(gradient, count, first, memory);
       add_warps<C>(p, sum_position, base, count, first, memory);
     }
   }
-  if (!p.slots) return;
-  // Zeroes the slots of the instances after the last one that the forward pass visited.
-  const uint32_t last = f.tile_start[blockIdx.x + 1];
-  for (uint32_t i = end + uint32_t(thread / kSlotWidth); i < last; i += kBlock / kSlotWidth)
-    p.slots[int64_t(p.instance_slot[i]) * kSlotWidth + thread % kSlotWidth] = T(0);
+}
+
+template <int C, bool kAdditive, class T>
+SNOW_INLINE void backward(const RasterizeBackwardParams<T>& p, BackwardMemory<T>& memory) {
+  const Segment segment(p.frame.tile_start, int(p.n));
+  if (segment.begin >= segment.end) return;
+  const uint32_t visited_end = p.frame.tile_end[segment.tile];
+  if (p.slots) {
+    // Zeroes the slots of the instances after the last one that the forward pass visited.
+    const int thread = int(threadIdx.x);
+    const uint32_t first = visited_end > segment.begin ? visited_end : segment.begin;
+    for (uint32_t i = first + uint32_t(thread / kSlotWidth); i < segment.end;
+         i += kBlock / kSlotWidth)
+      p.slots[int64_t(p.instance_slot[i]) * kSlotWidth + thread % kSlotWidth] = T(0);
+  }
+  if (visited_end <= segment.begin) return;
+  const uint32_t end = visited_end < segment.end ? visited_end : segment.end;
+  const bool has_state = !kAdditive && !segment.is_first;
+  const T* const state = has_state ? pixel_state<C>(p.states, segment.begin) : nullptr;
+  add_instances<C, kAdditive>(p, segment.tile, segment.begin, end, state, memory);
 }
 
 template <bool kAdditive, class T>
@@ -599,29 +683,30 @@ using namespace snow;
 #endif
 #define SNOW_BACKWARD_BLOCKS 4
 
-#define SNOW_RASTERIZE_KERNELS(SUFFIX, T, FORWARD_BLOCKS, BACKWARD_BLOCKS)                       \
-  SNOW_KERNEL_OF(rasterize_fwd##SUFFIX, kBlock, FORWARD_BLOCKS, RasterizeForwardParams<T>) {     \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                    \
-    if (p.frame.additive)                                                                        \
-      forward_of_channels<Blend::kAdditive>(p, *memory);                                         \
-    else                                                                                         \
-      forward_of_channels<Blend::kFrontToBack>(p, *memory);                                      \
-  }                                                                                              \
-  SNOW_KERNEL(rasterize_median##SUFFIX, kBlock, RasterizeForwardParams<T>) {                     \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                    \
-    forward<4, Blend::kMedian, T>(p.frame, int(p.channels), nullptr, p.image, p.alpha, *memory); \
-  }                                                                                              \
-  SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {                        \
-    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                    \
-    forward<1, Blend::kCount, T>(p.frame, 1, nullptr, p.counts, nullptr, *memory);               \
-  }                                                                                              \
-  SNOW_KERNEL_OF(rasterize_bwd##SUFFIX, kBlock, BACKWARD_BLOCKS, RasterizeBackwardParams<T>) {   \
-    SNOW_SHARED(BackwardMemory<T>, memory, 1);                                                   \
-    if (p.frame.additive)                                                                        \
-      backward_of_channels<true>(p, *memory);                                                    \
-    else                                                                                         \
-      backward_of_channels<false>(p, *memory);                                                   \
-  }                                                                                              \
+#define SNOW_RASTERIZE_KERNELS(SUFFIX, T, FORWARD_BLOCKS, BACKWARD_BLOCKS)                      \
+  SNOW_KERNEL_OF(rasterize_fwd##SUFFIX, kBlock, FORWARD_BLOCKS, RasterizeForwardParams<T>) {    \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                   \
+    if (p.frame.additive)                                                                       \
+      forward_of_channels<Blend::kAdditive>(p, *memory);                                        \
+    else                                                                                        \
+      forward_of_channels<Blend::kFrontToBack>(p, *memory);                                     \
+  }                                                                                             \
+  SNOW_KERNEL(rasterize_median##SUFFIX, kBlock, RasterizeForwardParams<T>) {                    \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                   \
+    forward<4, Blend::kMedian, T>(p.frame, int(p.channels), nullptr, p.image, p.alpha, nullptr, \
+                                  *memory);                                                     \
+  }                                                                                             \
+  SNOW_KERNEL(rasterize_count##SUFFIX, kBlock, RasterizeCountParams<T>) {                       \
+    SNOW_SHARED(ForwardMemory<T>, memory, 1);                                                   \
+    forward<1, Blend::kCount, T>(p.frame, 1, nullptr, p.counts, nullptr, nullptr, *memory);     \
+  }                                                                                             \
+  SNOW_KERNEL_OF(rasterize_bwd##SUFFIX, kBlock, BACKWARD_BLOCKS, RasterizeBackwardParams<T>) {  \
+    SNOW_SHARED(BackwardMemory<T>, memory, 1);                                                  \
+    if (p.frame.additive)                                                                       \
+      backward_of_channels<true>(p, *memory);                                                   \
+    else                                                                                        \
+      backward_of_channels<false>(p, *memory);                                                  \
+  }                                                                                             \
   SNOW_KERNEL(background_bwd##SUFFIX, 128, BackgroundBackwardParams<T>) { background_row(p); }
 
 SNOW_RASTERIZE_KERNELS(, float, SNOW_FORWARD_BLOCKS, SNOW_BACKWARD_BLOCKS)

@@ -12,7 +12,7 @@ from snowsplat.ops.cuda.kernels import KERNELS, SWEEP_EDGE, Kernel, Run
 from snowsplat.ops.cuda.nearest_neighbours import neighbours
 from snowsplat.ops.cuda.photometric import photometric
 from snowsplat.ops.cuda.tiling import splats_sort, tiles_count, tiles_fill, workspace_bytes
-from snowsplat.util.native_layout import POSE_SUMS, Fields
+from snowsplat.util.native_layout import POSE_SUMS, SEGMENT, Fields
 
 Execute = Callable[[Kernel, str, int, Fields], None]
 """Runs a kernel. Arguments: the kernel, its full name, the number of blocks, the parameters."""
@@ -76,6 +76,17 @@ def _has_slots(run: Run, suffix: str, p: Fields) -> int:
     return int(torch.are_deterministic_algorithms_enabled())
 
 
+def _boundaries(instances: int) -> int:
+    """The segments of all tiles of `rasterize_bwd`, without the first one of each tile, at most."""
+    return max(0, instances - 1) // SEGMENT
+
+
+def _rasterize_bwd(run: Run, suffix: str, p: Fields) -> int:
+    boundaries = _boundaries(len(p["frame.instance_splat"]))
+    run("rasterize_bwd" + suffix, p, p["n"] + boundaries)
+    return 0
+
+
 def _plane_sweep(run: Run, suffix: str, p: Fields) -> int:
     blocks = -(-p["width"] // SWEEP_EDGE) * -(-p["height"] // SWEEP_EDGE)
     run("plane_sweep" + suffix, p, blocks)
@@ -98,6 +109,8 @@ SEQUENCES: dict[str, Callable[[Run, str, Fields], int]] = {
     "tiles_fill": tiles_fill,
     "rasterize_block_bytes": lambda run, suffix, p: 1,  # a bit for each of the 8 warps of a tile
     "rasterize_has_slots": _has_slots,
+    "rasterize_boundaries": lambda run, suffix, p: _boundaries(p["n"]),
+    "rasterize_bwd": _rasterize_bwd,
     "photometric": partial(photometric, ""),
     "photometric_u8": partial(photometric, "_u8"),
     "neighbours": neighbours,
