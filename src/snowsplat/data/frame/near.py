@@ -13,6 +13,7 @@ from snowsplat.data.dataset import scene_extent
 from snowsplat.data.frame.bounds import scene_bounds
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.near_plane import near_plane
+from snowsplat.util.process import single_threaded
 
 # At most this number of cameras is used, evenly chosen, to limit the time; of the points about this
 # number, and more if that is too few for most cameras: each may see a small part of a large scene.
@@ -49,6 +50,7 @@ def near_of(cameras: Sequence[Camera], points: Tensor | None) -> float:
     return near_plane(min(float(np.median(away)), scene_extent(used)))
 
 
+@single_threaded()  # for so few points, threads take longer to start than to compute
 def _depths(cameras: Sequence[Camera], points: Tensor) -> list[tuple[float, float]]:
     """For each camera that sees enough points: their 2% quantile and their median depth."""
     points = points.detach().cpu().double()

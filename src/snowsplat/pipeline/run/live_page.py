@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from snowsplat.data import Dataset
 from snowsplat.pipeline.observer import SILENT, Observer
@@ -11,9 +12,10 @@ from snowsplat.scene.gaussians import Gaussians
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.viewer.hosts import LOCAL_HOST, KnownHosts
 from snowsplat.viewer.http.listen import listen
-from snowsplat.viewer.live.curves import SampledPsnr
-from snowsplat.viewer.live.training import TrainingViewer
-from snowsplat.viewer.live.viewer import NetworkViewer, Scene
+
+if TYPE_CHECKING:  # most trainings have no page; importing its server takes 0.1 s
+    from snowsplat.viewer.live.training import TrainingViewer
+    from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 
 class LivePage:
@@ -61,6 +63,8 @@ class LivePage:
         ``background``: red, green, blue in 0..1. ``label``: the title of the page.
         Raises: UserError: another process has opened the port since the constructor checked it.
         """
+        from snowsplat.viewer.live.viewer import NetworkViewer
+
         viewer = NetworkViewer(
             dataset,
             background,
@@ -75,6 +79,9 @@ class LivePage:
 
     def open_training(self, trainer: Trainer, label: str, observer: Observer = SILENT) -> None:
         """Open the page for a training run, as `open`; then call `after_step` after each step."""
+        from snowsplat.viewer.live.curves import SampledPsnr
+        from snowsplat.viewer.live.training import TrainingViewer
+
         white = trainer.config.background == "white"
         background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
         viewer = self.open(trainer.dataset, background, label, observer)

@@ -34,6 +34,7 @@ from snowsplat.data.photos.image_loader import Photos
 from snowsplat.scene.camera import Camera
 from snowsplat.training.starts.point_colors import point_colors, point_pixels
 from snowsplat.util.messages import Message, message
+from snowsplat.util.process import single_threaded
 
 #: Photos are encoded approximately by this power: value = light^(1 / 2.2).
 GAMMA = 2.2
@@ -81,6 +82,7 @@ class ExposureStart:
     everywhere: bool = True
 
 
+@single_threaded()
 def exposure_start(dataset: Dataset, images: Photos) -> ExposureStart:
     """Compare the exposures of the training photos.
 
