@@ -81,9 +81,11 @@ def test_lists_of_test_images(pristine, tmp_path):
     names = ["view_02.png", "view_05"]
     dataset = load_dataset(pristine["colmap-txt"], test_list=names)
     assert [view.name for view in dataset.test] == ["view_02.png", "view_05.png"]
-    (tmp_path / "test.txt").write_text("view_02.png\n\n view_05 \n")
-    again = load_dataset(pristine["colmap-txt"], test_list=tmp_path / "test.txt")
-    assert [view.name for view in again.test] == ["view_02.png", "view_05.png"]
+    for encoding in ("utf-8-sig", "utf-16"):  # as Windows writes
+        text = "view_02.png\r\n\n view_05 \n"
+        (tmp_path / "test.txt").write_text(text, encoding=encoding)
+        again = load_dataset(pristine["colmap-txt"], test_list=tmp_path / "test.txt")
+        assert [view.name for view in again.test] == ["view_02.png", "view_05.png"]
     with pytest.raises(UserError, match="'view_99' is not an image"):
         load_dataset(pristine["colmap-txt"], test_list=["view_99"])
     with pytest.raises(UserError, match="cannot be read"):

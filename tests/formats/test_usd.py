@@ -18,7 +18,7 @@ from snowsplat.util.errors import UserError
 ORIGIN = (500_000.0, 20.0, -5_400_000.0)
 
 try:
-    from pxr import Usd, UsdGeom, UsdValidation, UsdVol
+    from pxr import Sdf, Usd, UsdGeom, UsdValidation, UsdVol
 
     installed = hasattr(UsdVol, "ParticleField3DGaussianSplat")
 except ImportError:
@@ -46,20 +46,17 @@ def test_a_usd_file_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @with_usd
 @pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc", ".usdz"])
 def test_a_scene_comes_back(make_scene, tmp_path: Path, suffix: str) -> None:
-    """In metres, at its place; SH of every degree."""
+    """With its unit, at its place; SH of every degree."""
     for degree, metres in enumerate((None, 1.0, 0.25, None)):
         scene = replace(make_scene(7, degree), metres_per_unit=metres, origin=ORIGIN)
         write_gaussians(tmp_path / f"a{suffix}", scene)
         back = read_gaussians(tmp_path / f"a{suffix}")
-        factor = metres or 1.0
         world, expected = (s.means.double().numpy() + np.array(s.origin) for s in (back, scene))
-        assert np.abs(world - factor * expected).max() < 1e-3
-        assert back.metres_per_unit == (None if metres is None else 1.0)
+        assert np.abs(world - expected).max() < 1e-3
+        assert back.metres_per_unit == metres
         for name, tensor in scene.parameters().items():
             if name not in ("means", "quats"):
-                other = back.parameters()[name]
-                shift = np.log(factor) if name == "log_scales" else 0.0
-                assert torch.allclose(other, tensor + shift, atol=1e-4), name
+                assert torch.allclose(back.parameters()[name], tensor, atol=1e-4), name
         alike = (scene.rotations * back.rotations).sum(1).abs()
         assert (alike - 1).abs().max() < 1e-5
     assert os.listdir(tmp_path) == [f"a{suffix}"]
@@ -124,13 +121,67 @@ def test_files_of_others(tmp_path: Path) -> None:
     assert found.sh_rest.shape == (2, 0, 3)
     assert not found.sh_dc.any()
     assert (found.opacity_logits > 10).all()
-    assert found.metres_per_unit is None
+    assert found.metres_per_unit == 0.01
     (tmp_path / "b.usda").write_text('#usda 1.0\n def Xform "a" {}\n')
-    with pytest.raises(UserError, match="without Gaussian splats"):
+    with pytest.raises(UserError, match="without visible Gaussian splats"):
         read_arrays(tmp_path / "b.usda")
     (tmp_path / "c.usdc").write_bytes(b"PXR-USDC" + bytes(200))
     with pytest.raises(UserError, match="c.usdc: OpenUSD reports"):
         read_arrays(tmp_path / "c.usdc")
+
+
+@with_usd
+def test_what_a_stage_says_of_its_splats(tmp_path: Path, caplog) -> None:
+    """Visibility, instances, times, colour spaces."""
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, "Y")
+
+    def define(path: str, x: float):
+        splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
+        splats.CreatePositionsAttr([(x, 0, 0)])
+        return splats
+
+    define("/plain", 1)
+    UsdGeom.Imageable(define("/group/hidden", 2)).MakeInvisible()
+    define("/shared/splats", 3)
+    for name, y in (("a", 5), ("b", 6)):
+        copy = UsdGeom.Xform.Define(stage, f"/{name}")
+        copy.GetPrim().GetReferences().AddInternalReference("/shared")
+        copy.GetPrim().SetInstanceable(True)
+        copy.AddTranslateOp().Set((0, y, 0))
+    define("/many/types/x/splats", 4)
+    UsdGeom.Xform.Define(stage, "/many/types/x").AddTranslateOp().Set((0, 0, 1))
+    many = UsdGeom.PointInstancer.Define(stage, "/many")
+    many.CreatePrototypesRel().AddTarget("/many/types/x")
+    many.CreateProtoIndicesAttr([0, 0, 0])
+    many.CreatePositionsAttr([(0, 7, 0), (0, 8, 0), (0, 9, 0)])
+    many.CreateInvisibleIdsAttr([1])
+    moving = define("/moving", 0)
+    moving.GetPositionsAttr().Clear()
+    moving.GetPositionsAttr().Set([(10, 0, 0)], 1)
+    moving.GetPositionsAttr().Set([(11, 0, 0)], 2)
+    light = define("/light", 12).GetPrim()
+    light.CreateAttribute("colorSpace:name", Sdf.ValueTypeNames.Token).Set("lin_rec709_scene")
+    stage.Export(str(tmp_path / "a.usda"))
+    with caplog.at_level("WARNING"):
+        found = read_arrays(tmp_path / "a.usda").world_means() * (1, -1, -1)
+    wanted = [
+        (1, 0, 0),
+        (3, 0, 0),
+        (3, 5, 0),
+        (3, 6, 0),
+        (4, 7, 1),
+        (4, 9, 1),
+        (10, 0, 0),
+        (12, 0, 0),
+    ]
+    np.testing.assert_allclose(sorted(map(tuple, found)), wanted)
+    for text in (
+        "1 prims with splats are invisible",
+        "animated; read at the first time",
+        "lin_rec709_scene",
+    ):
+        assert text in caplog.text
 
 
 @with_usd

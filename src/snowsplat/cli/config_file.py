@@ -12,7 +12,7 @@ from snowsplat.cli.command import Command
 from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.flags import Flag, flags_of
 from snowsplat.util.messages import message
-from snowsplat.util.safe_json import from_json, printable, read_json
+from snowsplat.util.safe_json import encoding_of, from_json, printable, read_json
 from snowsplat.util.settings import kinds_of, setting, suggestion
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _toml(file: Path) -> Any:
         raise UserError("{file}: TOML needs Python 3.11; write the same as JSON", file=file)
     import tomllib  # type: ignore[import-not-found,unused-ignore]
 
-    return tomllib.loads(file.read_text(encoding="utf-8"))
+    return tomllib.loads((data := file.read_bytes()).decode(encoding_of(data)))
 
 
 def _value(flag: Flag, value: Any) -> Any:

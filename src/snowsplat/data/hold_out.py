@@ -9,7 +9,7 @@ from snowsplat.data.dataset import PosedImage
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.messages import message
 from snowsplat.util.natural_order import natural_key
-from snowsplat.util.safe_json import is_file, quoted
+from snowsplat.util.safe_json import encoding_of, is_file, quoted
 
 
 def held_out_names(
@@ -56,7 +56,8 @@ def _names_in_list(
         try:
             if Path(test_list).exists() and not is_file(Path(test_list)):
                 raise ValueError("not a file")
-            lines = Path(test_list).read_text(encoding="utf-8").splitlines()
+            data = Path(test_list).read_bytes()
+            lines = data.decode(encoding_of(data)).splitlines()
         except (OSError, ValueError) as error:
             raise UserError(
                 "{test_list}: the list of test images cannot be read ({error})",

@@ -22,6 +22,7 @@ from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, without_unusable
 from snowsplat.formats.ply import is_ply, is_scene, read_ply
 from snowsplat.formats.sog import read_sog
+from snowsplat.formats.sog_container import meta_folder
 from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.util.messages import message
 from snowsplat.util.ply import open_table
@@ -70,7 +71,7 @@ def read_archive(path: Path) -> GaussianArrays:
     """
     with ZipMembers(path) as members:
         names = [name for name in members.names() if _is_own(name)]
-        if "meta.json" in names:
+        if meta_folder(names) is not None:
             return read_sog(path)
         if _DOCUMENT in names and any(_SPLAT.fullmatch(name) for name in names):
             return _project(path, members, names)

@@ -36,7 +36,11 @@ _COMPONENTS = {
 }
 #: The component types of the arrays that are written.
 _CODES = {("f", 4): 5126, ("u", 1): 5121, ("u", 2): 5123, ("u", 4): 5125}
-_VERTICES, _ROWS = 34962, 34963  # the targets of buffer views
+#: The component types of the indices of a sparse accessor.
+_INDICES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
+#: The extension of nodes that draw their mesh several times.
+INSTANCING = "EXT_mesh_gpu_instancing"
+_VERTICES, _TRIANGLES = 34962, 34963  # the targets of buffer views
 
 
 class Document:
@@ -147,7 +151,7 @@ def contents(
     accessors: list[dict[str, Any]] = []
     offset = 0
     for array in arrays:
-        target = _ROWS if array is rows else _VERTICES
+        target = _TRIANGLES if array is rows else _VERTICES
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target}
         accessor = {
             "bufferView": len(views),
@@ -213,32 +217,51 @@ def accessor(document: Document, index: int, *kinds: str) -> np.ndarray:
         KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
     """
     entry = _item(document.json, "accessors", index)
-    if entry["type"] not in kinds or entry["componentType"] not in _COMPONENTS or "sparse" in entry:
+    if entry["type"] not in kinds or entry["componentType"] not in _COMPONENTS:
         raise Damaged("its accessor {index} does not have the type of its attribute", index=index)
     code, divisor = _COMPONENTS[entry["componentType"]]
     dtype, width, count = np.dtype(code), _WIDTHS[entry["type"]], _non_negative(entry["count"])
-    data = view(document, entry["bufferView"])
-    row = width * dtype.itemsize
-    stride = _item(document.json, "bufferViews", entry["bufferView"]).get("byteStride", row)
-    offset = _non_negative(entry.get("byteOffset", 0))
-    needed = offset + (_non_negative(stride) * (count - 1) + row if count else 0)
-    if stride < row or needed > len(data):
+    sparse = entry.get("sparse")
+    if "bufferView" in entry or sparse is None:
+        result = _rows(document, entry, dtype, width, count).astype(np.float32)
+    elif count * width > document.size:  # zeros, of which the file has no bytes
         raise Damaged("its accessor {index} exceeds the file", index=index)
-    values = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
-    result = values.astype(np.float32)
+    else:
+        result = np.zeros((count, width), np.float32)
+    if sparse is not None:
+        changed, where = _non_negative(sparse["count"]), sparse["indices"]
+        rows = _rows(document, where, np.dtype(_INDICES[where["componentType"]]), 1, changed)
+        result[rows[:, 0]] = _rows(document, sparse["values"], dtype, width, changed)
     if entry.get("normalized", False) and divisor != 1.0:
         # The most negative integer also means -1.
         result = np.maximum(result / np.float32(divisor), np.float32(-1))
     return result
 
 
-def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """The meshes of the scene, each with ``world_from_mesh`` (4, 4) float64, for every node.
+def _rows(
+    document: Document, entry: dict[str, Any], dtype: np.dtype, width: int, count: int
+) -> np.ndarray:
+    """(count, width) values of a buffer view, as an accessor or a part of it describes them."""
+    index = entry["bufferView"]
+    data = view(document, index)
+    row = width * dtype.itemsize
+    stride = _item(document.json, "bufferViews", index).get("byteStride", row)
+    offset = _non_negative(entry.get("byteOffset", 0))
+    needed = offset + (_non_negative(stride) * (count - 1) + row if count else 0)
+    if stride < row or needed > len(data):
+        raise Damaged("an accessor exceeds its buffer view {index}", index=index)
+    return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
+
+
+def meshes(file: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """The meshes of the scene, each with ``world_from_mesh`` (4, 4) float64, for every node and
+    every instance of it.
 
     Raises:
-        Damaged: the nodes do not form trees.
+        Damaged: the nodes do not form trees; see also `accessor`.
         KeyError, IndexError, TypeError, ValueError: the JSON is not valid glTF.
     """
+    document = file.json
     nodes = document.get("nodes", [])
     if document.get("scenes"):
         roots = _item(document, "scenes", document.get("scene", 0)).get("nodes", [])
@@ -259,8 +282,21 @@ def meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarra
             raise Damaged("its nodes do not form trees")
         world_from_node = world_from_parent @ _local(node)
         if "mesh" in node:
-            yield _item(document, "meshes", node["mesh"]), world_from_node
+            mesh = _item(document, "meshes", node["mesh"])
+            for local in _instances(file, node):
+                yield mesh, world_from_node @ local
         waiting.extend((child, world_from_node) for child in children)
+
+
+def _instances(document: Document, node: dict[str, Any]) -> Iterator[np.ndarray]:
+    """(4, 4) ``node_from_mesh`` of each instance."""
+    attributes = node.get("extensions", {}).get(INSTANCING, {}).get("attributes")
+    if attributes is None:
+        yield np.eye(4)
+        return
+    columns = {name: accessor(document, each, "VEC3", "VEC4") for name, each in attributes.items()}
+    for values in zip(*columns.values(), strict=True):
+        yield _local({name.lower(): v for name, v in zip(columns, values, strict=True)})
 
 
 def _local(node: dict[str, Any]) -> np.ndarray:

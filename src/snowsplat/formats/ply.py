@@ -31,6 +31,7 @@ from snowsplat.scene.length import stored_metres
 from snowsplat.scene.origin import HERE, Origin, add_origins, stored_origin
 from snowsplat.scene.sh_constants import SH_C0, SH_REST_COUNTS
 from snowsplat.util.files import atomic_path
+from snowsplat.util.names import first_names
 from snowsplat.util.ply import PlyTable, header_of, open_table
 
 logger = logging.getLogger(__name__)
@@ -61,6 +62,8 @@ _MODES = {
 _REQUIRED = [*_MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS]
 _ORIGIN, _METRES = "origin ", "metres_per_unit "
 _HIGHEST_DEGREE = 10
+#: A comment of nerfstudio. Here, as in most files, y points down.
+_Z_UP = "vertical axis: z"
 
 
 def is_ply(head: bytes) -> bool:
@@ -84,9 +87,9 @@ def _missing(table: PlyTable) -> list[str]:
 def read_ply(path: Path, data: bytes | None = None) -> GaussianArrays:
     """Read a scene of any SH degree; coefficients beyond degree 3 are ignored.
 
-    The properties may have any order and any type. Unknown properties are ignored. NaN and infinity
-    are read as they are. Two scales are a flat Gaussian. The 3D filter of Mip-Splatting becomes
-    part of scales and opacities (equation 9 of Yu et al. 2024).
+    The properties may have any order and any type. Other properties are named in a warning. NaN and
+    infinity are read as they are. Two scales are a flat Gaussian. The 3D filter of Mip-Splatting
+    becomes part of scales and opacities (equation 9 of Yu et al. 2024).
 
     ``data``: see `open_table`.
 
@@ -104,6 +107,14 @@ def read_ply(path: Path, data: bytes | None = None) -> GaussianArrays:
     if k < stored:
         degree = math.isqrt(stored + 1) - 1
         logger.warning("%s: SH degree %d is reduced to 3", path, degree)
+
+    known = {*_MEANS, *_NORMALS, *_DC, *_RGB, "alpha", "opacity", *_SCALES, *_QUATS, _FILTER}
+    if others := sorted(table.columns.keys() - known - {*_rest_names(stored)}):
+        logger.warning("%s: not read, and lost: %s", path, first_names(others, 8))
+    if _Z_UP in map(str.lower, table.comments):
+        logger.warning(
+            "%s: its z axis is up; to turn it upright, convert with --rotate 90 0 0", path
+        )
 
     n = table.count
     exact = any(table.columns[name] == "f8" for name in _MEANS) or table.format == "ascii"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,13 @@ from snowsplat.util.safe_json import is_file, parse_json, quoted
 _MOST_INFLATION = 4
 
 
+def meta_folder(names: Iterable[str]) -> str | None:
+    """The folder of the only ``meta.json`` of a zip file, with "/", or ""; None: there is none."""
+    found = [name for name in names if PurePosixPath(name).name == "meta.json"]
+    own = [name for name in found if not name.startswith("__MACOSX/")]
+    return own[0].removesuffix("meta.json") if len(own) == 1 else None
+
+
 class Bundle:
     """The members of a zip file or of a folder. A context manager."""
 
@@ -32,8 +39,10 @@ class Bundle:
             with open(path, "rb") as file:
                 zipped = file.read(2) == b"PK"
             self.size = path.stat().st_size
+        self._folder = ""
         if zipped:
             self._zip = ZipMembers(path)
+            self._folder = meta_folder(self._zip.names()) or ""
 
     def __enter__(self) -> Bundle:
         return self
@@ -93,7 +102,7 @@ class Bundle:
 
     def _member(self, name: str) -> bytes:
         assert self._zip is not None
-        return self._zip.read(name, _MOST_INFLATION)
+        return self._zip.read(self._folder + name, _MOST_INFLATION)
 
     def _file(self, path: Path) -> bytes:
         with reading_file(path):

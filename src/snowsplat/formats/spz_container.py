@@ -1,7 +1,7 @@
 """The container of an `.spz` file: its header and its columns as bytes, packed and unpacked.
 
-Versions 1 to 3 have a header of 16 bytes and the columns, in one gzip stream (some tools write
-them uncompressed). Version 4 has a header of 32 bytes, extensions, a table with the packed and
+Versions 1 to 3 have a header of 16 bytes and the columns, compressed by gzip (some tools write them
+uncompressed). Version 4 has a header of 32 bytes, extensions, a table with the packed and
 unpacked size of each column, and the columns, each in a zstd stream; empty columns are omitted.
 
 Spark writes version 2, also with a tree of levels of detail: after the columns, the number of
@@ -72,7 +72,7 @@ def is_spz(head: bytes) -> bool:
     """Whether a file that begins with ``head`` is an .spz file of any version."""
     if head.startswith(_GZIP):
         try:
-            head = zlib.decompressobj(31).decompress(head, 4)
+            head, _ = _gunzip(head, len(_MAGIC))
         except zlib.error:
             return False
     return head.startswith(_MAGIC)
@@ -91,7 +91,7 @@ def read_header(data: bytes) -> Header:
     head = data
     try:
         if data.startswith(_GZIP):
-            head = zlib.decompressobj(31).decompress(data, _HEAD.size)
+            head, _ = _gunzip(data, _HEAD.size)
         return _header(head, len(data))
     except (zlib.error, struct.error):
         raise _damaged() from None
@@ -116,14 +116,12 @@ def _unpack(data: bytes) -> Contents:
         body = data[_HEAD.size :]
         size = _body_bytes(header)
     else:
-        stream = zlib.decompressobj(31)
-        head = stream.decompress(data, _HEAD.size)
-        header = _header(head, len(data))
+        header = _header(_gunzip(data, _HEAD.size)[0], len(data))
         size = _body_bytes(header)
-        # The checksum is only verified at the end of the stream.
-        body = stream.decompress(stream.unconsumed_tail, size + _EXTENSION_LIMIT)
-        if header.version > 3 or not stream.eof:
+        content, complete = _gunzip(data, _HEAD.size + size + _EXTENSION_LIMIT)
+        if header.version > 3 or not complete:
             raise _damaged()
+        body = content[_HEAD.size :]
     if len(body) < size:
         raise _damaged()
     columns, start = [], 0
@@ -132,6 +130,20 @@ def _unpack(data: bytes) -> Contents:
         start += width * header.count
     children = body[start : start + 2 * header.count] if header.flags & LEVELS else b""
     return Contents(header, columns, body[size:] if header.flags & EXTENDED else b"", children)
+
+
+def _gunzip(data: bytes, most: int) -> tuple[bytes, bool]:
+    """At most ``most`` bytes, at least one, of a gzip file, which may have several members; and
+    whether they are complete: the checksum is verified at the end of a member."""
+    parts: list[bytes] = []
+    while data.startswith(_GZIP) and most > 0:
+        stream = zlib.decompressobj(31)
+        parts.append(stream.decompress(data, most))
+        if not stream.eof:
+            return b"".join(parts), False
+        most -= len(parts[-1])
+        data = stream.unused_data
+    return b"".join(parts), not data.startswith(_GZIP)
 
 
 def _body_bytes(header: Header) -> int:

@@ -6,15 +6,17 @@ optional extra: `pip install "snowsplat[usd]"`.
 The splats are one prim with arrays: positions; orientations; scales, the standard deviations
 themselves; opacities in 0 … 1; and SH coefficients in the basis and order of our renderer, all
 those of a particle together, the constant one first. Values of any of these arrays may have 16 bits
-(`positionsh` …). The stage has y up, and metres are its unit: the frame and the scale of the prim
-are as in glTF (see `gltf`), its translation is the `scene.origin`. A stage states a unit even where
-it is unknown, so "metres_per_unit" in "snowsplat" of its customLayerData is 1 if it is known. The
-schema has no mark for antialiased scenes. Specification: openusd.org, schema domain usdVol.
+(`positionsh` …). The stage has y up: the frame of the prim is as in glTF (see `gltf`), its
+translation is the `scene.origin`. A stage states a unit even where it is unknown, so
+"metres_per_unit" in "snowsplat" of its customLayerData is 1 if it is known. The schema has no mark
+for antialiased scenes. Specification: openusd.org, schema domain usdVol.
 """
 
 from __future__ import annotations
 
+import logging
 import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -25,7 +27,7 @@ import numpy as np
 
 from snowsplat.formats import packing
 from snowsplat.formats.archive import first_member
-from snowsplat.formats.damage import Unsupported, reads
+from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
 from snowsplat.formats.gltf import place_in_scene
 from snowsplat.scene.length import stored_metres
@@ -33,9 +35,14 @@ from snowsplat.scene.sh_constants import SH_REST_COUNTS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
+logger = logging.getLogger(__name__)
+
 _SUFFIXES = (".usdc", ".usda", ".usd")
 _PRIM = "/scene/splats"
 _OWN = "snowsplat"
+_SPACE = "colorSpace:name"
+# Gaussians in copies of point instancers, at most.
+_MOST_COPIED = 10_000_000
 # The radius of a Gaussian in its extent, in standard deviations.
 _RADIUS = 3.0
 
@@ -82,34 +89,79 @@ def read_usd(path: Path) -> GaussianArrays:
     path.open("rb").close()  # a clear error if that is not possible
     with _usd(path) as (Usd, UsdGeom, _, UsdVol, _, _):
         stage = Usd.Stage.Open(str(path))
+        # A stage whose unit is one metre says nothing: programs that do not know the unit write it.
         unit = UsdGeom.GetStageMetersPerUnit(stage)
+        known = unit != 1.0 and UsdGeom.StageHasAuthoredMetersPerUnit(stage)
+        unit = stored_metres(unit) if known else None
         own = stage.GetRootLayer().customLayerData.get(_OWN, {})
         metres = stored_metres(own.get("metres_per_unit")) if isinstance(own, dict) else None
         # In a stage with z up, z becomes y, and y becomes -z.
         upright = np.eye(4)
         if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
             upright[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-        places = UsdGeom.XformCache()
-        parts = []
-        for prim in stage.Traverse():
-            if prim.IsA(UsdVol.ParticleField3DGaussianSplat):
-                # USD multiplies rows by matrices from the right.
-                matrix = upright @ np.array(places.GetLocalToWorldTransform(prim)).T
-                parts.append(place_in_scene(_splats(prim), matrix))
+        time = Usd.TimeCode.EarliestTime()
+        places = UsdGeom.XformCache(time)
+        parts, notes = [], Counter[str]()
+        for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+            if not prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+                continue
+            if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+                notes["invisible, left out"] += 1
+                continue
+            splats, matrices = _splats(prim, time), _placed(UsdGeom, places, prim, time)
+            if len(matrices) > 1 and len(matrices) * len(splats.means) > _MOST_COPIED:
+                raise Damaged("it repeats its splats too often")
+            parts += [place_in_scene(splats, upright @ matrix) for matrix in matrices]
+            if prim.GetAttribute("positions").ValueMightBeTimeVarying():
+                notes["animated; read at the first time"] += 1
+            space = next(filter(None, (p.GetAttribute(_SPACE).Get() for p in _upwards(prim))), "")
+            if space and not space.startswith("srgb"):
+                notes[f"in the colour space {space[:40]}; read as sRGB"] += 1
+    for note, count in notes.items():
+        logger.warning("%s: %d prims with splats are %s", path, count, note)
     if not parts:
-        raise Unsupported("a USD file without Gaussian splats (ParticleField3DGaussianSplat)")
+        raise Unsupported(
+            "a USD file without visible Gaussian splats (ParticleField3DGaussianSplat)"
+        )
     scene = GaussianArrays.cat(parts)
     found = usable_gaussians(path, *packing.flip_axes(replace(scene, means=scene.world_means())))
-    # A file of ours is in metres; another unit is that of another program that has edited it.
-    return replace(found, metres_per_unit=metres and metres * unit)
+    return replace(found, metres_per_unit=unit or metres)
 
 
-def _splats(prim: Any) -> GaussianArrays:
+def _upwards(prim: Any) -> Iterator[Any]:
+    """A prim and its ancestors."""
+    while prim:
+        yield prim
+        prim = prim.GetParent()
+
+
+def _placed(UsdGeom: Any, places: Any, prim: Any, time: Any) -> list[np.ndarray]:
+    """``world_from_prim`` (4, 4), of each copy if the prim is a prototype of a point instancer."""
+
+    def world(of: Any) -> np.ndarray:  # USD multiplies rows by matrices from the right
+        return np.array(places.GetLocalToWorldTransform(of)).T
+
+    above = next((p for p in _upwards(prim) if p.IsA(UsdGeom.PointInstancer)), None)
+    instancer: Any = UsdGeom.PointInstancer(above) if above else None
+    roots = instancer.GetPrototypesRel().GetTargets() if above else []
+    for number, root in enumerate(roots):
+        if prim.GetPath().HasPrefix(root):
+            inner = np.linalg.inv(world(prim.GetStage().GetPrimAtPath(root))) @ world(prim)
+            every = instancer.ComputeInstanceTransformsAtTime(
+                time, time, applyMask=UsdGeom.PointInstancer.IgnoreMask
+            )
+            shown = instancer.ComputeMaskAtTime(time) or [True] * len(every)
+            used = zip(every, instancer.GetProtoIndicesAttr().Get(time), shown, strict=True)
+            return [world(above) @ np.array(m).T @ inner for m, n, on in used if on and n == number]
+    return [world(prim)]
+
+
+def _splats(prim: Any, time: Any) -> GaussianArrays:
     """The splats of a prim in its frame. Raises: Damaged: lengths that do not match."""
 
     def read(name: str, width: int) -> np.ndarray | None:
         for each in (name, f"{name}h"):
-            value = prim.GetAttribute(each).Get()
+            value = prim.GetAttribute(each).Get(time)
             if value is not None and len(value):
                 return np.array(value, np.float32).reshape(-1, width)
         return None
@@ -126,7 +178,7 @@ def _splats(prim: Any) -> GaussianArrays:
             return np.full((count, width), default, np.float32)
         return values[:count]
 
-    stored = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    stored = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get(time)
     size = (int(stored if stored is not None else 3) + 1) ** 2
     sh = read("radiance:sphericalHarmonicsCoefficients", 3)
     if size < 1 or sh is None or len(sh) < count * size:
@@ -156,24 +208,19 @@ def write_usd(path: Path | str, gaussians: GaussianArrays) -> None:
     means, quats = scene.means, scene.quats
     cut = packing.Cut(path, "USD", len(means))
     scales, opacities, sh = packing.linear_values(cut, scene)
-    metres = gaussians.metres_per_unit or 1.0
     with _usd(path) as (Usd, UsdGeom, UsdUtils, UsdVol, Sdf, Vt):
         kind = path.suffix.lower()
         layer = Sdf.Layer.CreateAnonymous(".usda" if kind == ".usda" else ".usdc")
         stage = Usd.Stage.Open(layer)
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        UsdGeom.SetStageMetersPerUnit(stage, gaussians.metres_per_unit or 1.0)
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, str(Path(_PRIM).parent)).GetPrim())
         known = {"metres_per_unit": 1.0} if gaussians.metres_per_unit else {}
         layer.customLayerData = {_OWN: known}
         splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PRIM)
         x, y, z = gaussians.origin
         if any(gaussians.origin):
-            splats.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(
-                (metres * x, -metres * y, -metres * z)
-            )
-        if metres != 1:
-            splats.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set((metres,) * 3)
+            splats.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set((x, -y, -z))
         flat = np.ascontiguousarray
         splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(flat(means)))
         # Arrays of quaternions have the real part last.

@@ -25,12 +25,14 @@ from snowsplat.project.left_out import LeftOut
 from snowsplat.project.training_folder import DATASET, SCENE, TrainingFolder
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
+from snowsplat.util.ply import open_table
 from snowsplat.util.safe_json import read_json
 
 #: The record of `make` in its folder. "title": the name of the scene for people; "file": its file;
 #: "last_part": the scene has seen the held-out photos, too.
 MAKE_RECORD = "make.json"
 _HEAD_BYTES = 16_384
+_SUFFIXES = (".ply", ".sog", ".spz", ".splat", ".ksplat", ".glb")
 _STEP = re.compile(r"_(\d+)")  # in the names of files of gsplat
 
 
@@ -196,7 +198,8 @@ def _read_make_record(folder: Path) -> dict[str, Any]:
 
 def _index_in(folder: Path) -> Path | None:
     """The file that describes the scene of which ``folder`` consists: `lod-meta.json`, the
-    `meta.json` of SOG, or the newest scene of a training of gsplat; None if there is none."""
+    `meta.json` of SOG, the newest scene of a training of gsplat, or its only scene file, as in a
+    published site; None if there is none."""
     if (folder / INDEX).is_file():
         return folder / INDEX
     sog = folder / META
@@ -204,8 +207,26 @@ def _index_in(folder: Path) -> Path | None:
         with open(sog, "rb") as file:
             if is_sog(file.read(_HEAD_BYTES)):
                 return sog
-    if any((folder / name).exists() for name in ("point_cloud", "sparse", "transforms.json")):
-        return None  # a training of other programs, or a dataset
+    others = ("point_cloud", "sparse", "transforms.json", "cfg_args", "checkpoints", SCENE)
+    if any((folder / name).exists() for name in (*others, MAKE_RECORD)) or not folder.is_dir():
+        return None  # a training, or a dataset
     theirs = [*folder.glob("ply/point_cloud_*.ply"), *folder.glob("ckpts/ckpt_*_rank0.pt")]
     steps = {path: int(match[1]) for path in theirs if (match := _STEP.search(path.name))}
-    return max(steps, key=steps.__getitem__, default=None)
+    if steps:
+        return max(steps, key=steps.__getitem__)
+    files = [path for path in folder.iterdir() if path.is_file()]
+    scenes = [path for path in files if path.suffix.lower() in _SUFFIXES and _is_scene(path)]
+    photos = sum(path.suffix.lower() in (".jpg", ".jpeg", ".png") for path in files)
+    return scenes[0] if len(scenes) == 1 and photos < 2 else None
+
+
+def _is_scene(path: Path) -> bool:
+    """Whether a file has Gaussians; a PLY file may have points."""
+    from snowsplat.formats.ply import is_scene
+    from snowsplat.formats.registry import format_for_reading
+
+    try:
+        format = format_for_reading(path)
+        return format.read is not None and (format.name != "PLY" or is_scene(open_table(path)))
+    except UserError:
+        return False

@@ -17,6 +17,8 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+#: How the pointer begins that Git LFS puts in the place of a file.
+GIT_LFS = b"version https://git-lfs.github.com/spec/"
 _TEMPORARY = re.compile(r"\.(.+?)(\.[a-z0-9_]{8})?\.tmp")
 
 
@@ -105,8 +107,11 @@ def _lock(temporary: Path) -> int:
 
 @contextlib.contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Context for reading a file: raises `UserError` instead of `OSError`."""
+    """Context for reading a file: raises `UserError` instead of `OSError`, and for a pointer of
+    Git LFS, which is in the place of a file that was not downloaded."""
     try:
+        if path.is_file() and path.stat().st_size < 1024 and path.read_bytes().startswith(GIT_LFS):
+            raise UserError("{path}: is a pointer of Git LFS; run git lfs pull", path=path)
         yield
     except OSError as error:
         raise UserError(

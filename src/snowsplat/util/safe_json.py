@@ -47,8 +47,14 @@ def read_json(path: Path, ratio: int = _RATIO) -> Any:
     return parse_json(path.read_bytes(), ratio)
 
 
+def encoding_of(data: bytes) -> str:
+    """The encoding of a text that begins with these bytes: UTF-8, with or without a byte order
+    mark, or UTF-16 with one. Programs on Windows write such marks."""
+    return "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+
+
 def parse_json(data: bytes, ratio: int = _RATIO) -> Any:
-    """The value of a JSON text in UTF-8, with or without a byte order mark.
+    """The value of a JSON text; see `encoding_of`.
 
     Some texts, such as ``[[],[],[]``, need twenty times their size in memory. A text that would
     need too much is rejected before it is parsed.
@@ -61,7 +67,7 @@ def parse_json(data: bytes, ratio: int = _RATIO) -> Any:
     if needed > _ALWAYS_ALLOWED + ratio * len(data):
         raise Problem("too many values")
     try:
-        value = json.loads(data.decode("utf-8-sig"))
+        value = json.loads(data.decode(encoding_of(data)))
     except RecursionError:
         raise Problem("nested too deeply") from None
     level = [value] if isinstance(value, dict | list) else []

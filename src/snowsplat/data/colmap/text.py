@@ -24,6 +24,7 @@ from snowsplat.data.lens.lens import Lens
 from snowsplat.data.lens.models import COLMAP_MODELS
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import reading, shown
+from snowsplat.util.safe_json import encoding_of
 
 logger = logging.getLogger(__name__)
 
@@ -43,10 +44,15 @@ _LONGEST_TRACK = 1 << 16
 
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text file, without comments."""
-    with reading(path), open(path, encoding="utf-8", errors="surrogateescape") as file:
+    with reading(path), open(path, encoding=_encoding(path), errors="surrogateescape") as file:
         for line in file:
             if not line.startswith("#"):
                 yield line.strip()
+
+
+def _encoding(path: Path) -> str:
+    with open(path, "rb") as file:
+        return encoding_of(file.read(2))
 
 
 def _count_words(line: str) -> int:
@@ -62,7 +68,7 @@ def _count_words(line: str) -> int:
 def _warn_if_fewer(path: Path, kind: str, count: int) -> None:
     # COLMAP writes the number into a comment. It may be outdated if somebody edited the file, so
     # a difference is only a warning.
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with open(path, encoding=_encoding(path), errors="replace") as file:
         head = file.read(1000)
     declared = re.search(rf"^#.*Number of {kind}: (\d{{1,12}})\b", head, re.MULTILINE)
     if declared and int(declared[1]) > count:

@@ -10,6 +10,7 @@ from typing import BinaryIO
 from PIL import Image, features
 
 from snowsplat.util.errors import Problem
+from snowsplat.util.files import GIT_LFS
 
 #: Formats that depend on how Pillow was built.
 OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
@@ -93,6 +94,9 @@ def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]
 
 
 def _check_header(file: BinaryIO) -> None:
+    if file.read(len(GIT_LFS)) == GIT_LFS:
+        raise Problem("is a pointer of Git LFS; run git lfs pull")
+    file.seek(0)
     start = file.read(len(_PNG))
     if start == _PNG:
         for _ in range(_MOST_SEGMENTS):

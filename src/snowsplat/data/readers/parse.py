@@ -13,7 +13,7 @@ import numpy as np
 
 from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import reading
-from snowsplat.util.safe_json import quoted, read_json
+from snowsplat.util.safe_json import encoding_of, quoted, read_json
 
 #: Memory for JSON values per byte of the text. A point of OpenSfM needs 7 times its text.
 _JSON_RATIO = 8
@@ -51,11 +51,12 @@ def load_json(path: Path, ratio: int = _JSON_RATIO) -> Any:
 
 
 def load_text(path: Path) -> str:
-    """The text of a file. Bytes that are not UTF-8 stay as they are in file names.
+    """The text of a file, see `encoding_of`. Invalid bytes stay as they are in file names.
 
     Raises: UserError: the file cannot be read.
     """
-    return _load_bytes(path).decode("utf-8-sig", "surrogateescape")
+    data = _load_bytes(path)
+    return data.decode(encoding_of(data), "surrogateescape")
 
 
 def load_xml(path: Path) -> Element:

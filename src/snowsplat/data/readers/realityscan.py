@@ -21,7 +21,7 @@ from snowsplat.data.readers.lenses import perspective
 from snowsplat.data.readers.points import points_beside
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.util.errors import UserError
-from snowsplat.util.safe_json import quoted
+from snowsplat.util.safe_json import encoding_of, quoted
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,8 @@ def is_realityscan(path: Path) -> bool:
     """Whether a file is a table of cameras, with or without all columns that are needed."""
     if path.suffix.lower() != ".csv":
         return False
-    lines = parse.head_of(path).decode("utf-8-sig", "replace").splitlines()
+    head = parse.head_of(path)
+    lines = head.decode(encoding_of(head), "replace").splitlines()
     return any(line.startswith("#") and set(_columns(line)) >= _POSITIONS for line in lines[:2])
 
 
