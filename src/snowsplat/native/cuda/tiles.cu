@@ -138,6 +138,13 @@ SNOW_INLINE void for_each_32_tiles(const TileRectangle& r, const TileTest<T>& to
   }
 }
 
+// The splat, in the order of depth, of a thread of this block. The warps of a block test the tiles of
+// its large splats together. The nearest splats are the largest, so each warp of a block has splats
+// of another depth: 32 that are neighbours.
+SNOW_INLINE int64_t depth_index(int thread) {
+  return (int64_t(thread / kWarp) * gridDim.x + blockIdx.x) * kWarp + thread % kWarp;
+}
+
 SNOW_INLINE uint32_t pair_of_16_bits(int low, int high) {
   return uint32_t(low) | uint32_t(high) << 16;
 }
@@ -166,7 +173,7 @@ SNOW_INLINE void count_tiles(const TilesCountKernelParams<T>& out) {
   if (threadIdx.x == 0) *large_count = 0;
   __syncthreads();
 
-  const int64_t i = thread_index();
+  const int64_t i = depth_index(int(threadIdx.x));
   const T* row = stage_rows(out.packed, out.stride, i < m ? int(out.order[i]) : -1,
                             stage + warp_id() * kWarp * kRow);
   if (i < m) {
@@ -200,7 +207,7 @@ SNOW_INLINE void count_tiles(const TilesCountKernelParams<T>& out) {
                         count += uint32_t(__popc(__ballot_sync(kAllLanes, touched)));
                       });
     if (lane_id() == 0) {
-      const int64_t at = int64_t(blockIdx.x) * kThreads + large[e];
+      const int64_t at = depth_index(large[e]);
       out.tiles[at] = out.counts[at] = count;
     }
   }
@@ -233,7 +240,7 @@ SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
 
   // First, each thread reads one splat. Then each lane writes one tile of the small splats of its
   // warp, so that neighbouring lanes write to neighbouring addresses.
-  const int64_t i = thread_index();
+  const int64_t i = depth_index(int(threadIdx.x));
   uint32_t splat = 0, corner = 0, tiles = 0, first_slot = 0;
   int width = 1, area = 0;
   if (i < p.n) {
@@ -275,7 +282,7 @@ SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
   __syncthreads();
 
   for (int e = warp_id(); e < *large_count; e += kWarps) {
-    const int64_t at = int64_t(blockIdx.x) * kThreads + large[e];
+    const int64_t at = depth_index(large[e]);
     const uint32_t its_corner = p.corners[at], its_size = p.sizes[at];
     const uint32_t its_splat = p.order[at], count = p.tiles[at];
     const int64_t its_slot = p.first_slots[at];
