@@ -31,12 +31,13 @@ using DepthKey = typename DepthKeyOf<T>::type;
 // A pinhole camera. Pixel (i, j) has its centre at (i + 0.5, j + 0.5); z points forward.
 template <class T>
 struct CameraParams {
-  const T* cam_from_world;  // (3, 4): rotation and translation
-  double width, height;     // pixels
-  double fx, fy, cx, cy;    // pixels
-  double near;              // world units; nearer Gaussians are not visible
-  int64_t antialiased;      // 1: the dilation of a splat lowers its opacity; see projection.h
-  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, near, antialiased)
+  const T* cam_from_world;   // (3, 4): rotation and translation
+  double width, height;      // pixels
+  double fx, fy, cx, cy;     // pixels
+  const double* intrinsics;  // (4,) in place of these four numbers; or null
+  double near;               // world units; nearer Gaussians are not visible
+  int64_t antialiased;       // 1: the dilation of a splat lowers its opacity; see projection.h
+  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, intrinsics, near, antialiased)
 };
 
 // The parameters of N Gaussians.
@@ -129,6 +130,23 @@ struct AdamStepParams {
   SNOW_FIELDS(n, splats, ids, grad_packed, camera, sh_rest_rows, sh_degree, means, log_scales,
               quats, opacity_logits, sh_dc, sh_rest, beta1, beta2, inv_correction2, eps2,
               visible_only, valid, nonfinite_rows)
+};
+
+// ---- add_noise ----------------------------------------------------------------------------------
+
+template <class T>
+struct AddNoiseParams {
+  int64_t n;                // Gaussians
+  T* means;                 // in and out, (n, 3)
+  const T* log_scales;      // (n, 3)
+  const T* quats;           // (n, 4)
+  const T* opacity_logits;  // (n,)
+  double amount;            // of the noise
+  double sharpness, opacity;  // k and t of σ(k (t − o))
+  double negligible;        // rows with a smaller value of this sigmoid have no noise
+  int64_t seed, first;      // row i has the random numbers number first + i of this seed
+  SNOW_FIELDS(n, means, log_scales, quats, opacity_logits, amount, sharpness, opacity, negligible,
+              seed, first)
 };
 
 // ---- accumulate_screen_statistics ---------------------------------------------------------------
@@ -381,6 +399,19 @@ struct PointsInFrustaParams {
   T* counts;          // out, (n,) the number of views that contain the point
   T* rates;           // out, (n,) the largest focal / depth of these views, or 0
   SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
+};
+
+// ---- points_in_spheres --------------------------------------------------------------------------
+
+template <class T>
+struct PointsInSpheresParams {
+  int64_t n;         // points
+  const T* points;   // (n, 3) world units
+  int64_t count;     // C
+  const T* spheres;  // (C, 4) centre and radius, world units
+  T* counts;         // out, (n,) the number of spheres that contain the point
+  T* nearest;        // out, (n,) the distance of the nearest centre, or inf
+  SNOW_FIELDS(n, points, count, spheres, counts, nearest)
 };
 
 // ---- fuse_depth ---------------------------------------------------------------------------------

@@ -34,9 +34,12 @@ struct PinholeCamera {
   // every thread computes them.
   template <class Real>
   SNOW_INLINE PinholeCamera(const CameraParams<T>& c, Real)
-      : fx(T(c.fx)), fy(T(c.fy)), cx(T(c.cx)), cy(T(c.cy)), width(T(c.width)), height(T(c.height)),
-        near(T(c.near)), antialiased(c.antialiased != 0),
+      : width(T(c.width)), height(T(c.height)), near(T(c.near)), antialiased(c.antialiased != 0),
         dilation(T(c.antialiased ? kMipDilation : kDilation)) {
+    const double* given = c.intrinsics;
+    const Real focal_x(given ? given[0] : c.fx), focal_y(given ? given[1] : c.fy),
+        centre_x(given ? given[2] : c.cx), centre_y(given ? given[3] : c.cy);
+    fx = T(focal_x), fy = T(focal_y), cx = T(centre_x), cy = T(centre_y);
     for (int i = 0; i < 3; i++) {
       for (int j = 0; j < 3; j++) rotation[3 * i + j] = c.cam_from_world[4 * i + j];
       translation[i] = c.cam_from_world[4 * i + 3];
@@ -45,8 +48,7 @@ struct PinholeCamera {
       position[k] = -(rotation[k] * translation[0] + rotation[3 + k] * translation[1] +
                       rotation[6 + k] * translation[2]);
     }
-    const Real w(c.width), h(c.height), focal_x(c.fx), focal_y(c.fy), centre_x(c.cx),
-        centre_y(c.cy);
+    const Real w(c.width), h(c.height);
     const Real beyond_x = Real(0.15) * w, beyond_y = Real(0.15) * h;
     min_tx = T(-(centre_x + beyond_x) / focal_x), max_tx = T((w - centre_x + beyond_x) / focal_x);
     min_ty = T(-(centre_y + beyond_y) / focal_y), max_ty = T((h - centre_y + beyond_y) / focal_y);
@@ -71,6 +73,16 @@ struct ProjectedGaussian {
   Real mean2d[2], conic[3];
   Real activated_opacity, opacity;  // sigmoid(logit); of the splat
 };
+
+// Divides a quaternion by its length, and returns the inverse of the length. A zero quaternion stays
+// zero; quat_to_rotation returns the identity for it.
+template <class Real>
+SNOW_INLINE Real normalise_quat(const Real* q, Real* unit) {
+  const Real norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] + Real(1e-24f);
+  const Real inverse = Real(1.f) / sqrt(norm2);
+  for (int k = 0; k < 4; k++) unit[k] = q[k] * inverse;
+  return inverse;
+}
 
 // Quaternion wxyz (unit) → rotation matrix, row-major.
 template <class Real>
@@ -105,11 +117,7 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
   p.z = Real(W[6]) * mx + Real(W[7]) * my + Real(W[8]) * mz + Real(cam.translation[2]);
   p.inv_z = Real(1.f) / p.z;
 
-  // A zero quaternion stays zero. quat_to_rotation returns the identity for it.
-  Real norm2 = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] +
-               g.quat[3] * g.quat[3] + Real(1e-24f);
-  p.inv_quat_norm = Real(1.f) / sqrt(norm2);
-  for (int k = 0; k < 4; k++) p.quat[k] = g.quat[k] * p.inv_quat_norm;
+  p.inv_quat_norm = normalise_quat(g.quat, p.quat);
   quat_to_rotation(p.quat, p.R);
   for (int k = 0; k < 3; k++) p.scale[k] = exp(g.log_scale[k]);
   for (int i = 0; i < 3; i++)
