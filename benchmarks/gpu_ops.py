@@ -150,6 +150,8 @@ def _ops_of(scene: Workload, device: torch.device, dtype: torch.dtype) -> None:
             )
             for p in params.values():
                 p.grad = None
+        limits = {"sharpness": 100.0, "opacity": 0.5, "negligible": 1e-4}
+        ops.add_noise(gaussians, 1e-3, **limits, seed=1, first=3)
         counts = ops.count_blended(splats, *size)
         median, mean, alpha = ops.rasterize_median(splats, *size)
     _finite(median, mean, alpha, counts, splats.abs_grad, *many, *params.values())
@@ -190,6 +192,7 @@ def _geometry(scene: Workload, device: torch.device) -> None:
             torch.full((3,), camera.fx, dtype=dtype, device=device),
         )
         _finite(*ops.points_in_frusta(points, frusta))
+        _finite(*ops.points_in_spheres(points, torch.rand(3, 4, dtype=dtype).to(device)))
         depth = 1 + 5 * torch.rand(height, width, dtype=dtype).to(device)
         weight = torch.rand(height, width, dtype=dtype).to(device)
         image = torch.rand(3, height, width, dtype=dtype).to(device)

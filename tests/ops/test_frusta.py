@@ -1,4 +1,4 @@
-"""`points_in_frusta`: known positions, and native against the reference."""
+"""`points_in_frusta`, `points_in_spheres`: known positions, and native against the reference."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops import Frusta, reference
 
-from .scenes import Variant, generator, normal, one_line, uniform
+from .scenes import Variant, as_float32, generator, normal, one_line, uniform
 
 
 def looking_ahead(dtype: torch.dtype, far: float = math.inf) -> Frusta:
@@ -84,6 +84,43 @@ def test_native_agrees_with_the_reference(native: Variant, count: int, views: in
     assert all(map(torch.equal, found(3), (counts, rates)))
 
 
+def test_spheres(variant: Variant) -> None:
+    """A point on a sphere is not in it. A point that is not finite is in none."""
+    points = torch.tensor(
+        [[0, 0, 0], [3, 4, 0], [0, 0, 2], [math.nan, 0, 0], [0, math.inf, 0], [0, 0, -1e30]],
+        dtype=variant.dtype,
+    )
+    spheres = torch.tensor([[0.0, 0, 0, 5], [0, 0, 1, 1.5], [0, 0, 9, 0]], dtype=variant.dtype)
+    counts, nearest = variant.ops.points_in_spheres(points, spheres)
+    assert counts.tolist() == [2.0, 0.0, 2.0, 0.0, 0.0, 0.0]
+    assert nearest[:3].tolist() == [0.0, 5.0, 1.0]
+    assert nearest[3].isnan()
+    assert nearest[4] == math.inf
+    assert nearest[5] >= 1e30
+    counts, nearest = variant.ops.points_in_spheres(points, spheres[:0])
+    assert not counts.any()
+    assert nearest.tolist() == [math.inf] * 6
+    assert [len(each) for each in variant.ops.points_in_spheres(points[:0], spheres)] == [0, 0]
+
+
+@pytest.mark.parametrize(("count", "spheres"), [(1, 1), (17, 3), (1025, 5), (2100, 40)])
+def test_spheres_agree_with_the_reference(native: Variant, count: int, spheres: int) -> None:
+    """Also far from the origin, where the digits of squared coordinates would not suffice."""
+    points = 1000 + normal(generator(spheres), count, 3)
+    given = torch.cat([1000 + normal(generator(9), spheres, 3), torch.ones(spheres, 1)], 1)
+    points, given = as_float32(points), as_float32(given)
+    expected = reference.points_in_spheres(points, given)
+
+    def found(threads: int) -> tuple[Tensor, Tensor]:
+        ops.set_num_threads(threads)
+        return native.ops.points_in_spheres(points.to(native.dtype), given.to(native.dtype))
+
+    counts, nearest = found(1)
+    assert (counts.double() == expected[0]).double().mean() > 0.998
+    torch.testing.assert_close(nearest.double(), expected[1], rtol=1e-5, atol=0)
+    assert all(map(torch.equal, found(3), (counts, nearest)))
+
+
 def test_wrong_input() -> None:
     points, frusta = torch.ones(2, 3), looking_ahead(torch.float32)
     wrong = {
@@ -96,3 +133,6 @@ def test_wrong_input() -> None:
         with pytest.raises(ValueError, match=message) as caught:
             ops.points_in_frusta(*arguments)
         assert one_line(caught.value)
+    for message, given in (("spheres must be", points), ("spheres must be", points.double())):
+        with pytest.raises(ValueError, match=message):
+            ops.points_in_spheres(points, given)

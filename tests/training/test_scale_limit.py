@@ -8,8 +8,7 @@ from tests.gaussians import gaussians_in_box
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import look_at
-from snowsplat.training.parts import scale_limit
-from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit, distances_to_cameras
+from snowsplat.training.parts.scale_limit import INTERVAL, ScaleLimit
 from snowsplat.training.settings.recipes import recipe
 
 from .stage import stage
@@ -35,10 +34,15 @@ def scene() -> Gaussians:
     return gaussians
 
 
-def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monkeypatch):
-    monkeypatch.setattr(scale_limit, "_ROWS", 3)  # several parts
+def apply(gaussians: Gaussians, step: int, cameras: list[Camera]) -> None:
+    part, run = ScaleLimit(0.5), stage(gaussians, step, cameras=cameras)
+    part.begin(run)
+    part.between(run)
+
+
+def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera():
     before, after = scene(), scene()
-    ScaleLimit(0.5).between(stage(after, INTERVAL, cameras=CAMERAS))
+    apply(after, INTERVAL, CAMERAS)
     limits = torch.tensor([1.0, 4.0, 2.5])
     torch.testing.assert_close(after.scales[:3], torch.minimum(before.scales[:3], limits[:, None]))
     assert after.log_scales.isfinite().all()
@@ -49,18 +53,18 @@ def test_scales_are_at_most_the_share_of_the_distance_to_the_nearest_camera(monk
 
 def test_nothing_changes_between_the_steps_of_the_limit():
     before, after = scene(), scene()
-    ScaleLimit(0.5).between(stage(after, INTERVAL + 1, cameras=CAMERAS))
+    apply(after, INTERVAL + 1, CAMERAS)
     assert torch.equal(after.log_scales, before.log_scales)
 
 
 def test_many_cameras_are_sampled():
     many = [camera(0.01 * i) for i in range(1000)]
-    between = torch.tensor([[0.01, 0.0, 0.0], [0.16, 0.0, 0.0]])  # at the second and 17th camera
-    distances = distances_to_cameras(between, many)
-    assert torch.allclose(distances[:1], torch.tensor([0.01]))  # every 16th camera is used
-    assert float(distances[1]) < 1e-30
     gaussians = scene()
-    ScaleLimit(0.5).between(stage(gaussians, INTERVAL, cameras=many))
+    gaussians.means[2:] = torch.tensor([[0.01, 0.0, 0.0], [0.16, 0.0, 0.0]])
+    apply(gaussians, INTERVAL, many)
+    # At the second and at the 17th camera: every 16th is used.
+    assert math.isclose(float(gaussians.scales[2].max()), 0.005, rel_tol=1e-5)
+    assert float(gaussians.scales[3].max()) < 1e-30
     assert math.isclose(float(gaussians.scales[1].max()), 3.0, rel_tol=1e-6)  # below the limit, 4
 
 

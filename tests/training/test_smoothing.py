@@ -8,7 +8,7 @@ from tests.gaussians import gaussians_in_box
 
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.training.parts.smoothing import INTERVAL, VARIANCE, SmoothingFilter, sampling_rates
+from snowsplat.training.parts.smoothing import INTERVAL, VARIANCE, SmoothingFilter
 
 from .stage import stage
 
@@ -24,15 +24,6 @@ MEANS = torch.tensor(
 )
 
 
-def test_the_rate_is_the_largest_of_the_photos_that_show_the_mean():
-    torch.testing.assert_close(
-        sampling_rates(MEANS, [NEAR, FAR]), torch.tensor([30.0, 30.0, 300 / 7, 0.0, 0.0])
-    )
-    torch.testing.assert_close(
-        sampling_rates(MEANS, [NEAR]), torch.tensor([15.0, 0.0, 0.0, 0.0, 0.0])
-    )
-
-
 def scene() -> Gaussians:
     bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     gaussians = gaussians_in_box(bounds, 5, torch.Generator().manual_seed(5))
@@ -42,9 +33,15 @@ def scene() -> Gaussians:
     return gaussians
 
 
+def apply(gaussians: Gaussians, step: int, cameras: list[Camera]) -> None:
+    part, run = SmoothingFilter(), stage(gaussians, step, cameras=cameras)
+    part.begin(run)
+    part.between(run)
+
+
 def test_all_scales_but_the_smallest_are_at_least_the_filter():
     before, after = scene(), scene()
-    SmoothingFilter().between(stage(after, INTERVAL, cameras=[NEAR, FAR]))
+    apply(after, INTERVAL, [NEAR, FAR])
     limits = math.sqrt(VARIANCE) / torch.tensor([30.0, 30.0, 300 / 7])
     torch.testing.assert_close(after.scales[0], torch.tensor([limits[0], 1e-4, 0.5]))
     for row in (1, 2):  # from needles to discs
@@ -57,5 +54,5 @@ def test_all_scales_but_the_smallest_are_at_least_the_filter():
 
 def test_nothing_changes_between_the_steps_of_the_filter():
     gaussians = scene()
-    SmoothingFilter().between(stage(gaussians, INTERVAL + 1, cameras=[NEAR]))
+    apply(gaussians, INTERVAL + 1, [NEAR])
     assert torch.equal(gaussians.log_scales, scene().log_scales)

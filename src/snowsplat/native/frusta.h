@@ -1,4 +1,4 @@
-// points_in_frusta for one point and one camera, for CPU and GPU.
+// points_in_frusta and points_in_spheres for one point and one camera, for CPU and GPU.
 #pragma once
 
 #include "params.h"
@@ -31,6 +31,17 @@ SNOW_INLINE void add_frustum(const Frustum<T>& f, const Real* point, Real& count
                       (Real(f.width) * z > at[0]) & (Real(f.height) * z > at[1]);
   count = count + select(inside, Real(T(1)), zero);
   rate = max(rate, select(inside, Real(f.focal) / z, zero));
+}
+
+// Adds to `count` whether the sphere (centre, radius) contains the point, and lowers `nearest` to the
+// distance of its centre. The differences are exact for a near point, unlike |a|² + |b|² − 2 a·b.
+template <class Real, class T>
+SNOW_INLINE void add_sphere(const T* sphere, const Real* point, Real& count, Real& nearest) {
+  const Real x = point[0] - Real(sphere[0]), y = point[1] - Real(sphere[1]),
+             z = point[2] - Real(sphere[2]);
+  const Real distance = sqrt(fma(z, z, fma(y, y, x * x))), zero(T(0));
+  count = count + select(Real(sphere[3]) > distance, Real(T(1)), zero);
+  nearest = min(nearest, distance);
 }
 
 }  // namespace snow

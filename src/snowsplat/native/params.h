@@ -131,6 +131,23 @@ struct AdamStepParams {
               visible_only, valid, nonfinite_rows)
 };
 
+// ---- add_noise ----------------------------------------------------------------------------------
+
+template <class T>
+struct AddNoiseParams {
+  int64_t n;                // Gaussians
+  T* means;                 // in and out, (n, 3)
+  const T* log_scales;      // (n, 3)
+  const T* quats;           // (n, 4)
+  const T* opacity_logits;  // (n,)
+  double amount;            // of the noise
+  double sharpness, opacity;  // k and t of σ(k (t − o))
+  double negligible;        // rows with a smaller value of this sigmoid have no noise
+  int64_t seed, first;      // row i has the random numbers number first + i of this seed
+  SNOW_FIELDS(n, means, log_scales, quats, opacity_logits, amount, sharpness, opacity, negligible,
+              seed, first)
+};
+
 // ---- accumulate_screen_statistics ---------------------------------------------------------------
 
 template <class T>
@@ -381,6 +398,19 @@ struct PointsInFrustaParams {
   T* counts;          // out, (n,) the number of views that contain the point
   T* rates;           // out, (n,) the largest focal / depth of these views, or 0
   SNOW_FIELDS(n, points, views, to_image, size, depths, focal, counts, rates)
+};
+
+// ---- points_in_spheres --------------------------------------------------------------------------
+
+template <class T>
+struct PointsInSpheresParams {
+  int64_t n;         // points
+  const T* points;   // (n, 3) world units
+  int64_t count;     // C
+  const T* spheres;  // (C, 4) centre and radius, world units
+  T* counts;         // out, (n,) the number of spheres that contain the point
+  T* nearest;        // out, (n,) the distance of the nearest centre, or inf
+  SNOW_FIELDS(n, points, count, spheres, counts, nearest)
 };
 
 // ---- fuse_depth ---------------------------------------------------------------------------------

@@ -72,6 +72,16 @@ struct ProjectedGaussian {
   Real activated_opacity, opacity;  // sigmoid(logit); of the splat
 };
 
+// Divides a quaternion by its length, and returns the inverse of the length. A zero quaternion stays
+// zero; quat_to_rotation returns the identity for it.
+template <class Real>
+SNOW_INLINE Real normalise_quat(const Real* q, Real* unit) {
+  const Real norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] + Real(1e-24f);
+  const Real inverse = Real(1.f) / sqrt(norm2);
+  for (int k = 0; k < 4; k++) unit[k] = q[k] * inverse;
+  return inverse;
+}
+
 // Quaternion wxyz (unit) → rotation matrix, row-major.
 template <class Real>
 SNOW_INLINE void quat_to_rotation(const Real* q, Real* R) {
@@ -105,11 +115,7 @@ SNOW_INLINE void project_gaussian(const GaussianShape<Real>& g, const PinholeCam
   p.z = Real(W[6]) * mx + Real(W[7]) * my + Real(W[8]) * mz + Real(cam.translation[2]);
   p.inv_z = Real(1.f) / p.z;
 
-  // A zero quaternion stays zero. quat_to_rotation returns the identity for it.
-  Real norm2 = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] +
-               g.quat[3] * g.quat[3] + Real(1e-24f);
-  p.inv_quat_norm = Real(1.f) / sqrt(norm2);
-  for (int k = 0; k < 4; k++) p.quat[k] = g.quat[k] * p.inv_quat_norm;
+  p.inv_quat_norm = normalise_quat(g.quat, p.quat);
   quat_to_rotation(p.quat, p.R);
   for (int k = 0; k < 3; k++) p.scale[k] = exp(g.log_scale[k]);
   for (int i = 0; i < 3; i++)

@@ -122,6 +122,8 @@ struct Simd {
   SNOW_INLINE friend Simd zero_unless(Mask m, Simd a) { return Vec(IVec(a.v) & m.m); }
   SNOW_INLINE friend Simd min(Simd a, Simd b) { return Vec(a.v < b.v ? a.v : b.v); }
   SNOW_INLINE friend Simd max(Simd a, Simd b) { return Vec(a.v > b.v ? a.v : b.v); }
+  // a b + c, rounded once where the processor has an instruction for it.
+  SNOW_INLINE friend Simd fma(Simd a, Simd b, Simd c) { return a.v * b.v + c.v; }
   SNOW_INLINE friend Simd sqrt(Simd a) {
     for (int l = 0; l < W; l++) a.v[l] = T(__builtin_sqrt(double(a.v[l])));
     return a;

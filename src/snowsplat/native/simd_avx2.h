@@ -72,6 +72,7 @@ struct Simd<float, 8> {
   SNOW_INLINE friend Simd zero_unless(Mask m, Simd a) { return _mm256_and_ps(m.m, a.v); }
   SNOW_INLINE friend Simd min(Simd a, Simd b) { return _mm256_min_ps(a.v, b.v); }
   SNOW_INLINE friend Simd max(Simd a, Simd b) { return _mm256_max_ps(a.v, b.v); }
+  SNOW_INLINE friend Simd fma(Simd a, Simd b, Simd c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
   SNOW_INLINE friend Simd sqrt(Simd a) { return _mm256_sqrt_ps(a.v); }
   SNOW_INLINE friend Simd reciprocal(Simd a) {  // 12-bit estimate and one Newton step: 2^-23
     Simd r = _mm256_rcp_ps(a.v);

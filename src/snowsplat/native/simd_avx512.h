@@ -75,6 +75,7 @@ struct Simd<float, 16> {
   SNOW_INLINE friend Simd zero_unless(Mask m, Simd a) { return _mm512_maskz_mov_ps(m.m, a.v); }
   SNOW_INLINE friend Simd min(Simd a, Simd b) { return _mm512_min_ps(a.v, b.v); }
   SNOW_INLINE friend Simd max(Simd a, Simd b) { return _mm512_max_ps(a.v, b.v); }
+  SNOW_INLINE friend Simd fma(Simd a, Simd b, Simd c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
   SNOW_INLINE friend Simd sqrt(Simd a) { return _mm512_sqrt_ps(a.v); }
   SNOW_INLINE friend Simd reciprocal(Simd a) {  // 14-bit estimate and one Newton step
     Simd r = _mm512_rcp14_ps(a.v);

@@ -10,11 +10,12 @@ from snowsplat.ops.adam import AdamRates, Moments, adam_step
 from snowsplat.ops.camera_gradient import camera_gradient
 from snowsplat.ops.capacity import Capacity
 from snowsplat.ops.devices import default_device, device_name, resolve_device
-from snowsplat.ops.frusta import Frusta, points_in_frusta
+from snowsplat.ops.frusta import Frusta, points_in_frusta, points_in_spheres
 from snowsplat.ops.fusion import fuse_depth
 from snowsplat.ops.gaussian_parameters import GaussianParameters
 from snowsplat.ops.native import get_num_threads, set_num_threads
 from snowsplat.ops.nearest_neighbours import neighbours
+from snowsplat.ops.noise import add_noise
 from snowsplat.ops.photometric import photometric_loss, ssim
 from snowsplat.ops.projection import add_project_gradients, project
 from snowsplat.ops.rasterizer import count_blended, rasterize, rasterize_median
@@ -34,6 +35,7 @@ __all__ = [
     "View",
     "accumulate_screen_statistics",
     "adam_step",
+    "add_noise",
     "add_project_gradients",
     "camera_gradient",
     "count_blended",
@@ -45,6 +47,7 @@ __all__ = [
     "photometric_loss",
     "plane_sweep",
     "points_in_frusta",
+    "points_in_spheres",
     "project",
     "project_activated",
     "rasterize",

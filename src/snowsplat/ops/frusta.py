@@ -1,4 +1,4 @@
-"""`points_in_frusta`: how many cameras show each point, and from how near."""
+"""`points_in_frusta` and `points_in_spheres`: which cameras show a point, and which are near it."""
 
 from __future__ import annotations
 
@@ -73,3 +73,35 @@ def points_in_frusta(points: Tensor, frusta: Frusta) -> tuple[Tensor, Tensor]:
         rates=rates,
     )
     return counts, rates
+
+
+@torch.no_grad()
+def points_in_spheres(points: Tensor, spheres: Tensor) -> tuple[Tensor, Tensor]:
+    """The number of spheres that contain each of points (N, 3), and how far the nearest one is.
+
+    Args:
+        spheres: (C, 4), centre and radius in world units. A sphere contains the points whose
+            distance from its centre is smaller than its radius. Not differentiable.
+
+    Returns:
+        counts (N,), and the distance (N,) of the nearest centre, inf if there are none; of the
+        dtype of the points.
+
+    Raises:
+        ValueError: a wrong shape, dtype or device.
+    """
+    op = "points_in_spheres"
+    check_float(op, "points", points)
+    check_tensor(op, "points", points, (None, 3), points)
+    check_tensor(op, "spheres", spheres, (None, 4), points)
+    counts, nearest = points.new_empty(2, len(points)).unbind()
+    launch(
+        variant(op, points),
+        n=len(points),
+        points=points.detach().contiguous(),
+        count=len(spheres),
+        spheres=spheres.contiguous(),
+        counts=counts,
+        nearest=nearest,
+    )
+    return counts, nearest

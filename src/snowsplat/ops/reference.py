@@ -14,8 +14,10 @@ kernels with these functions in float64. From top to bottom, this file describes
     neighbours      the initial size             Kerbl et al. 2023, §5.1
     accumulate_screen_statistics                 for density control Kerbl et al. 2023, §5.2
     points_in_frusta   which views show a point  focal / z           Yu et al. 2024, §4.1
+    points_in_spheres  which cameras are near it
     fuse_depth      signed distances             Σ w s / Σ w        Curless and Levoy 1996
     adam_step       one step of the optimiser    m, v                Kingma and Ba 2015
+    add_noise       noise of the means           Σ η                 Kheradmand et al. 2024, eq. 8
 
 `plane_sweep` is in `sweep_reference.py`.
 
@@ -30,6 +32,7 @@ Coordinate frames are those of OpenCV: x right, y down, z forward. Pixel (i, j) 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -534,6 +537,16 @@ def points_in_frusta(points: Tensor, frusta: Frusta) -> tuple[Tensor, Tensor]:
     return inside.sum(1).to(points.dtype), torch.cat([rates, nothing], 1).amax(1)
 
 
+@torch.no_grad()
+def points_in_spheres(points: Tensor, spheres: Tensor) -> tuple[Tensor, Tensor]:
+    """The number (N,) of spheres (C, 4), a centre and a radius, that contain each of points (N, 3),
+    and the distance (N,) of the nearest centre."""
+    distances = (points[:, None] - spheres[:, :3]).norm(dim=2)
+    nothing = distances.new_full((len(points), 1), math.inf)
+    inside = (distances < spheres[:, 3]).sum(1)
+    return inside.to(points.dtype), torch.cat([distances, nothing], 1).amin(1)
+
+
 # ------------------------------------------------------------------------------------ fuse_depth
 
 
@@ -682,3 +695,54 @@ def adam_step(
         p.copy_(torch.where(updated, new_value, p))
         exp_avg.copy_(torch.where(updated, m, exp_avg))
         exp_avg_sq.copy_(torch.where(updated, v, exp_avg_sq))
+
+
+# ------------------------------------------------------------------------------------- add_noise
+
+
+@torch.no_grad()
+def add_noise(
+    gaussians: GaussianParameters,
+    amount: float,
+    *,
+    sharpness: float,
+    opacity: float,
+    negligible: float,
+    seed: int,
+    first: int = 0,
+) -> None:
+    """μ += amount · σ(k (t − o)) · Σ η, in place, with η ~ N(0, I) (Kheradmand et al. 2024, eq. 8).
+
+    The random bits are those of Philox 4x32-10 (Salmon et al. 2011).
+    """
+    means = gaussians.means
+    gate = torch.sigmoid(sharpness * (opacity - torch.sigmoid(gaussians.opacity_logits)))
+    eta = normal_numbers(seed, first, len(means)).to(means)
+    rotation = _rotation_matrices(gaussians.quats)
+    variances = (2 * gaussians.log_scales).clamp(max=40).exp()
+    noise = torch.einsum("nik,nk,njk,nj->ni", rotation, variances, rotation, eta)
+    moved = means + amount * gate[:, None] * noise
+    used = (gate > negligible) & moved.isfinite().all(1)
+    means[used] = moved[used]
+
+
+def normal_numbers(seed: int, first: int, count: int) -> Tensor:
+    """(count, 3) float64 of N(0, 1): those with the numbers from ``first`` on (Box and Muller)."""
+    a, b, c, d = random_bits(seed, torch.arange(first, first + count)).double().unbind(1)
+    radius = (-2 * ((torch.stack([a, c], 1) + 0.5) / 2**32).log()).sqrt()
+    angle = 2 * math.pi * torch.stack([b, d], 1) / 2**32
+    return torch.stack([radius * angle.cos(), radius * angle.sin()], 2).flatten(1)[:, :3]
+
+
+def random_bits(seed: int, counters: Tensor) -> Tensor:
+    """(N, 4) int64 of 32 random bits for each of counters (N,) int64: Philox 4x32-10."""
+    low = 0xFFFFFFFF
+    zero = torch.zeros_like(counters)
+    a, b, c, d = counters & low, counters >> 32, zero, zero
+    key = [seed & low, seed >> 32]
+    for _ in range(10):
+        first, second = 0xD2511F53 * a, 0xCD9E8D57 * c  # of 64 bits, as if without sign
+        a, c = (second >> 32 & low) ^ b ^ key[0], (first >> 32 & low) ^ d ^ key[1]
+        b, d = second & low, first & low
+        key = [(key[0] + 0x9E3779B9) & low, (key[1] + 0xBB67AE85) & low]
+    return torch.stack([a, b, c, d], 1)

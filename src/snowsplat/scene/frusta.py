@@ -1,10 +1,11 @@
-"""The frusta of cameras, for `ops.points_in_frusta`."""
+"""The frusta and the surroundings of cameras, for `points_in_frusta` and `points_in_spheres`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from snowsplat.ops import Frusta
 from snowsplat.scene.camera import Camera
@@ -23,3 +24,9 @@ def frusta_of(cameras: Sequence[Camera], depths: Sequence[tuple[float, float]]) 
         torch.tensor(depths, dtype=double, device=device),
         torch.tensor([max(c.fx, c.fy) for c in cameras], dtype=double, device=device),
     )
+
+
+def spheres_of(cameras: Sequence[Camera], radii: Sequence[float]) -> Tensor:
+    """(C, 4) float32: the centres of cameras, and a radius for each, in world units; on the CPU."""
+    pairs = zip(cameras, radii, strict=True)
+    return torch.tensor([[*c.position.tolist(), radius] for c, radius in pairs])

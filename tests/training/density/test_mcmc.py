@@ -15,6 +15,7 @@ from snowsplat.training.density.mcmc import (
     USUAL_EXTENT,
     McmcDensity,
     McmcDensityControl,
+    positions_at,
     shared_opacity,
 )
 from snowsplat.training.settings.rates import LearningRates
@@ -138,6 +139,14 @@ def test_sources_are_drawn_by_opacity():
     assert share == pytest.approx(0.9, abs=0.04)
 
 
+def test_positions_by_weight():
+    weights = torch.tensor([0.0, 0.5, 0.25, 0.0, 0.25])
+    share = torch.tensor([0.0, 0.49, 0.5, 0.74, 0.75, 1.0 - 2**-53], dtype=torch.float64)
+    assert positions_at(weights, share).tolist() == [1, 1, 2, 2, 4, 4]
+    many = torch.full((1000,), 1.0 - 2**-24)
+    assert positions_at(many, share)[-1] == 999
+
+
 def test_growth_up_to_the_limit():
     gaussians = some_gaussians(100)
     control, adam = set_up(gaussians, max_gaussians=112, densify_from=0)
@@ -149,7 +158,8 @@ def test_growth_up_to_the_limit():
     assert counts == [105, 110, 112, 112, 112]
 
 
-def test_noise_follows_the_covariance_of_transparent_gaussians():
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_noise_follows_the_covariance_of_transparent_gaussians(on_gpu):
     """Eq. 8: the noise is Σ η = R diag(s²) Rᵀ η, with standard normal η."""
     n = 4000
     one = some_gaussians(1, opacity=0.001)
@@ -160,7 +170,10 @@ def test_noise_follows_the_covariance_of_transparent_gaussians():
     gaussians = gaussians.append(opaque)
     before = gaussians.clone()
     control, _ = set_up(gaussians)
-    control._add_noise(gaussians, rate=1e-5)
+    if on_gpu:
+        control._add_noise_of_rows(gaussians, 1e-5 * 5e5)
+    else:
+        control._add_noise(gaussians, rate=1e-5)
     moved = gaussians.means - before.means
     assert not moved[n].any()  # the opaque one has no noise
     gate = 1 / (1 + math.exp(-100 * (0.005 - 0.001)))

@@ -42,5 +42,9 @@ SNOW_INLINE int warp_id() { return int(threadIdx.x / kWarp); }
 SNOW_INLINE uint32_t lanes_below() { return (1u << lane_id()) - 1; }
 // The index of this thread among the threads of all blocks.
 SNOW_INLINE int64_t thread_index() { return int64_t(blockIdx.x) * blockDim.x + threadIdx.x; }
+template <class T>
+SNOW_INLINE T infinity() {
+  return T(__int_as_float(0x7f800000));
+}
 
 }  // namespace snow

@@ -19,10 +19,6 @@ namespace {
 constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 constexpr int kAxisBits = 21;
 
-template <class T>
-SNOW_INLINE T infinity() {
-  return T(__int_as_float(0x7f800000));
-}
 
 template <class T>
 struct alignas(16) Point {

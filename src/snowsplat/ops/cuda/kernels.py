@@ -45,6 +45,7 @@ KERNELS: dict[str, Kernel] = {
     "accumulate_screen_statistics": Kernel("statistic", 256, 256),
     "adam_splat_of": Kernel("adam", 256, 256),
     "adam_update": Kernel("adam", 64, 64),
+    "add_noise": Kernel("noise", 128, 128),
     "scan_sums": Kernel("sort", 256, 1024),
     "scan_of_sums": Kernel("sort", 256, 256),
     "scan_apply": Kernel("sort", 256, 1024),
@@ -78,5 +79,6 @@ KERNELS: dict[str, Kernel] = {
     **{f"neighbours_of_{k}": Kernel("neighbours", 128, 128) for k in NEIGHBOUR_LISTS},
     "plane_sweep": Kernel("plane_sweep", SWEEP_EDGE**2, 1),
     "points_in_frusta": Kernel("frusta", 128, 128),
+    "points_in_spheres": Kernel("frusta", 128, 128),
     "fuse_depth": Kernel("fusion", 128, 128),
 }

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from snowsplat import ops
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.geometry import morton_order, rotation_from_quat
 from snowsplat.training.processes.shards import ALONE, Shards
@@ -30,8 +31,7 @@ from snowsplat.training.step.view_gradient import ViewGradient
 MAX_COPIES = 51
 #: Slope k of the sigmoid that restricts noise to nearly transparent Gaussians (eq. 8).
 NOISE_SHARPNESS = 100.0
-#: On the CPU, Gaussians whose sigmoid is below this value get no noise, so that few random numbers
-#: are needed.
+#: Gaussians whose sigmoid is below this value get no noise, so that few random numbers are needed.
 NOISE_NEGLIGIBLE = 1e-4
 #: λ_Σ of the paper is for scenes of this extent, in world units; COLMAP's have 4 to 6.
 USUAL_EXTENT = 5.0
@@ -97,26 +97,35 @@ class McmcDensityControl:
 
     def _add_noise(self, gaussians: Gaussians, rate: float) -> None:
         """μ += rate · noise · σ(−k (o − t)) · Σ η, η ~ N(0, I), t = ``prune_opacity`` (eq. 8)."""
-        gate = torch.sigmoid(NOISE_SHARPNESS * (self.settings.prune_opacity - gaussians.opacities))
-        if gate.device.type == "cpu":
-            rows: Tensor | slice = torch.nonzero(gate > NOISE_NEGLIGIBLE)[:, 0]
-            eta = self._noise_of(len(gate[rows]), self.generator)
-        else:  # noise takes little time on a GPU, and `nonzero` would wait for the GPU
-            rows = slice(None)
-            on_device = torch.Generator(gate.device)
-            on_device.manual_seed(int(torch.randint(2**62, (), generator=self.generator)))
-            eta = self._noise_of(len(gate), on_device)
+        on_cpu = gaussians.means.device.type == "cpu"
+        add = self._add_noise_of_generator if on_cpu else self._add_noise_of_rows
+        add(gaussians, rate * self.settings.noise)
+
+    def _add_noise_of_rows(self, gaussians: Gaussians, amount: float) -> None:
+        """One pass over the rows, with random numbers that depend on the row."""
+        ops.add_noise(
+            gaussians,
+            amount,
+            sharpness=NOISE_SHARPNESS,
+            opacity=self.settings.prune_opacity,
+            negligible=NOISE_NEGLIGIBLE,
+            seed=self._seed(),
+            first=self.shards.first(len(gaussians)),
+        )
+
+    def _add_noise_of_generator(self, gaussians: Gaussians, amount: float) -> None:
+        """With the numbers of the generator, of which training runs on a CPU have always had the
+        same: their scenes do not change."""
+        limit = self.settings.prune_opacity
+        gate = torch.sigmoid(NOISE_SHARPNESS * (limit - gaussians.opacities))
+        rows = torch.nonzero(gate > NOISE_NEGLIGIBLE)[:, 0]
+        first, total = self.shards.first(len(rows)), self.shards.total(len(rows))
+        eta = torch.randn(total, 3, 1, generator=self.generator)[first : first + len(rows)]
         rotations = rotation_from_quat(gaussians.quats[rows])
         # With the limit, the variance is finite in single precision for any scale.
         variances = (2.0 * gaussians.log_scales[rows]).clamp(max=40.0).exp()[:, :, None]
         noise = (rotations @ (variances * (rotations.mT @ eta)))[:, :, 0]
-        gaussians.means[rows] += rate * self.settings.noise * gate[rows, None] * noise
-
-    def _noise_of(self, rows: int, generator: torch.Generator) -> Tensor:
-        """(rows, 3, 1) of N(0, 1): the part of this process of the numbers for all rows."""
-        first, total = self.shards.first(rows), self.shards.total(rows)
-        eta = torch.randn(total, 3, 1, generator=generator, device=generator.device)
-        return eta[first : first + rows]
+        gaussians.means[rows] += amount * gate[rows, None] * noise
 
     def _relocate(self, gaussians: Gaussians, optimizer: Adam) -> Gaussians:
         # The choice depends on all rows. Every process makes it in the same way.
@@ -129,12 +138,7 @@ class McmcDensityControl:
         moved = max(count, grown) - len(survivors)
         if moved == 0:
             return gaussians
-        # This is computed on the CPU, because the generator is there, even if the Gaussians are on
-        # a GPU.
-        picks = torch.multinomial(
-            opacities[survivors].cpu(), moved, replacement=True, generator=self.generator
-        )
-        sources = survivors[picks.to(survivors.device)]
+        sources = survivors[self._drawn(opacities[survivors], moved)]
         copies = 1 + torch.bincount(sources, minlength=count)
 
         index = torch.cat([survivors, sources])
@@ -149,12 +153,33 @@ class McmcDensityControl:
         optimizer.select(index, shared)
         return gaussians
 
+    def _drawn(self, weights: Tensor, count: int) -> Tensor:
+        """(count,) int64: positions in ``weights`` (M,) in 0..1, each drawn with its weight."""
+        if weights.device.type == "cpu":
+            return torch.multinomial(weights, count, replacement=True, generator=self.generator)
+        generator = torch.Generator(weights.device)
+        generator.manual_seed(self._seed())
+        share = torch.rand(count, generator=generator, dtype=torch.float64, device=weights.device)
+        return positions_at(weights, share)
+
+    def _seed(self) -> int:
+        """The seed of random numbers that are made on a GPU."""
+        return int(torch.randint(2**62, (), generator=self.generator))
+
     def state_tensors(self) -> dict[str, Tensor]:
         """Empty: there are no statistics."""
         return {}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Does nothing: there are no statistics."""
+
+
+def positions_at(weights: Tensor, share: Tensor) -> Tensor:
+    """(S,) int64: the positions in ``weights`` (M,) in 0..1, not all 0, where their cumulative sum
+    is the given share (S,) float64 in [0, 1) of the whole sum."""
+    # Sums of integers are the same in each process, whatever the order of the additions.
+    ends = (2**24 * weights.double()).long().cumsum(0)
+    return torch.searchsorted(ends, (share * ends[-1]).long(), right=True)
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

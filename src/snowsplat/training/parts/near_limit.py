@@ -31,7 +31,7 @@ from torch import Tensor
 from snowsplat import ops
 from snowsplat.ops import Frusta
 from snowsplat.scene.camera import Camera
-from snowsplat.scene.frusta import frusta_of
+from snowsplat.scene.frusta import frusta_of, spheres_of
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.training.parts.part import REMOVED, Part
 from snowsplat.training.starts.photos import in_threads
@@ -56,8 +56,6 @@ _QUANTILE = 0.02
 _FEWEST_POINTS = 50
 #: A Gaussian near a camera is removed if at most this number of photos show its centre.
 _UNCONFIRMED = 1
-#: Distances are computed for this number of Gaussians at a time, to limit the memory.
-_ROWS = 1 << 14
 
 
 class NearLimit(Part):
@@ -72,7 +70,7 @@ class NearLimit(Part):
         self.share = share
         self._views: Frusta | None = None  # before the limits; None: no limit
         self._photos: Frusta
-        self._spheres: Tensor  # (C, 4): the position of a camera, and its limit
+        self._spheres: Tensor  # of the training views, see `spheres_of`; the radius is the limit
 
     def begin(self, run: Run) -> None:
         """Compute the limits, from the points of the dataset; without points, there are none."""
@@ -93,34 +91,16 @@ class NearLimit(Part):
         like = torch.empty(0, device=device)
         self._views = frusta_of([c for c, _ in views], [(0.0, far) for _, far in views]).to(like)
         self._photos = frusta_of(cameras, [(0.0, math.inf)] * len(cameras)).to(like)
-        spheres = [
-            [*camera.position.tolist(), limit]
-            for camera, limit in zip(used, limits, strict=False)  # without the unseen ones
-        ]
-        self._spheres = torch.tensor(spheres, dtype=torch.float32, device=device)
+        self._spheres = spheres_of(used, limits[: len(used)]).to(device)
 
     def between(self, run: Run) -> None:
         """Make the Gaussians that are too near transparent, in every `INTERVAL`-th step."""
         if self._views is not None and run.schedule.multiples(run.step, INTERVAL):
             means = run.gaussians.means
             in_front = ops.points_in_frusta(means, self._views)[0] > 0
-            run.gaussians.opacity_logits.masked_fill_(in_front | self._unconfirmed(means), REMOVED)
-
-    def _unconfirmed(self, means: Tensor) -> Tensor:
-        """(M,) bool: which means (M, 3) are near a camera, and in at most one photo."""
-        # Not as |a|² + |b|² − 2 a·b, whose digits would not suffice far from the origin.
-        exact = "donot_use_mm_for_euclid_dist"
-        centres, limits = self._spheres[:, :3], self._spheres[:, 3]
-        near = torch.cat(
-            [
-                (torch.cdist(part, centres, compute_mode=exact) < limits).any(1)
-                for part in means.split(_ROWS)
-            ]
-        )
-        rows = near.nonzero()[:, 0]
-        photos, _ = ops.points_in_frusta(means[rows], self._photos)
-        near[rows[photos > _UNCONFIRMED]] = False
-        return near
+            near = ops.points_in_spheres(means, self._spheres)[0] > 0
+            unconfirmed = ops.points_in_frusta(means, self._photos)[0] <= _UNCONFIRMED
+            run.gaussians.opacity_logits.masked_fill_(in_front | near & unconfirmed, REMOVED)
 
 
 def unseen_cameras(cameras: Sequence[Camera], points: Tensor) -> list[Camera]:

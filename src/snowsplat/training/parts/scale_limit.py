@@ -13,13 +13,13 @@ nearest camera; this is an upper limit.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from snowsplat.scene.camera import Camera
+from snowsplat import ops
+from snowsplat.scene.frusta import spheres_of
 from snowsplat.training.parts.part import Part
 
 if TYPE_CHECKING:
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 INTERVAL = 100
 #: At most this number of cameras is used, evenly chosen, to limit the time.
 _CAMERAS = 64
-#: Distances are computed for this number of Gaussians at a time, to limit the memory.
-_ROWS = 1 << 14
 
 
 class ScaleLimit(Part):
     """Limits the scales. It has no state."""
+
+    _spheres: Tensor  # the cameras, see `spheres_of`
 
     name = "scale_limit"
 
@@ -44,25 +44,16 @@ class ScaleLimit(Part):
         """
         self.ratio = ratio
 
+    def begin(self, run: Run) -> None:
+        """Choose the cameras."""
+        cameras = run.dataset_cameras[:: math.ceil(len(run.dataset_cameras) / _CAMERAS)]
+        self._spheres = spheres_of(cameras, [0.0] * len(cameras)).to(run.device)
+
     def between(self, run: Run) -> None:
         """Reduce the scales that exceed the limit, in place, in every `INTERVAL`-th step."""
         if run.schedule.multiples(run.step, INTERVAL):
-            distances = distances_to_cameras(run.gaussians.means, run.dataset_cameras)
-            limit = (self.ratio * distances).log()
+            _, distances = ops.points_in_spheres(run.gaussians.means, self._spheres)
+            # A mean may be in the centre of a camera.
+            limit = (self.ratio * distances.clamp_min(torch.finfo(torch.float32).tiny)).log()
             scales = run.gaussians.log_scales
             scales.copy_(torch.minimum(scales, limit[:, None]))
-
-
-def distances_to_cameras(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """(N,): the distance of each mean (N, 3) to the nearest of at most 64 cameras, in world units;
-    not 0.
-    """
-    used = cameras[:: math.ceil(len(cameras) / _CAMERAS)]
-    centres = torch.stack([camera.position for camera in used]).to(torch.float32)
-    # A product of matrices would be inaccurate for short distances.
-    exact = "donot_use_mm_for_euclid_dist"
-    nearest = [
-        torch.cdist(part, centres, compute_mode=exact).amin(1) for part in means.split(_ROWS)
-    ]
-    # A mean may be in the centre of a camera.
-    return torch.cat(nearest).clamp_min(torch.finfo(torch.float32).tiny)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Number of steps between two applications.
 INTERVAL = 200
-#: This number of Gaussians is processed at a time, to limit the memory.
+#: On the CPU, this number of Gaussians is processed at a time, for its cache.
 _ROWS = 1 << 14
 
 
@@ -81,5 +81,7 @@ class SkyPart(Part):
             self._decided = True
             self._find(run)
         if self.sky is not None and run.schedule.multiples(run.step, INTERVAL):
-            before = [self.sky.is_before(means) for means in run.gaussians.means.split(_ROWS)]
+            means = run.gaussians.means
+            rows = _ROWS if means.device.type == "cpu" else max(1, len(means))
+            before = [self.sky.is_before(part) for part in means.split(rows)]
             run.gaussians.opacity_logits.masked_fill_(torch.cat(before), REMOVED)

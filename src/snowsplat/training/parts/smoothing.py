@@ -17,14 +17,12 @@ well. A needle has two small scales, so there are no needles.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from snowsplat import ops
-from snowsplat.scene.camera import Camera
+from snowsplat.ops import Frusta
 from snowsplat.scene.frusta import frusta_of
 from snowsplat.training.parts.part import Part
 
@@ -41,22 +39,23 @@ class SmoothingFilter(Part):
     """Limits the scales. It has no state."""
 
     name = "smoothing"
+    _frusta: Frusta
+
+    def begin(self, run: Run) -> None:
+        """Compute the frusta of the training views."""
+        depths = [(camera.near, math.inf) for camera in run.dataset_cameras]
+        self._frusta = frusta_of(run.dataset_cameras, depths).to(run.gaussians.means)
 
     def between(self, run: Run) -> None:
         """Raise the scales below the limit, except for the smallest one of each Gaussian, in place,
         in every `INTERVAL`-th step.
         """
         if run.schedule.multiples(run.step, INTERVAL):
-            rates = sampling_rates(run.gaussians.means, run.dataset_cameras)
+            # The most pixels per world unit with which an image shows the mean, or 0.
+            _, rates = ops.points_in_frusta(run.gaussians.means, self._frusta)
             limit = math.sqrt(VARIANCE) / rates  # inf for a Gaussian that no photo shows
             limit = limit.nan_to_num(posinf=0.0).log()
             scales = run.gaussians.log_scales
             smallest = scales.argmin(1, keepdim=True)
             raised = torch.maximum(scales, limit[:, None])
             scales.copy_(raised.scatter(1, smallest, scales.gather(1, smallest)))
-
-
-def sampling_rates(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """(N,): the most pixels per world unit with which an image shows each mean (N, 3), or 0."""
-    depths = [(camera.near, math.inf) for camera in cameras]
-    return ops.points_in_frusta(means, frusta_of(cameras, depths).to(means))[1]
