@@ -107,7 +107,8 @@ class Step:
 
     @torch.no_grad()
     def queue(self) -> None:
-        batch = [BatchView(0, self.view, self.camera, self.photo, self.background)]
+        row = torch.zeros(1, dtype=torch.int64, device=self.background.device)
+        batch = [BatchView(0, self.view, self.camera, self.photo, self.background, row)]
         self.trainer._optimize(STEP, batch)
 
     @contextmanager

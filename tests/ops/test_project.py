@@ -188,6 +188,17 @@ def test_near_is_an_argument(variant: Variant) -> None:
     assert len(scene.project(variant.ops, near=2.01)) == 0
 
 
+def test_intrinsics_in_memory_replace_the_numbers(variant: Variant) -> None:
+    scene = random_scene(3, 50).to(variant.dtype, requires_grad=False)
+    memory = torch.tensor(
+        [scene.view.fx, scene.view.fy, scene.view.cx, scene.view.cy], dtype=torch.float64
+    )
+    other = scene.looking(fx=1.0, fy=2.0, cx=3.0, cy=-4.0, intrinsics=memory)
+    expected, found = scene.project(variant.ops), other.project(variant.ops)
+    assert torch.equal(found.packed, expected.packed)
+    assert torch.equal(found.ids, expected.ids)
+
+
 def test_moving_world_and_camera_together_changes_nothing(variant: Variant) -> None:
     scene = random_scene(5, 30, sh_degree=0)
     w, x, y, z = turn = torch.tensor([0.5, 0.1, -0.7, 0.5], dtype=torch.float64)  # of length 1

@@ -180,7 +180,7 @@ def exposure_of(setting: str, dataset: Dataset, notes: list[str] | None = None) 
 def exposed(exposure: Exposure, render, photo: LoadedImage, behind: Tensor, black: bool = False):
     """The image of view 0, and its gains. ``render``: a background → an image."""
     run = SimpleNamespace(config=SimpleNamespace(background="black" if black else "random"))
-    view = BatchView(0, None, None, photo, behind)
+    view = BatchView(0, None, None, photo, behind, torch.tensor([0]))
     image = render(exposure.background(run, view, behind))
     return exposure.image(run, view, image, photo), exposure._present[view]
 

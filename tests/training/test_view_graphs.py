@@ -15,6 +15,7 @@ from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.run import Run
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.core.view_graphs import MOST_RECORDINGS, ViewGraphs, recordable
+from snowsplat.training.parts.exposure import Exposure
 from snowsplat.training.parts.part import Part
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.step.batch import BatchView
@@ -90,6 +91,34 @@ def test_recordings_change_nothing(dataset: Dataset, config: TrainConfig) -> Non
     assert record.forgotten > 1  # densification replaced the Gaussians
 
 
+def mixed(dataset: Dataset) -> Dataset:
+    """Views with different intrinsics."""
+    train = [
+        replace(view, camera=replace(view.camera, fx=26.0 + i, fy=24.0 - i, cx=12.0 + 0.1 * i))
+        for i, view in enumerate(dataset.train)
+    ]
+    return replace(dataset, train=train)
+
+
+@pytest.mark.parametrize("exposure", ["off", "on"])
+def test_a_recording_is_for_all_intrinsics_and_exposures(dataset: Dataset, exposure: str) -> None:
+    """The learnt gains are the same, too."""
+    config = replace(CALM, exposure=exposure, background="random")
+    plain = Trainer(mixed(dataset), config)
+    expected = losses(plain, 30)
+    record = Counted()
+    trainer = Trainer(mixed(dataset), config)
+    assert recordable(trainer.parts)
+    trainer.graphs = ViewGraphs(record, note=pytest.fail)
+    assert losses(trainer, 30) == expected
+    assert record.recorded == 2
+    assert record.queued == 2 * 29  # all but the first step
+    if exposure == "on":
+        gains = [each.part(Exposure).log_gains for each in (plain, trainer)]
+        assert torch.equal(*gains)
+        assert gains[0].any()
+
+
 def test_the_least_recently_used_recording_is_replaced(dataset: Dataset) -> None:
     trainer = Trainer(dataset, CALM)
     record = Counted()
@@ -126,7 +155,11 @@ def test_parts_between_the_projection_and_the_loss_are_not_recorded() -> None:
         def loss(self, run: Run, view: BatchView, rendered: RenderOutput) -> Tensor | None:
             return None
 
+    class Recorded(Brighter):
+        recordable = True
+
     assert recordable([Masked()])
+    assert recordable([Masked(), Recorded()])
     assert not recordable([Masked(), Brighter()])
     assert not recordable([Darker()])
 
@@ -146,12 +179,14 @@ def test_a_trainer_with_its_own_loss_is_not_recorded(dataset: Dataset) -> None:
 @pytest.mark.gpu
 @needs_gpu
 @every_density_control
-@pytest.mark.parametrize("background", ["black", "random"])
+@pytest.mark.parametrize(
+    ("background", "exposure"), [("black", "on"), ("random", "off"), ("random", "on")]
+)
 def test_graphs_of_a_gpu_change_nothing(
-    dataset: Dataset, config: TrainConfig, background: str
+    dataset: Dataset, config: TrainConfig, background: str, exposure: str
 ) -> None:
     """The losses and the parameters have the same bits as without graphs."""
-    config = replace(config, background=background)
+    config, dataset = replace(config, background=background, exposure=exposure), mixed(dataset)
     torch.use_deterministic_algorithms(True, warn_only=True)
     try:
         plain = with_masks(Trainer(dataset, config, device=torch.device("cuda")))

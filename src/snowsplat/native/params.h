@@ -31,12 +31,13 @@ using DepthKey = typename DepthKeyOf<T>::type;
 // A pinhole camera. Pixel (i, j) has its centre at (i + 0.5, j + 0.5); z points forward.
 template <class T>
 struct CameraParams {
-  const T* cam_from_world;  // (3, 4): rotation and translation
-  double width, height;     // pixels
-  double fx, fy, cx, cy;    // pixels
-  double near;              // world units; nearer Gaussians are not visible
-  int64_t antialiased;      // 1: the dilation of a splat lowers its opacity; see projection.h
-  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, near, antialiased)
+  const T* cam_from_world;   // (3, 4): rotation and translation
+  double width, height;      // pixels
+  double fx, fy, cx, cy;     // pixels
+  const double* intrinsics;  // (4,) in place of these four numbers; or null
+  double near;               // world units; nearer Gaussians are not visible
+  int64_t antialiased;       // 1: the dilation of a splat lowers its opacity; see projection.h
+  SNOW_FIELDS(cam_from_world, width, height, fx, fy, cx, cy, intrinsics, near, antialiased)
 };
 
 // The parameters of N Gaussians.

@@ -34,9 +34,12 @@ struct PinholeCamera {
   // every thread computes them.
   template <class Real>
   SNOW_INLINE PinholeCamera(const CameraParams<T>& c, Real)
-      : fx(T(c.fx)), fy(T(c.fy)), cx(T(c.cx)), cy(T(c.cy)), width(T(c.width)), height(T(c.height)),
-        near(T(c.near)), antialiased(c.antialiased != 0),
+      : width(T(c.width)), height(T(c.height)), near(T(c.near)), antialiased(c.antialiased != 0),
         dilation(T(c.antialiased ? kMipDilation : kDilation)) {
+    const double* given = c.intrinsics;
+    const Real focal_x(given ? given[0] : c.fx), focal_y(given ? given[1] : c.fy),
+        centre_x(given ? given[2] : c.cx), centre_y(given ? given[3] : c.cy);
+    fx = T(focal_x), fy = T(focal_y), cx = T(centre_x), cy = T(centre_y);
     for (int i = 0; i < 3; i++) {
       for (int j = 0; j < 3; j++) rotation[3 * i + j] = c.cam_from_world[4 * i + j];
       translation[i] = c.cam_from_world[4 * i + 3];
@@ -45,8 +48,7 @@ struct PinholeCamera {
       position[k] = -(rotation[k] * translation[0] + rotation[3 + k] * translation[1] +
                       rotation[6 + k] * translation[2]);
     }
-    const Real w(c.width), h(c.height), focal_x(c.fx), focal_y(c.fy), centre_x(c.cx),
-        centre_y(c.cy);
+    const Real w(c.width), h(c.height);
     const Real beyond_x = Real(0.15) * w, beyond_y = Real(0.15) * h;
     min_tx = T(-(centre_x + beyond_x) / focal_x), max_tx = T((w - centre_x + beyond_x) / focal_x);
     min_ty = T(-(centre_y + beyond_y) / focal_y), max_ty = T((h - centre_y + beyond_y) / focal_y);

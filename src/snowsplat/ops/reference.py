@@ -119,7 +119,9 @@ def _project_rows(
     """
     means, log_scales, quats, opacity_logits, sh_dc, sh_rest = parameters
     W, t = cam_from_world[:, :3], cam_from_world[:, 3]  # (3, 3), (3,): the viewing transformation
-    fx, fy, cx, cy = zoom * view.fx, zoom * view.fy, view.cx, view.cy
+    given = view.intrinsics
+    numbers = [view.fx, view.fy, view.cx, view.cy] if given is None else given.tolist()
+    fx, fy, (cx, cy) = zoom * numbers[0], zoom * numbers[1], numbers[2:]
 
     # The centre. (M, 3) in camera space, then (M, 2) in pixels.
     x, y, z = (means @ W.T + t).unbind(dim=1)

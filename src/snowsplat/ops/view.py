@@ -26,6 +26,8 @@ class View:
         fx, fy, cx, cy: focal lengths and principal point, in pixels.
         sh_degree: 0 to 3, the degree of the spherical harmonics.
         near: > 0, in world units. Gaussians that are nearer are not visible.
+        intrinsics: (4,) float64 on the device of the Gaussians: fx, fy, cx and cy, which the
+            kernels read in place of the four numbers when they run; not checked. None: the numbers.
         antialiased: multiply opacities by √(det(J W Σ Wᵀ Jᵀ) / det Σ'), and use d = 0.1 for the
             low-pass filter: the 2D mip filter of Yu et al. 2024. See `project`.
 
@@ -44,6 +46,7 @@ class View:
     sh_degree: int = 0
     near: float = 0.2
     antialiased: bool = False
+    intrinsics: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_size("View", self.width, self.height)
@@ -67,4 +70,9 @@ def camera_params(view: View, like: Tensor) -> Struct:
     pose = view.cam_from_world.to(like.device, like.dtype, non_blocking=True)
     names = ("width", "height", "fx", "fy", "cx", "cy", "near")
     numbers = {name: float(getattr(view, name)) for name in names}
-    return {"cam_from_world": pose.contiguous(), **numbers, "antialiased": view.antialiased}
+    return {
+        "cam_from_world": pose.contiguous(),
+        **numbers,
+        "intrinsics": view.intrinsics,
+        "antialiased": view.antialiased,
+    }

@@ -14,6 +14,7 @@ from snowsplat.scene.render import RenderOutput
 from snowsplat.training.core.progress import Progress
 from snowsplat.training.core.regularizers import add_regularizers
 from snowsplat.training.core.run import Run
+from snowsplat.training.core.view_graphs import Objective
 from snowsplat.training.step.batch import Batch, BatchView, batch_gradients
 from snowsplat.training.step.view_gradient import ViewGradient
 from snowsplat.util.interrupts import interrupts_between_steps
@@ -101,8 +102,12 @@ class Trainer(Run):
         replaced = kind._background is not Trainer._background or kind._loss is not Trainer._loss
         if self.graphs is not None and not replaced:
             (view,) = batch
+            idle = tuple(part.idle for part in self.parts)
+            objective = Objective(
+                self._background, self._compared, self._repeated, (self.loss, idle)
+            )
             recorded = self.graphs.gradient(
-                self.gaussians, view, self._target(view), sh_degree, self.runner, self.loss
+                self.gaussians, view, self._target(view), sh_degree, self.runner, objective
             )
             if recorded is not None:
                 return [recorded]
@@ -130,7 +135,11 @@ class Trainer(Run):
         return photo
 
     def _loss(self, view: BatchView, rendered: RenderOutput) -> Tensor:
-        photo, image = self._target(view), rendered.image
+        return self._compared(view, rendered, self._target(view))
+
+    def _compared(self, view: BatchView, rendered: RenderOutput, photo: LoadedImage) -> Tensor:
+        """The loss (); ``photo``: from `_target`."""
+        image = rendered.image
         for part in self.parts:
             image = part.image(self, view, image, photo)
         loss = self.loss(image, photo, view.background)
@@ -138,6 +147,10 @@ class Trainer(Run):
             if (term := part.loss(self, view, rendered)) is not None:
                 loss = loss + term
         return loss
+
+    def _repeated(self, view: BatchView, recorded: BatchView) -> None:
+        for part in self.parts:
+            part.repeated(self, view, recorded)
 
     def evaluate(self) -> Evaluation:
         """Metrics of the test views in the current state. Black replaces a random background."""

@@ -3,9 +3,9 @@
 A GPU computes the gradient of 200,000 Gaussians in 0.6 ms, but Python needs 2 ms to queue its 60
 kernels one by one. A CUDA graph is a recorded sequence of kernels, which is queued by one call. It
 repeats the same kernels with the same addresses and numbers. So a recording is used only while all
-of these are the same (`_key`): the memory of the Gaussians, the intrinsics of the camera, the size
-of the photo, and the memory of the rasterizer. What differs between the views, their pose, photo
-and background, is copied to memory that belongs to the recording (`_Inputs`).
+of these are the same (`_key`): the memory of the Gaussians, the size of the photo, and the memory
+of the rasterizer. What differs between the views, their pose, intrinsics, photo, background and
+index, is copied to memory that belongs to the recording (`_Inputs`).
 
 There are two graphs, because the CPU reads the loss back between the forward and the backward pass:
 see `StepRunner`. Density control and the optimiser are not recorded: they depend on the step.
@@ -13,18 +13,18 @@ see `StepRunner`. Density control and the optimiser are not recorded: they depen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from snowsplat import ops
 from snowsplat.data.photos.decode import LoadedImage
 from snowsplat.ops.splats import Splats2D
-from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
-from snowsplat.scene.render import project
+from snowsplat.scene.render import RenderOutput, view_of
 from snowsplat.training.parts.part import Part
 from snowsplat.training.step.batch import BatchView
 from snowsplat.training.step.step_runner import StepRunner, Summary
@@ -34,7 +34,23 @@ from snowsplat.util.messages import Message, message
 #: A recording keeps the memory of its splats and their gradient: 132 bytes per Gaussian.
 MOST_RECORDINGS = 4
 
-Loss = Callable[[Tensor, LoadedImage, Tensor], Tensor]
+
+@dataclass(frozen=True)
+class Objective:
+    """How a view becomes a loss.
+
+    Attributes:
+        background: a view -> the colour (3,) over which it is rendered.
+        loss: a view, its rendering, and the photo that it is compared with -> the loss ().
+        repeated: called after a recording was queued for a view, with this view and that of the
+            recording, which the two functions got.
+        version: a recording is for one of them.
+    """
+
+    background: Callable[[BatchView], Tensor]
+    loss: Callable[[BatchView, RenderOutput, LoadedImage], Tensor]
+    repeated: Callable[[BatchView, BatchView], None]
+    version: Hashable
 
 
 class Recorder(Protocol):
@@ -51,40 +67,52 @@ class Recorder(Protocol):
 
 
 def recordable(parts: Sequence[Part]) -> bool:
-    """Whether no part takes part between the projection and the loss.
+    """Whether each part that takes part between the projection and the loss permits recordings.
 
-    The Python code of such a part would run when it is recorded, but not in later steps.
+    The Python code of a part runs when it is recorded, but not in later steps.
     """
     hooks = ("background", "image", "loss")
-    active = [type(part) for part in parts if not part.idle]
-    return all(getattr(kind, hook) is getattr(Part, hook) for kind in active for hook in hooks)
+    fixed = [type(part) for part in parts if not (part.idle or part.recordable)]
+    return all(getattr(kind, hook) is getattr(Part, hook) for kind in fixed for hook in hooks)
 
 
-@dataclass
 class _Inputs:
-    """Memory that belongs to a recording."""
+    """Memory that belongs to a recording.
 
-    camera: Camera
-    photo: LoadedImage
-    background: Tensor
+    Attributes:
+        view: stands for all views; see `BatchView`.
+        photo: what the image is compared with.
+        intrinsics: (4,) float64: see `ops.View`.
+    """
 
-    @classmethod
-    def like(cls, view: BatchView, photo: LoadedImage, dtype: torch.dtype) -> _Inputs:
-        camera = view.camera
-        pose = torch.empty_like(camera.cam_from_world, dtype=dtype)
+    def __init__(self, view: BatchView, photo: LoadedImage, dtype: torch.dtype) -> None:
+        pose = torch.empty_like(view.camera.cam_from_world, dtype=dtype)
         mask = None if photo.mask is None else torch.empty_like(photo.mask)
-        return cls(
-            replace(camera, cam_from_world=pose),
-            LoadedImage(torch.empty_like(photo.planes), mask),
-            torch.empty_like(view.background),
+        self.view = replace(
+            view,
+            index=-1,
+            camera=replace(view.camera, cam_from_world=pose),
+            photo=None,
+            background=torch.empty_like(view.background),
+            row=torch.empty_like(view.row),
         )
+        self.photo = LoadedImage(torch.empty_like(photo.planes), mask)
+        self.intrinsics = torch.empty(4, dtype=torch.float64, device=pose.device)
+        # The GPU has copied it when the step ends, at the latest.
+        self._numbers = torch.zeros(4, dtype=torch.float64, pin_memory=pose.device.type == "cuda")
 
     def copy(self, view: BatchView, photo: LoadedImage) -> None:
-        self.camera.cam_from_world.copy_(view.camera.cam_from_world)
+        self.view.camera.cam_from_world.copy_(view.camera.cam_from_world)
         self.photo.planes.copy_(photo.planes)
         if self.photo.mask is not None and photo.mask is not None:
             self.photo.mask.copy_(photo.mask)
-        self.background.copy_(view.background)
+        self.view.background.copy_(view.background)
+        self.view.row.copy_(view.row)
+        c = view.camera
+        numbers = [c.fx, c.fy, c.cx, c.cy]
+        if self._numbers.tolist() != numbers:
+            self._numbers.copy_(torch.tensor(numbers, dtype=torch.float64))
+            self.intrinsics.copy_(self._numbers, non_blocking=True)
 
 
 class _Recording:
@@ -100,17 +128,19 @@ class _Recording:
         gaussians: Gaussians,
         sh_degree: int,
         runner: StepRunner,
-        loss: Loss,
+        objective: Objective,
         record: Recorder,
     ) -> None:
         self.inputs = inputs
 
         def forward() -> None:
-            camera, background = inputs.camera, inputs.background
-            self.splats = project(gaussians, camera, sh_degree)
+            view = inputs.view
+            projection = view_of(gaussians, view.camera, sh_degree)
+            self.splats = ops.project(gaussians, replace(projection, intrinsics=inputs.intrinsics))
             with torch.enable_grad():
-                image = runner.rasterize(self.splats, camera, background).image
-                self._loss = loss(image, inputs.photo, background)
+                background = objective.background(view)
+                rendered = runner.rasterize(self.splats, view.camera, background)
+                self._loss = objective.loss(view, rendered, inputs.photo)
             self.summary = runner.summary([self._loss.detach()], runner.capacity.required)
 
         def backward() -> None:
@@ -142,7 +172,7 @@ class ViewGraphs:
         photo: LoadedImage,
         sh_degree: int,
         runner: StepRunner,
-        loss: Loss,
+        objective: Objective,
     ) -> ViewGradient | None:
         """As `batch_gradients` for one view; None if there is no recording for it.
 
@@ -151,8 +181,6 @@ class ViewGraphs:
 
         Args:
             photo: what the image is compared with.
-            loss: takes an image (H, W, 3), the photo and the background (3,). Another object has
-                other recordings.
         """
         if self._record is None:
             return None
@@ -162,7 +190,7 @@ class ViewGraphs:
             if self._recordings:
                 self._recordings.clear()
                 self._record.forget()
-        key = (_key(gaussians, view, photo, sh_degree, runner), loss)
+        key = (_key(gaussians, view, photo, sh_degree, runner), objective.version)
         repeated, self._last = (memory, key) == self._last, (memory, key)
         recording = self._recordings.pop(key, None)
         if recording is None:
@@ -170,9 +198,11 @@ class ViewGraphs:
                 return None
             if len(self._recordings) == MOST_RECORDINGS:
                 del self._recordings[next(iter(self._recordings))]
-            inputs = _Inputs.like(view, photo, gaussians.means.dtype)
+            inputs = _Inputs(view, photo, gaussians.means.dtype)
             try:
-                recording = _Recording(inputs, gaussians, sh_degree, runner, loss, self._record)
+                recording = _Recording(
+                    inputs, gaussians, sh_degree, runner, objective, self._record
+                )
             except RuntimeError as error:  # for example, the memory does not suffice
                 self._record = None
                 self._recordings.clear()
@@ -189,6 +219,7 @@ class ViewGraphs:
         recording.forward()
         runner.send(recording.summary)
         recording.backward()
+        objective.repeated(view, recording.inputs.view)
         return runner.gradient(recording.splats, view.camera, sh_degree)
 
 
@@ -198,7 +229,7 @@ def _key(
     """All numbers and sizes that a recording repeats, except for the memory of the Gaussians."""
     c = view.camera
     return (
-        (c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.near),
+        (c.width, c.height, c.near),
         (photo.planes.shape, photo.mask is None, view.background.dtype),
         (sh_degree, gaussians.antialiased, runner, runner.capacity.instances),
         torch.are_deterministic_algorithms_enabled(),

@@ -56,6 +56,7 @@ class ViewQueue:
         self._generator = generator
         self._batch = batch
         self._shards = shards
+        self._rows = torch.arange(len(views), device=background.evaluation.device)
 
     def take(self, after: int, step: int) -> list[BatchView]:
         """The views of the steps ``after`` + 1 to ``step``, at the resolution of the last one.
@@ -79,7 +80,8 @@ class ViewQueue:
         own = position % self._shards.size == self._shards.rank
         photo = self._images.get(self._views[i], downscale) if own else None
         camera = self._camera_of(i).downscaled(downscale)
-        return BatchView(i, self._views[i], camera, photo, self._background.draw())
+        row = self._rows[i : i + 1]
+        return BatchView(i, self._views[i], camera, photo, self._background.draw(), row)
 
     def exclude(self, indices: Iterable[int], after: int) -> None:
         """Do not use these views in the steps that follow ``after``."""

@@ -38,7 +38,10 @@ class ExposedImages:
             photo: has the same colours at each call with the same ``index`` and size; None: it may
                 have others.
         """
-        at = self._positions(photo, None if index is None else (index, image.shape[0]))
+        if image.device.type == "cpu":
+            at = self._positions(photo, None if index is None else (index, image.shape[0]))
+        else:  # a GPU would wait for the number of positions
+            at = photo.planes[:3] >= _OVEREXPOSED
         result: Tensor = _Exposed.apply(image, log_gains, at)
         return result
 
@@ -54,15 +57,22 @@ class ExposedImages:
 
 
 class _Exposed(torch.autograd.Function):
-    """The image that `ExposedImages.exposed` returns; ``at`` is from `_positions`."""
+    """The image that `ExposedImages.exposed` returns.
+
+    ``at``: where the photo is overexposed: from `_positions`, or (3, H, W) bool.
+    """
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, log_gains: Tensor, at: Tensor) -> Tensor:
         gains = log_gains.exp()
         planes = _product(image, gains)
-        values = planes.view(-1).index_select(0, at)
-        planes.view(-1).scatter_(0, at, values.clamp(max=1.0))
-        ctx.at, ctx.unlimited = at, (values <= 1.0).to(planes.dtype)
+        if at.dtype == torch.bool:
+            ctx.limited = at & (planes > 1.0)
+            planes.masked_fill_(ctx.limited, 1.0)
+        else:
+            values = planes.view(-1).index_select(0, at)
+            planes.view(-1).scatter_(0, at, values.clamp(max=1.0))
+            ctx.limited, ctx.at, ctx.unlimited = None, at, (values <= 1.0).to(planes.dtype)
         ctx.save_for_backward(image, gains)
         return planes.permute(1, 2, 0)
 
@@ -71,11 +81,15 @@ class _Exposed(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
         image, gains = ctx.saved_tensors
         planes = _product(grad, gains)
-        flat = planes.view(-1)
-        flat.scatter_(0, ctx.at, flat.index_select(0, ctx.at) * ctx.unlimited)
         values = image.permute(2, 0, 1).reshape(3, -1)
-        pairs = zip(planes.view(3, -1), values, strict=True)
-        grad_gains = torch.stack([torch.dot(*pair) for pair in pairs])
+        if ctx.limited is not None:
+            planes.masked_fill_(ctx.limited, 0.0)
+            grad_gains = (planes.view(3, -1) * values).sum(1)
+        else:
+            flat = planes.view(-1)
+            flat.scatter_(0, ctx.at, flat.index_select(0, ctx.at) * ctx.unlimited)
+            pairs = zip(planes.view(3, -1), values, strict=True)
+            grad_gains = torch.stack([torch.dot(*pair) for pair in pairs])
         return planes.permute(1, 2, 0), grad_gains, None
 
 

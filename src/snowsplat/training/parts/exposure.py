@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from statistics import pstdev
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -61,14 +62,16 @@ class Exposure(Part):
     """
 
     name = "exposure"
+    recordable = True
 
     def __init__(self, setting: str) -> None:
         """
         ``setting``: "auto" or "on", see ``TrainConfig.exposure``.
         """
         self._setting = setting
-        # (3,) log-gains, with their gradients, of the views of this process in the present step.
-        self._present: dict[BatchView, Tensor] = {}
+        # (3,) log-gains, with their gradients, of the views that exist: those of this process in
+        # the present step, and those of recordings.
+        self._present: WeakKeyDictionary[BatchView, Tensor] = WeakKeyDictionary()
         self._images = ExposedImages()
 
     def prepare(self, run: Run) -> None:
@@ -114,7 +117,8 @@ class Exposure(Part):
         if not self.active:
             return color
         # If a step is repeated, this replaces the gradient of the last attempt.
-        self._present[view] = log_gains = self.log_gains[view.index].clone().requires_grad_()
+        log_gains = self.log_gains.index_select(0, view.row)[0].requires_grad_()
+        self._present[view] = log_gains
         if run.config.background == "black":  # saves a pass over the image
             return color
         return color * (-log_gains).exp()
@@ -123,20 +127,26 @@ class Exposure(Part):
         """The image (H, W, 3) as the camera of the view exposes it."""
         if not self.active:
             return image
-        # Another part may have changed the colours: then the positions are not remembered.
+        # Another part may have changed the colours, and a recording is for many photos: then the
+        # positions are not remembered.
         same = view.photo is not None and photo.planes is view.photo.planes
         return self._images.exposed(image, self._present[view], photo, view.index if same else None)
+
+    def repeated(self, run: Run, view: BatchView, recorded: BatchView) -> None:
+        """See `Part.repeated`."""
+        if self.active:
+            self._present[view] = self._present[recorded]
 
     def after_step(self, run: Run, step: int, batch: Batch) -> None:
         """Update the gains of the photos of the batch."""
         if not self.active:
             return
-        size = run.shards.size
+        size, rank = run.shards.size, run.shards.rank
         own = self.log_gains.new_zeros(-(-len(batch) // size), 3)
-        for row, log_gains in zip(own, self._present.values(), strict=False):
-            assert log_gains.grad is not None
-            row += log_gains.grad
-        self._present.clear()
+        for row, view in zip(own, batch[rank::size], strict=False):
+            gradient = self._present.pop(view).grad
+            assert gradient is not None
+            row += gradient
         table = run.shards.table(own.flatten()).view(size, -1, 3)
         rate = _RATE * (_LAST_RATE / _RATE) ** (step / run.schedule.iterations)
         for position, view in enumerate(batch):  # in each round, process r has view r

@@ -45,8 +45,8 @@ class Part:
     `loss` and `regularizer`. With several processes, all of them call the same methods in the same
     order, but `background`, `target`, `image` and `loss` only in the process that blends the view:
     these must not call `Run.render` or methods of ``run.shards``. On a GPU, these four may be
-    called twice for a view. A GPU is faster if no part that is not `idle` overrides `background`,
-    `image` or `loss`: see `training.core.view_graphs`.
+    called twice for a view. A GPU is faster if each part that is not `idle` and overrides
+    `background`, `image` or `loss` is `recordable`: see `training.core.view_graphs`.
 
     Attributes:
         name: of the part in checkpoints and messages; default: the name of the class.
@@ -54,9 +54,15 @@ class Part:
         abs_grad: whether the part uses ``gradient.splats.abs_grad``.
         idle: whether `background`, `image` and `loss` have no effect in this training. All three
             are set at the latest in `prepare`.
+        recordable: whether the kernels of `background`, `image` and `loss` may be recorded in one
+            step, and repeated in other steps for other views. Their Python code does not run then.
+            So what differs between views must come from tensors: those of their arguments, whose
+            memory a recording has for itself (``view.row`` is the index on the device), and those
+            of the part, which must always be at the same place in memory. See also `repeated`.
     """
 
     name: ClassVar[str]
+    recordable: ClassVar[bool] = False
     with_depth: bool = False
     abs_grad: bool = False
     idle: bool = False
@@ -111,6 +117,12 @@ class Part:
         the image, the alpha and, if `with_depth`, the depth.
         """
         return None
+
+    def repeated(self, run: Run, view: BatchView, recorded: BatchView) -> None:
+        """Called after the kernels of `background`, `image` and `loss` were queued again for
+        ``view``, and those of their backward pass. ``recorded``: the view with which the methods
+        were called when they were recorded: tensors that were made then have new values.
+        """
 
     def gradients(self, run: Run, step: int, batch: Batch, gradients: Gradients) -> None:
         """Called before the optimiser: may read or change the gradient of each view of the batch,

@@ -154,8 +154,8 @@ class Transients(Part):
         if self._mode == "off" or bool(cells.all()):
             return photo
         size = photo.planes.shape[1:]
+        cells = cells.to(photo.planes.device, non_blocking=True)
         mask = interpolate(cells[None, None].to(torch.uint8), size)[0, 0].to(torch.bool)
-        mask = mask.to(photo.planes.device, non_blocking=True)
         return replace(photo, mask=mask if photo.mask is None else mask & photo.mask)
 
     def shares(self) -> dict[str, float]:

@@ -27,7 +27,8 @@ class BatchView:
     """A view of a batch, at the resolution of the step. Each one is different from any other.
 
     ``index`` is that of the view in the training views of the dataset. ``photo`` is None if another
-    process blends this view.
+    process blends this view. In a recording, which stands for many views, the index is -1 and the
+    photo None, see `Part.recordable`.
     """
 
     index: int
@@ -35,6 +36,7 @@ class BatchView:
     camera: Camera
     photo: LoadedImage | None
     background: Tensor  # (3,)
+    row: Tensor  # (1,) int64 on the device: the index
 
 
 #: The views of a step, and the gradient of each.
