@@ -101,8 +101,27 @@ def test_sort_by_some_bits(run: Run, bits: tuple[int, int]) -> None:
     assert sort(run, keys, bits)[1].tolist() == sorted(range(300), key=lambda i: plain[i])
 
 
+@pytest.mark.parametrize("n", [700, 2 * BLOCK + 77])
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32, torch.int64])
+def test_sort_of_many_blocks(
+    run: Run, dtype: torch.dtype, n: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel of its own adds the counts of the blocks; here, for few blocks."""
+    monkeypatch.setattr(sorting, "MOST_ADDED", 0)
+    keys = random_keys(n, n, dtype)
+    plain = [k & 0xFFFF for k in unsigned(keys)]
+    got, values = sort(run, keys, (0, 16))
+    wanted = sorted(range(n), key=lambda i: plain[i])
+    assert values.tolist() == wanted
+    assert torch.equal(got, keys[wanted])
+
+
+@pytest.mark.parametrize("most_added", [0, 64])
 @pytest.mark.parametrize("count", [0, 1, 700, BLOCK, BLOCK + 5, 2 * BLOCK, 10**12])
-def test_sort_of_a_count_on_the_device(run: Run, count: int) -> None:
+def test_sort_of_a_count_on_the_device(
+    run: Run, count: int, most_added: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sorting, "MOST_ADDED", most_added)
     keys = random_keys(4, 2 * BLOCK, torch.int16, distinct=50)
     there = min(count, 2 * BLOCK)
     got, values = sort(run, keys, (0, 6), count)

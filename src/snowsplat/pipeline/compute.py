@@ -9,6 +9,8 @@ import logging
 import os
 import re
 import sys
+import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -85,6 +87,21 @@ class Compute(Settings):
         if self.deterministic:
             _sum_in_a_fixed_order()
         return device
+
+
+def open_device(device: torch.device) -> None:
+    """Open a GPU in the background, which takes half a second. Meanwhile, files can be read.
+
+    An error is that of the first use in the foreground.
+    """
+    import torch
+
+    def use() -> None:
+        with suppress(RuntimeError):
+            torch.zeros(1, device=device)
+
+    if device.type == "cuda":
+        threading.Thread(target=use, name="snowsplat-open-device").start()
 
 
 def _sum_in_a_fixed_order() -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from snowsplat.data import Dataset, read_dataset, read_files
 from snowsplat.ops import device_name
-from snowsplat.pipeline.compute import Compute
+from snowsplat.pipeline.compute import Compute, open_device
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.camera_check import check_cameras, check_test_photos
@@ -162,6 +162,7 @@ class _Job:
         self.request, self.out, self.options = request, request.out, request.options
         self.note = request.observer.note
         self.device = self.options.compute.apply()
+        open_device(self.device)
         reset_peak()
         self.memory_before = resident_bytes()
         self.shards: Shards = ALONE

@@ -3,7 +3,8 @@
 // ops/cuda/sorting.py).
 //
 //   scan_sums, scan_of_sums, scan_apply   an exclusive prefix sum
-//   sort_count, sort_offsets, sort_scatter   one pass of the sort, by one digit of at most 8 bits
+//   sort_count, sort_offsets, sort_scatter   one pass of the sort, by one digit of at most 8 bits;
+//                                            few blocks need no sort_offsets
 //
 // Keys are unsigned integers of 16, 32 or 64 bits; values have 32 bits. The sort is stable.
 #include "cuda/scan.h"
@@ -33,8 +34,8 @@ struct SortPassParams {
   uint32_t* values_out;    // out, (n,)
   int64_t shift, bits;
   int64_t blocks;          // of sort_count and sort_scatter
-  uint32_t* counts;        // (2^bits, blocks)
-  const uint32_t* totals;  // (2^bits,); `counts` if there is one block
+  uint32_t* counts;        // (2^bits, blocks); without `totals`: (blocks, 256)
+  const uint32_t* totals;  // (2^bits,), or null: sort_scatter adds the counts itself
   const int64_t* count;    // (1,) the number of pairs, or null: n
   SNOW_FIELDS(n, keys, values, keys_out, values_out, shift, bits, blocks, counts, totals, count)
 };
@@ -139,7 +140,7 @@ SNOW_INLINE uint32_t lanes_with(int digit) {
   return same;
 }
 
-// counts[digit · blocks + block]: how often the digit is in the keys of a block.
+// How often each digit is in the keys of a block.
 template <class Key>
 SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
   constexpr int kItems = kSortItems<Key>;
@@ -163,9 +164,32 @@ SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
     }
   }
   __syncthreads();
-  if (threadIdx.x <= digit_of.mask)
-    p.counts[int64_t(threadIdx.x) * p.blocks + blockIdx.x] = histogram[threadIdx.x];
+  if (threadIdx.x <= digit_of.mask) {
+    const int64_t thread = threadIdx.x, block = blockIdx.x;
+    p.counts[p.totals ? thread * p.blocks + block : block * kDigits + thread] = histogram[thread];
+  }
 }
+
+// The occurrences of a digit in the keys of the preceding blocks, and of all blocks.
+struct Occurrences {
+  uint32_t before = 0, total = 0;
+
+  template <class Key>
+  SNOW_INLINE Occurrences(const SortPassParams<Key>& p, int digit) {
+    if (p.totals) {
+      before = p.counts[int64_t(digit) * p.blocks + blockIdx.x], total = p.totals[digit];
+      return;
+    }
+    const int blocks = int(p.blocks), block = int(blockIdx.x);
+#pragma unroll 8
+    for (int b = 0; b < blocks; b++) {
+      const uint32_t count = p.counts[b * kDigits + digit];
+      total += count;
+      if (b < block) before += count;
+    }
+  }
+  SNOW_INLINE Occurrences() {}
+};
 
 // One block per digit. Replaces each count of the digit with the sum of the counts of the preceding
 // blocks, and writes the sum of all counts to totals[digit].
@@ -197,12 +221,9 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
 // in the keys of the block, sorted by digit. The keys are written to shared memory in this order,
 // and from there to global memory, so that neighbouring threads write to neighbouring addresses.
 // Then the values are written in the same way. Invalid items are at the end and have the last
-// digit, so they stay at the end. With a single block, sort_offsets may be skipped: the counts of
-// the block are the totals.
+// digit, so they stay at the end.
 template <class Key>
-SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const uint32_t* values,
-                               Key* keys_out, uint32_t* values_out, Digit digit_of, int64_t blocks,
-                               const uint32_t* counts, const uint32_t* totals) {
+SNOW_INLINE void scatter_block(const SortPassParams<Key>& p, int64_t first, int valid) {
   constexpr int kItems = kSortItems<Key>, kWarps = kThreads / kWarp, kAll = kThreads * kItems;
   constexpr int kWords = kAll * int(sizeof(Key) == 8 ? 2 : 1) / 2;
   SNOW_SHARED(uint16_t, histograms, kWarps* kDigits);
@@ -212,6 +233,9 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
   Key* const staged_keys = reinterpret_cast<Key*>(staged);
   uint32_t* const staged_values = reinterpret_cast<uint32_t*>(staged);
 
+  const Key* const keys = p.keys;
+  const uint32_t* const values = p.values;
+  const Digit digit_of = digit_at(p.shift, p.bits);
   const int thread = int(threadIdx.x), lane = lane_id();
   const int mine = warp_id() * (kItems * kWarp) + lane;
   uint16_t* const histogram = histograms + warp_id() * kDigits;
@@ -250,15 +274,14 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
     }
     // Two scans in one: of the counts of this block in the low half, and of the counts of all
     // blocks in the high half.
-    const uint64_t both = uint64_t(is_digit ? totals[thread] : 0) << 32 | sum;
+    const Occurrences of_digit = is_digit ? Occurrences(p, thread) : Occurrences();
+    const uint64_t both = uint64_t(of_digit.total) << 32 | sum;
     const uint64_t before = block_scan<kThreads>(both).before;
     const uint32_t here = uint32_t(before);
 #pragma unroll
     for (int w = 0; w < kWarps; w++)
       histograms[w * kDigits + thread] = uint16_t(histograms[w * kDigits + thread] + here);
-    uint32_t other_blocks = 0;
-    if (is_digit && blocks > 1) other_blocks = counts[int64_t(thread) * blocks + blockIdx.x];
-    run_start[thread] = uint32_t(before >> 32) + other_blocks - here;
+    run_start[thread] = uint32_t(before >> 32) + of_digit.before - here;
   }
   __syncthreads();
 
@@ -275,7 +298,7 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
     const int at = k * kThreads + thread;
     const Key moved = staged_keys[at];
     target[k] = run_start[digit_of(moved)] + uint32_t(at);
-    if (at < valid) keys_out[target[k]] = moved;
+    if (at < valid) p.keys_out[target[k]] = moved;
   }
   __syncthreads();
 
@@ -288,7 +311,7 @@ SNOW_INLINE void scatter_block(int64_t first, int valid, const Key* keys, const 
 #pragma unroll
   for (int k = 0; k < kItems; k++) {
     const int at = k * kThreads + thread;
-    if (at < valid) values_out[target[k]] = staged_values[at];
+    if (at < valid) p.values_out[target[k]] = staged_values[at];
   }
 }
 
@@ -296,9 +319,7 @@ template <class Key>
 SNOW_INLINE void scatter(const SortPassParams<Key>& p) {
   constexpr int kAll = kThreads * kSortItems<Key>;
   const int64_t first = int64_t(blockIdx.x) * kAll, left = valid_items(p.n, p.count) - first;
-  if (left > 0)
-    scatter_block(first, left < kAll ? int(left) : kAll, p.keys, p.values, p.keys_out, p.values_out,
-                  digit_at(p.shift, p.bits), p.blocks, p.counts, p.totals);
+  if (left > 0) scatter_block(p, first, left < kAll ? int(left) : kAll);
 }
 
 }  // namespace

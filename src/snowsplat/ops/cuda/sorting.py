@@ -12,6 +12,7 @@ from torch import Tensor
 from snowsplat.ops.cuda.kernels import KERNELS, Run
 
 _DIGIT_BITS = 8
+MOST_ADDED = 64  # blocks whose counts `sort_scatter` adds; for more, `sort_offsets` does it first
 _KEYS = {torch.int16: "u16", torch.int32: "u32", torch.int64: "u64"}
 
 
@@ -58,8 +59,8 @@ def sort_pairs(
     name, device = _KEYS[keys.dtype], keys.device
     blocks = KERNELS[f"sort_count_{name}"].blocks(n)
     counts = torch.empty(blocks << _DIGIT_BITS, dtype=torch.int32, device=device)
-    totals = counts  # the counts of a single block are the totals
-    if blocks > 1:
+    totals = None
+    if blocks > MOST_ADDED:
         totals = torch.empty(1 << _DIGIT_BITS, dtype=torch.int32, device=device)
     begin, end = bits
     passes = sort_passes(end - begin)
@@ -80,7 +81,7 @@ def sort_pairs(
             "count": count,
         }
         run(f"sort_count_{name}", sort_pass)
-        if blocks > 1:
+        if totals is not None:
             run("sort_offsets", {"n": blocks, "counts": counts, "totals": totals}, 1 << width)
         run(f"sort_scatter_{name}", sort_pass)
         keys, keys2, values, values2 = keys2, keys, values2, values
