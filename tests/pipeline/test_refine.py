@@ -19,7 +19,7 @@ from snowsplat.util.errors import SettingError
 
 
 def test_the_photos_improve_a_decimated_scene(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("snowsplat.pipeline.refine._STEPS", 40)
+    monkeypatch.setattr("snowsplat.pipeline.decimate._REFINED_STEPS", 40)
     train(dataset, tmp_path / "out", TrainOptions(settings={"iterations": 60}))
     count = len(read_gaussians(tmp_path / "out/point_cloud/iteration_60/point_cloud.ply")) // 3
     plain, refined = tmp_path / "plain.ply", tmp_path / "refined.ply"

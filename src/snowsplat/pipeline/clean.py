@@ -17,8 +17,7 @@ from snowsplat.evaluation.metrics import compare, evaluate_views, size_text
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.output.scene_files import format_for_writing, write_gaussians
-from snowsplat.pipeline.output.scene_source import load_viewable
-from snowsplat.pipeline.refine import photos_of
+from snowsplat.pipeline.output.scene_source import load_viewable, photos_of
 from snowsplat.project.project import Project
 from snowsplat.project.training_folder import Color
 from snowsplat.scene.camera import Camera

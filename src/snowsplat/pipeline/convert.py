@@ -15,17 +15,16 @@ from snowsplat.formats import Format
 from snowsplat.formats.lod import LEVELS
 from snowsplat.formats.origin_file import origin_file
 from snowsplat.formats.spz import WRITTEN_VERSIONS
-from snowsplat.pipeline.decimate import Decimation, write_within
+from snowsplat.pipeline.decimate import Decimation, refine, write_within
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.convert import Edits, file_size, gaussians_to_keep
-from snowsplat.pipeline.output.levels import write_levels
 from snowsplat.pipeline.output.scene_files import (
     format_for_writing,
     read_gaussians,
     write_gaussians,
+    write_levels,
 )
-from snowsplat.pipeline.output.scene_source import cameras_of, viewable
-from snowsplat.pipeline.refine import photos_of, refine
+from snowsplat.pipeline.output.scene_source import cameras_of, photos_of, viewable
 from snowsplat.pipeline.true_scale import KnownDistance, compared
 from snowsplat.project.project import Project
 from snowsplat.scene import edit

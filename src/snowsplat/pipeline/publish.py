@@ -10,7 +10,7 @@ from snowsplat.formats.lod import INDEX
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.observer import SILENT, Observer
 from snowsplat.pipeline.options.publish import PublishOptions
-from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_files import write_levels
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.project.project import Project
 from snowsplat.scene.edit import with_sh_degree

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from snowsplat.formats import format_for_reading
 from snowsplat.formats.lod import INDEX, LEVELS, read_index, read_lod
 from snowsplat.pipeline.observer import SILENT, Observer
-from snowsplat.pipeline.output.levels import write_levels
+from snowsplat.pipeline.output.scene_files import write_levels
 from snowsplat.pipeline.output.scene_source import load_viewable
 from snowsplat.project.project import Project
 from snowsplat.scene.gaussians import Gaussians

@@ -5,7 +5,9 @@ Importing this module registers the HTML page as a format. It does not import to
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from snowsplat.formats import (
     FORMATS,
@@ -18,6 +20,13 @@ from snowsplat.formats import (
     register_format,
     write_gaussians,
 )
+from snowsplat.formats.lod import lod_bytes, read_index
+from snowsplat.formats.lod_writer import write_lod
+from snowsplat.pipeline.observer import SILENT, Observer
+from snowsplat.util.stages import Outcome
+
+if TYPE_CHECKING:
+    from snowsplat.scene.gaussians import Gaussians
 
 __all__ = [
     "FORMATS",
@@ -27,6 +36,7 @@ __all__ = [
     "read_arrays",
     "read_gaussians",
     "write_gaussians",
+    "write_levels",
 ]
 
 
@@ -49,3 +59,17 @@ register_format(
         instead="use the scene file that the page was made from",
     )
 )
+
+
+def write_levels(path: Path, gaussians: Gaussians, observer: Observer = SILENT) -> None:
+    """Write FOLDER/lod-meta.json; the observer gets the stage "levels".
+
+    Raises:
+        UserError: ``path`` has another name.
+        OSError: a file cannot be written.
+    """
+    start = time.monotonic()
+    report = observer.begin("levels")
+    write_lod(path, GaussianArrays.from_gaussians(gaussians), report=report)
+    result = {"gaussians": read_index(path).counts(), "bytes": lod_bytes(path)}
+    observer.end("levels", Outcome(result, time.monotonic() - start, again=False))

@@ -102,6 +102,21 @@ def load_dataset_of(
     return with_refined(folder, read_dataset(settings)), background
 
 
+def photos_of(training: TrainingFolder | None, dataset: Path) -> tuple[Dataset, str]:
+    """The photos for `pipeline.decimate.refine`, and the colour behind them.
+
+    If the training of the scene is known, the photos have the size of its training, those that it
+    held out are held out, and the cameras are those that it has refined.
+    Raises: UserError: ``dataset`` is not a dataset.
+    """
+    settings = DatasetSettings(str(dataset.absolute()))
+    if training is None or not training.scenes():
+        return read_dataset(settings), "black"
+    trained, color = training.settings()
+    photos = read_dataset(replace(trained, path=settings.path))
+    return with_refined(training, photos), "white" if min(color) == 1.0 else "black"
+
+
 def cameras_of(training: TrainingFolder | None) -> tuple[list[str], list[Camera]]:
     """Names and cameras of the photos of a training; empty if they are not stored.
     Raises: UserError: the file is damaged.

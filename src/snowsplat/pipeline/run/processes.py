@@ -21,16 +21,20 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from snowsplat.util.errors import UserError
 from snowsplat.util.interrupts import ended_together, interrupts_between_steps
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
 
+    from snowsplat.evaluation.metrics import Evaluation
     from snowsplat.project.training_folder import DatasetSettings
+    from snowsplat.scene.gaussians import Gaussians
     from snowsplat.training.core.run import Loss
+    from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.part import Part
     from snowsplat.training.processes.shards import Shards
     from snowsplat.training.settings.config import TrainConfig
@@ -60,6 +64,51 @@ class Setup:
     config: TrainConfig
     schedule: Schedule | None = None
     checkpoint: Path | None = None  # the file of the state to continue from
+
+
+@dataclass(frozen=True)
+class Collective:
+    """The operations of a training that all its processes carry out together.
+
+    Process 0 calls the methods. Before each operation, it tells the other processes, which are in
+    `follow`, to do the same. A single process has nobody to tell. Each process has its own trainer.
+    """
+
+    trainer: Trainer
+
+    def scene(self) -> Gaussians:
+        """The Gaussians of all processes; the others than process 0 get no rows."""
+        self._tell("scene")
+        return self.trainer.shards.collect(self.trainer.gaussians)
+
+    def state(self) -> dict[str, Tensor]:
+        """See `Trainer.state_tensors`."""
+        self._tell("state")
+        return self.trainer.state_tensors()
+
+    def evaluate(self) -> Evaluation:
+        """See `Trainer.evaluate`."""
+        self._tell("evaluate")
+        return self.trainer.evaluate()
+
+    def stretch(self, step: int, iterations: int) -> None:
+        """See `Schedule.stretch`."""
+        self._tell("stretch", step, iterations)
+        self.trainer.schedule.stretch(step, iterations)
+
+    def proceed(self) -> None:
+        """Let the other processes go on with the next step, or end."""
+        self.trainer.shards.of_first(None)
+
+    def follow(self) -> None:
+        """Do what process 0 does, until it calls `proceed`; for the other processes."""
+        while (told := self.trainer.shards.of_first(None)) is not None:
+            name, *arguments = told
+            getattr(self, name)(*arguments)
+
+    def _tell(self, *operation: Any) -> None:
+        if self.trainer.shards.rank == 0:
+            self.trainer.shards.of_first(operation)
 
 
 def end_with_launcher() -> None:
@@ -127,7 +176,6 @@ def follow(
 ) -> None:
     """Take part in the training of process 0, until it ends; ``parts`` and ``loss`` as there."""
     from snowsplat.data import read_dataset
-    from snowsplat.pipeline.run.collective import Collective
     from snowsplat.training.core.checkpoint import load
     from snowsplat.training.core.trainer import Trainer
     from snowsplat.training.parts.list import parts_of

@@ -15,9 +15,9 @@ from snowsplat.evaluation.verdict import Verdict
 from snowsplat.pipeline.observer import Observer
 from snowsplat.pipeline.options.train import TrainOptions
 from snowsplat.pipeline.run.checkpoint_meta import CheckpointMeta
-from snowsplat.pipeline.run.collective import Collective
 from snowsplat.pipeline.run.live_page import LivePage
 from snowsplat.pipeline.run.photo_stamps import Stamp
+from snowsplat.pipeline.run.processes import Collective
 from snowsplat.pipeline.run.refined_cameras import write_refined
 from snowsplat.pipeline.run.train_result import TrainingStopped, TrainResult
 from snowsplat.pipeline.run.training_files import write_beginning, write_cameras, write_scene
