@@ -247,11 +247,12 @@ def test_masks_beside_the_images(dataset_copy):
         assert loader.get(views[1], 2).mask.all()
 
 
-def test_depth_maps_beside_the_images(dataset_copy):
+@pytest.mark.parametrize("name", ["depths", "depth", "depth_maps"])
+def test_depth_maps_beside_the_images(dataset_copy, name):
     folder = dataset_copy("colmap-bin")
-    (folder / "depths").mkdir()
-    for name in ("view_01.png", "view_02.png.npy", "view_03.txt"):
-        (folder / "depths" / name).touch()
+    (folder / name).mkdir()
+    for file in ("view_01.png", "view_02.png.npy", "view_03.txt"):
+        (folder / name / file).touch()
     views = load_dataset(folder, hold_out=None).train
     names = {view.name: view.depth and view.depth.name for view in views}
     assert {name: depth for name, depth in names.items() if depth} == {

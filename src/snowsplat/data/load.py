@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from snowsplat.data.dataset import Dataset, Points, PosedImage, View, scene_extent
+from snowsplat.data.files.listing import folders_of_maps
 from snowsplat.data.files.masks import with_masks
 from snowsplat.data.frame.move_to_origin import move_to_origin
 from snowsplat.data.frame.near import near_of
@@ -200,9 +201,10 @@ def _are_placeholder(points: Points) -> bool:
 def _with_maps(folder: Path, posed: list[PosedImage]) -> list[PosedImage]:
     """The same images, with ``depths/IMG.png`` and ``normals/IMG.png`` of the folder, or
     ``IMG.jpg.png``, or files of other formats, as maps of ``IMG.jpg``."""
-    if (depths := folder / "depths").is_dir():
+    depths, normals = folders_of_maps(folder)
+    if depths is not None:
         posed = [replace(image, depth=image.depth or _map_of(image, depths)) for image in posed]
-    if (normals := folder / "normals").is_dir():
+    if normals is not None:
         posed = [replace(image, normals=_map_of(image, normals)) for image in posed]
     return posed
 

@@ -1,8 +1,6 @@
 """Checkpoints of gsplat (`ckpt_29999_rank0.pt`): the tensors of its "splats", without optimizers.
 
-The file is a zip file of PyTorch: pickled metadata, `data.pkl`, and one uncompressed member per
-tensor. torch loads only weights, in a restricted unpickler that calls no code of the file, and maps
-the tensors into memory. The parameters are those of a PLY: logarithms of scales, quaternions wxyz,
+`torch_file` reads it. The parameters are those of a PLY: logarithms of scales, quaternions wxyz,
 logits of opacities, SH coefficients by order.
 """
 
@@ -18,20 +16,19 @@ import numpy as np
 from snowsplat.formats.archive import first_member
 from snowsplat.formats.damage import Damaged, Unsupported, reads
 from snowsplat.formats.gaussian_arrays import GaussianArrays, usable_gaussians
+from snowsplat.formats.torch_file import METADATA, Tensor, read_content, read_tensor
 from snowsplat.formats.zip_members import ZipMembers
 from snowsplat.scene.sh_constants import SH_REST_COUNTS
 
 logger = logging.getLogger(__name__)
 
-_METADATA = "data.pkl"
-_METADATA_LIMIT = 1 << 18  # bytes; unpickled values need more memory
 _NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 
 def is_checkpoint(head: bytes) -> bool:
     """Whether a file that begins with ``head`` was saved by PyTorch."""
     name = first_member(head)
-    return name is not None and (name == _METADATA or name.endswith(f"/{_METADATA}"))
+    return name is not None and (name == METADATA or name.endswith(f"/{METADATA}"))
 
 
 @reads
@@ -41,11 +38,13 @@ def read_checkpoint(path: Path) -> GaussianArrays:
     Raises: UserError: the file cannot be read, is damaged, or is another kind of checkpoint.
     """
     with ZipMembers(path) as members:
-        inner = [name for name in members.names() if name.endswith(_METADATA)]
-        if len(inner) != 1 or len(members.read(inner[0], 1)) > _METADATA_LIMIT:
-            raise Damaged("not a plausible checkpoint of PyTorch")
-    splats = _splats(_load(path))
-    arrays = [_array(path, splats[name]) for name in _NAMES if name in splats]
+        content, folder = read_content(members)
+        splats = _splats(content)
+        tensors = [splats[name] for name in _NAMES if name in splats]
+        if not all(isinstance(tensor, Tensor) for tensor in tensors):
+            raise Damaged("its splats are not tensors of numbers")
+        most = path.stat().st_size // 2
+        arrays = [read_tensor(members, folder, tensor, most) for tensor in tensors]
     means, scales, quats, opacities, sh0 = arrays[:5]
     n = len(means)
     shN = arrays[5] if len(arrays) > 5 else np.zeros((n, 0, 3), np.float32)
@@ -62,15 +61,6 @@ def read_checkpoint(path: Path) -> GaussianArrays:
     return usable_gaussians(
         path, means, scales, quats, opacities, sh0, shN[:, : SH_REST_COUNTS[-1]]
     )
-
-
-def _load(path: Path) -> Any:
-    import torch
-
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # the restricted unpickler raises errors of any type for damaged files
-        raise Damaged("a checkpoint that cannot be loaded safely, or a damaged one") from None
 
 
 def _splats(content: Any) -> dict[Any, Any]:
@@ -95,23 +85,6 @@ def _splats(content: Any) -> dict[Any, Any]:
         "splats); save a .ply in the program that made it",
         missing=", ".join(missing),
     )
-
-
-def _array(path: Path, tensor: Any) -> np.ndarray:
-    """A tensor as float32, or as float64 if it has doubles.
-
-    Raises: Damaged: not a tensor of floats, or larger than the file.
-    """
-    import torch
-
-    dense = isinstance(tensor, torch.Tensor) and tensor.layout == torch.strided
-    if not dense or tensor.device.type != "cpu" or not tensor.is_floating_point():
-        raise Damaged("its splats are not tensors of numbers")
-    if tensor.numel() * tensor.element_size() > path.stat().st_size:
-        raise Damaged("its tensors are larger than the file")
-    dtype = torch.float64 if tensor.dtype == torch.float64 else torch.float32
-    array: np.ndarray = tensor.detach().to(dtype).contiguous().numpy()
-    return array
 
 
 def _name_other_ranks(path: Path) -> None:

@@ -49,6 +49,8 @@ def describe(path: Path | str) -> dict[str, Any]:
     path = Path(path)
     if not path.exists():
         raise UserError("{path}: no such file or folder", path=path)
+    if not (path.is_file() or path.is_dir()):  # reading it may never end
+        raise UserError("{path}: is a pipe or a device; use a file", path=path)
     if path.suffix == ".safetensors":
         return _checkpoint(path)
     project = Project.open(path)

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from snowsplat.data.maps.mask_look import doubt_about_files
+from snowsplat.data.readers.projects import advice
 from snowsplat.pipeline.quality import PRESETS
 from snowsplat.project.left_out import LeftOut
 from snowsplat.sfm.colmap.options import thread_count
@@ -41,6 +42,9 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
     speed = measure_speed(thread_count(None))
     time = duration(predicted_seconds(photos, PRESETS["normal"].photos, "normal", speed))
     doubt = doubt_about_files([s.mask for s in sources.photos if s.mask is not None])
+    poses = message("none; to estimate them takes about {time}", time=time)
+    if (unread := advice(path)) is not None:
+        poses = message("{poses}; {unread}", poses=poses, unread=unread)
     return {
         "kind": "photos" if usable else "video",
         "path": str(path),
@@ -51,7 +55,7 @@ def describe_photos(sources: Sources) -> dict[str, Any]:
             [(shown(p), message("has no photo")) for p in sources.unused_masks], "unused_masks"
         ),
         **({} if doubt is None else {"doubtful": doubt}),
-        "camera_poses": message("none; to estimate them takes about {time}", time=time),
+        "camera_poses": poses,
         "next": f"snowsplat make {path}",
     }
 

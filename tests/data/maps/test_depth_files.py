@@ -35,6 +35,10 @@ def test_tiff_and_npy_files_of_floats(tmp_path):
     np.save(tmp_path / "map.npy", values[None].astype(np.float64))
     assert np.array_equal(read_depth_file(tmp_path / "map.tif"), values)
     assert np.array_equal(read_depth_file(tmp_path / "map.npy"), values)
+    for scale, order in ((-1.0, "<f4"), (1.0, ">f4")):  # PFM, from the bottom to the top
+        head = f"Pf\n{values.shape[1]} {values.shape[0]}\n{scale}\n".encode()
+        (tmp_path / "map.pfm").write_bytes(head + values[::-1].astype(order).tobytes())
+        assert np.array_equal(read_depth_file(tmp_path / "map.pfm"), values)
 
 
 @pytest.mark.parametrize("channel", ["Z", "Y"])
@@ -110,6 +114,7 @@ def test_files_that_are_no_depth_maps(tmp_path):
     Image.fromarray(np.zeros((4, 4), np.uint8)).convert("P").save(tmp_path / "palette.png")
     (tmp_path / "damaged.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     (tmp_path / "damaged.npy").write_bytes(b"\x93NUMPY\x01")
+    (tmp_path / "damaged.pfm").write_bytes(b"Pf\n3 4\n-1\n123")
     (tmp_path / "map.txt").write_text("1 2 3")
     for name, problem in {
         "photo.png": "one number per pixel",
@@ -118,6 +123,7 @@ def test_files_that_are_no_depth_maps(tmp_path):
         "objects.npy": "cannot be read",
         "damaged.png": "cannot be read",
         "damaged.npy": "cannot be read",
+        "damaged.pfm": "cannot be read",
         "map.txt": "unknown kind",
         "missing.png": "no such depth map",
     }.items():

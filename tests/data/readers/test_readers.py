@@ -11,6 +11,7 @@ import torch
 
 from snowsplat.data.load import load_dataset
 from snowsplat.data.readers import NoPosesError, find_poses, photo_folder, read_poses
+from snowsplat.data.readers.projects import advice
 from snowsplat.pipeline.describe import describe
 from snowsplat.util.errors import SettingError, UserError
 
@@ -315,6 +316,27 @@ def test_projects_that_are_not_readable_are_explained(name, tmp_path):
     (tmp_path / name).touch()
     with pytest.raises(NoPosesError, match=rf"{name} is .*; (export|convert|unpack)"):
         load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "program"),
+    [
+        ("pose/0.txt", "1 0 0 0\n0 1 0 0\n", "ScanNet and NSVF"),
+        ("groundtruth.txt", "# time x y z\n1.5 0 0 1 0 0 0 1\n", "TUM"),
+        ("poses.txt", "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI"),
+        ("a/b.txt", "1 0 0 0\n", None),
+        ("poses.txt", "poses: none\n", None),
+        ("A.xmp", "<x/>", None),
+        ("A.xmp", '<x xmlns:xcr="http://www.capturingreality.com/ns"/>', "RealityCapture"),
+        ("frame_0.json", '{"cameraPoseARFrame": []}', "3d Scanner App"),
+    ],
+)
+def test_poses_that_are_not_read_are_named(tmp_path, name, text, program):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(text)
+    found = advice(tmp_path)
+    assert (found is None) == (program is None)
+    assert program is None or f"{name!r} has camera poses in the layout of {program}" in str(found)
 
 
 def test_other_files_are_no_exports(tmp_path):

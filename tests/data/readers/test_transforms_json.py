@@ -278,6 +278,13 @@ def test_files_of_another_kind(tmp_path, text, message):
         load_dataset(tmp_path)
 
 
+def test_renders_in_a_format_that_is_not_read_are_named(scene, tmp_path):
+    folder = scene({"fl_x": 50}, [{"file_path": "r_0"}, {"file_path": "r_1"}], existing=())
+    (tmp_path / "r_0.exr").touch()
+    with pytest.raises(UserError, match=r"'r_0\.exr' is not read; convert them to PNG"):
+        load_dataset(folder)
+
+
 def test_the_same_image_twice(scene, caplog):
     """Is ignored; with another pose, only the first is used, and the other one is named."""
     twice = [{"file_path": "a.png"}, {"file_path": "./a.png"}, {}]

@@ -17,20 +17,9 @@ logger = logging.getLogger(__name__)
 # What is in a folder of this name. The name is compared without regard to case, and without "_" and
 # "." at its start and "_2", "_4" or "_8" at its end.
 _MASKS = re.compile(r"mask|(\w+_)?masks|(dynamic|images?)_mask|mask_images?")
-_MAPS = {
-    "depth",
-    "depths",
-    "depth_map",
-    "depth_maps",
-    "depthmaps",
-    "depth_images",
-    "confidence",
-    "confidences",
-    "confidence_maps",
-    "normal",
-    "normals",
-    "normal_maps",
-}
+_DEPTHS = ("depths", "depth", "depth_maps", "depth_map", "depthmaps", "depthmap", "depth_images")
+_NORMALS = ("normals", "normal", "normal_maps", "normal_map", "normalmaps", "normal_images")
+_MAPS = {*_DEPTHS, *_NORMALS, "confidence", "confidences", "confidence_maps"}
 _THUMBNAILS = {"thumb", "thumbs", "thumbnail", "thumbnails", "@eadir", "__macosx"}
 _DIVIDED = re.compile(r"(?P<original>.+)_[248]")
 #: Names of folders that say that there are photos inside, and not which ones.
@@ -69,6 +58,15 @@ def folder_kind(name: str) -> FolderKind:
     if name in _MAPS:
         return "maps"
     return "thumbnails" if name in _THUMBNAILS else "photos"
+
+
+def folders_of_maps(root: Path) -> tuple[Path | None, Path | None]:
+    """The folders of depth and of normal maps in a folder, by their usual names."""
+    depths, normals = (
+        next((root / name for name in names if (root / name).is_dir()), None)
+        for names in (_DEPTHS, _NORMALS)
+    )
+    return depths, normals
 
 
 def original_of(name: str, siblings: Iterable[str], *, divided: bool = True) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.safe_json import is_file
 
 #: Suffixes of the files that `read_map` reads.
-MAP_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
+MAP_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".pfm")
 
 #: Takes the channels of an EXR file by name, and returns the map; a KeyError if there is none.
 Pick = Callable[[Mapping[str, Any]], np.ndarray]
@@ -37,7 +38,7 @@ def read_map(path: Path, kind: str, pick: Pick) -> np.ndarray:
     """The values of a map, as stored, in an array of any shape and dtype.
 
     Args:
-        path: PNG, TIFF, NPY, or EXR, which needs the package OpenEXR.
+        path: PNG, TIFF, NPY, PFM, or EXR, which needs the package OpenEXR.
         kind: of the map, for messages, as "depth map".
 
     Raises:
@@ -58,6 +59,8 @@ def read_map(path: Path, kind: str, pick: Pick) -> np.ndarray:
             return _read_npy(path)
         if suffix == ".exr":
             return _read_exr(path, pick)
+        if suffix == ".pfm":
+            return _read_pfm(path)
         with open_image(path, ("PNG", "TIFF")) as image:
             if image.mode == "P":
                 raise Problem("it has a palette of colours; save the values")
@@ -78,6 +81,17 @@ def _read_npy(path: Path) -> np.ndarray:
     if values.size > 3 * MOST_PIXELS:
         raise Problem(TOO_LARGE)
     return np.array(values)
+
+
+def _read_pfm(path: Path) -> np.ndarray:
+    """PFM: the rows from the bottom to the top; a negative scale means little-endian."""
+    with open(path, "rb") as file:
+        kind, width, height, scale = b" ".join(file.readline(80) for _ in range(3)).split()
+        shape = (int(height), int(width), {b"Pf": 1, b"PF": 3}[kind])
+        if not 0 < shape[0] * shape[1] <= MOST_PIXELS:
+            raise Problem(TOO_LARGE)
+        values = np.fromfile(file, "<f4" if float(scale) < 0 else ">f4", math.prod(shape))
+    return values.reshape(shape)[::-1]
 
 
 def _read_exr(path: Path, pick: Pick) -> np.ndarray:
@@ -108,8 +122,8 @@ def _read_exr(path: Path, pick: Pick) -> np.ndarray:
 def read_depth_file(path: Path) -> np.ndarray:
     """The values of a depth map, as stored: (H, W) float32.
 
-    Reads PNG files of 8 or 16 bits, TIFF files (also of 32-bit floats), NPY files, and the channel
-    Z or the first grey channel of EXR files, which need the package OpenEXR.
+    Reads PNG files of 8 or 16 bits, TIFF files (also of 32-bit floats), NPY and PFM files, and the
+    channel Z or the first grey channel of EXR files, which need the package OpenEXR.
 
     Raises:
         UserError: the file is missing, damaged, not a map of one channel, or has no known suffix.

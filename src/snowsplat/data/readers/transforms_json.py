@@ -41,6 +41,7 @@ from snowsplat.data.readers.transforms_lens import is_panorama, lens_of, number_
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid, transform_points
 from snowsplat.util.errors import UserError
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import inside, is_file, quoted
 
 logger = logging.getLogger(__name__)
@@ -115,12 +116,17 @@ def read(files: list[Path], photos: PhotoFolder) -> Reconstruction:
     if not result.images:
         if not missing:
             raise UserError("{file}: it has no frames; check where the images are", file=files[0])
+        absent = root / safe_name(missing[0])
+        others = [file.name for file in absent.parent.glob("*") if file.stem == absent.stem]
+        problem = message("check where the images are")
+        if others:
+            problem = message("{file} is not read; convert them to PNG", file=quoted(others[0]))
         raise UserError(
-            "{file}: all of its {count} images are missing (the first is {first}); check where the "
-            "images are",
+            "{file}: all of its {count} images are missing (the first is {first}); {problem}",
             file=files[0],
             count=len(frames),
             first=quoted(missing[0]),
+            problem=problem,
         )
     warn_of_missing(root / shown, missing, len(frames))
     result.points = _points(root, first_scene)

@@ -1,6 +1,7 @@
 """Which files are photos, videos and masks, and their names in input/."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -197,3 +198,29 @@ def test_a_name_that_is_not_utf_8(tmp_path):
 def test_free_names_are_unique_if_case_is_ignored():
     wanted = ["a.jpg", "A.jpg", "b/a.jpg", "a.jpg", "a_2.jpg"]
     assert list(free_names(wanted)) == ["a.jpg", "A_2.jpg", "b/a.jpg", "a_3.jpg", "a_2_2.jpg"]
+
+
+def test_what_lies_beside_photos_is_told_by_name_and_content(tmp_path):
+    """As SLAM programs and apps write it; the same names of colour photos are photos."""
+    root = write_photos(tmp_path / "p", 3)
+    for i, path in enumerate(sorted(root.iterdir())):
+        path.rename(root / f"frame_{i:05}.jpg")
+        photo(i).save(root / f"frame_{i:05}_masked.jpg")
+        Image.new("I;16", (40, 30), 1000 + i).save(root / f"depth{i:05}.png")
+        Image.new("L", (40, 30), i).save(root / f"conf_{i:05}.png")
+        photo(i).resize((8, 6)).save(root / f"thumb_{i:02}.jpg")
+    photo(7).save(root / "depth_00001.jpg")
+    photo(8).save(root / "normal_00077.jpg")
+    (root / "a.insp").touch()
+    found = find_sources([root])
+    assert [s.name for s in found.files] == [
+        "depth_00001.jpg",
+        *(f"frame_{i:05}.jpg" for i in range(3)),
+        "normal_00077.jpg",
+    ]
+    told = {Path(each.photo).name: str(each.reason) for each in found.left_out}
+    assert told["depth00000.png"] == "is a depth map of another photo"
+    assert told["conf_00002.png"] == "is a confidence map of another photo"
+    assert told["thumb_01.jpg"] == "is a small copy of another photo"
+    assert told["frame_00001_masked.jpg"] == "is a changed copy of another photo"
+    assert "two lenses (INSP); export an equirectangular picture" in told["p"]

@@ -117,6 +117,10 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDAr
     return np.asarray(np.abs(first - second).mean(axis=0))
 
 
+# A track of video in an mp4 file: its width and height, 2 bytes each.
+_TRACKS = re.compile(rb"stsd.{12}(?:avc[13]|hvc1|hev1|av01).{24}(.{4})", re.DOTALL)
+
+
 def spherical_video(path: Path) -> str | None:
     """Whether the header of an mp4 file says that its frames show all directions.
 
@@ -131,7 +135,8 @@ def spherical_video(path: Path) -> str | None:
         return _version_2(header, at)
     if _SPHERICAL.search(header):
         return _TWO_EYES if _STEREO.search(header) else ""
-    return None
+    sizes = _TRACKS.findall(header)
+    return "has the pictures of two lenses" if len(sizes) > len(set(sizes)) else None
 
 
 def _version_2(header: bytes, at: int) -> str | None:

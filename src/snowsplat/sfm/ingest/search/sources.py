@@ -13,9 +13,11 @@ from snowsplat.data.files.listing import files_below, folder_kind, original_of
 from snowsplat.data.files.masks import FoundMasks, find_masks
 from snowsplat.data.photos.image_file import OPTIONAL_FORMATS
 from snowsplat.data.readers import photo_folder, poses_in
+from snowsplat.data.readers.projects import advice
 from snowsplat.project.left_out import LeftOut
 from snowsplat.project.project import is_output
 from snowsplat.sfm.ingest.photo import not_used
+from snowsplat.sfm.ingest.photos.photo_files import Unusable, open_image
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
 from snowsplat.sfm.ingest.search.names import free_name
@@ -41,22 +43,26 @@ VIDEO_SUFFIXES = _suffixes(
 # Formats that are not read, first raw photos: the user should learn that such photos are not used.
 _UNREAD = (
     "dng cr2 cr3 crw nef nrw arw srf sr2 orf rw2 raf pef srw x3f raw iiq 3fr fff gpr rwl "
-    "avif jxl jp2 j2k jpx jpf jxr psd psb exr hdr tga"
+    "avif jxl jp2 j2k jpx jpf jxr psd psb exr hdr tga insp"
 )
 _UNREAD_SUFFIXES = frozenset(
     f".{name}" for name in _UNREAD.split() if name.upper() not in OPTIONAL_FORMATS
 )
 # Folders in a dataset in which programs keep models of all its images.
 _MODEL_FOLDERS = ("sparse", "dense", "colmap", "opensfm")
-# The name of a map of a photo: IMG_depth.png, r_0_depth_0001.png.
-_MAP = re.compile(
-    r"(?P<stem>.+)[._-](?P<kind>depth|confidence|normal|disparity)s?(?:[._-]?\d+)?\.\w+", re.I
-)
+# The name of what belongs to a photo: IMG_depth.png, r_0_depth_0001.png; depth_0001.png of
+# frame_0001.jpg, thumb_01.jpg.
+_KINDS = r"(?P<kind>depth|conf(?:idence)?|normal|disparity|masked|thumb(?:nail)?)s?"
+_MAP = re.compile(rf"(?P<stem>.+)[._-]{_KINDS}(?:[._-]?\d+)?\.\w+", re.I)
+_NUMBERED_MAP = re.compile(rf"(?:.*/)?{_KINDS}[._-]?(?P<number>\d+)\.\w+", re.I)
+_NUMBERED = re.compile(r".*?(?P<number>\d+)\.\w+")
 _KINDS_OF_MAPS = {
     "depth": message("is a depth map of another photo"),
-    "confidence": message("is a confidence map of another photo"),
+    "conf": message("is a confidence map of another photo"),
     "normal": message("is a normal map of another photo"),
     "disparity": message("is a disparity map of another photo"),
+    "masked": message("is a changed copy of another photo"),
+    "thumb": message("is a small copy of another photo"),
 }
 
 
@@ -168,6 +174,8 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
                 f"{shown(path)}: a capture of {program} without camera poses; the photos "
                 f"in {shown(photos.relative_to(path).as_posix())} are used"
             )
+        elif (unread := advice(path)) is not None:
+            notes.append(f"{shown(path)}: {unread}")
         photos_in = _photos_of_dataset(path)
         found = _search(photos_in)
         chosen = photos_or_films(photos_in, found.photos, found.videos)
@@ -225,7 +233,7 @@ def _search(root: Path) -> _Folder:
     no_views = {
         name: message("is the same picture as {photo}", photo=used) for name, used in copies.items()
     }
-    no_views |= _maps_beside(photos)
+    no_views |= _maps_beside(root, photos)
     found.left_out += [not_used(root / name, reason) for name, reason in no_views.items()]
     photos = [photo for photo in photos if photo not in no_views]
     found.masks = find_masks(root, photos)
@@ -252,6 +260,12 @@ def _unread_photos(files: Iterable[str], read: Sequence[str]) -> Message | None:
     )
     if not counts:
         return None
+    if counts["INSP"]:
+        return plural(
+            "has {n} photo of two lenses (INSP); export an equirectangular picture of it first",
+            "has {n} photos of two lenses (INSP); export equirectangular pictures of them first",
+            n=counts["INSP"],
+        )
     listed = " and ".join(f"{count:,} {name}" for name, count in counts.most_common())
     return plural(
         "has {listed} photo, which cannot be read; save it as JPEG or PNG first",
@@ -301,15 +315,45 @@ def _is_video_name(file: str) -> bool:
     return PurePosixPath(file).suffix.lower() in VIDEO_SUFFIXES
 
 
-def _maps_beside(photos: Sequence[str]) -> dict[str, Message]:
-    """Photos that are maps by their names, as IMG_depth.png beside IMG.jpg, and what they are."""
+def _maps_beside(root: Path, photos: Sequence[str]) -> dict[str, Message]:
+    """Photos that are maps or copies by their names, and what they are: IMG_depth.png beside
+    IMG.jpg; depth_01.png beside frame_01.jpg, if it has one channel or is smaller than half."""
     stems = {str(PurePosixPath(photo).with_suffix("")) for photo in photos}
-    matches = {photo: _MAP.fullmatch(photo) for photo in photos}
-    return {
-        photo: _KINDS_OF_MAPS[match["kind"].lower()]
-        for photo, match in matches.items()
-        if match is not None and match["stem"] in stems
+    maps = {photo: m for photo in photos if (m := _NUMBERED_MAP.fullmatch(photo))}
+    numbered = {photo: m for photo in photos if (m := _NUMBERED.fullmatch(photo))}
+    others = {
+        (PurePosixPath(photo).parent, int(match["number"])): photo
+        for photo, match in numbered.items()
+        if photo not in maps
     }
+    found = {}
+    for photo in photos:
+        match = _MAP.fullmatch(photo)
+        if match is None or match["stem"] not in stems:
+            match = maps.get(photo)
+            key = match and (PurePosixPath(photo).parent, int(match["number"]))
+            if (
+                match is None
+                or key not in others
+                or not _is_lesser(root / photo, root / others[key])
+            ):
+                continue
+        kind = next(kind for kind in _KINDS_OF_MAPS if match["kind"].lower().startswith(kind))
+        found[photo] = _KINDS_OF_MAPS[kind]
+    return found
+
+
+def _is_lesser(path: Path, photo: Path) -> bool:
+    """Whether an image has one channel, or is smaller than half of a photo."""
+    try:
+        with (
+            open_image(path, header_only=True) as image,
+            open_image(photo, header_only=True) as other,
+        ):
+            grey = len(image.getbands()) == 1 and image.mode != "P" and len(other.getbands()) > 1
+            return grey or 2 * max(image.size) < max(other.size)
+    except (Unusable, OSError, ValueError):
+        return False
 
 
 def _photos_of_dataset(root: Path) -> Path:
