@@ -8,12 +8,16 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
+from torch import Tensor
 
 from snowsplat.data.dataset import Dataset
 from snowsplat.data.photos import image_loader
-from snowsplat.data.photos.decode import load_views
+from snowsplat.data.photos.decode import ImageSource, load_views
+from snowsplat.data.photos.image_loader import ImageLoader
 from snowsplat.ops.native import LAUNCHERS
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.parts.near_limit import NearLimit
@@ -22,10 +26,11 @@ from snowsplat.training.parts.sky import INTERVAL, SkyPart
 from snowsplat.training.parts.transients import Transients
 from snowsplat.training.settings.config import TrainConfig
 from snowsplat.training.settings.recipes import recipe
+from snowsplat.training.starts.init import initial_gaussians
 from snowsplat.util.native_layout import Fields
 
 from ..pretended_gpu import pretended_gpu
-from . import test_sky
+from . import sphere, test_sky
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +90,26 @@ def test_the_first_scene_and_the_masks_are_those_of_the_cpu(
         found.part(Transients).masks, expected.part(Transients).masks, strict=True
     ):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("start", ["depth", "random", "sweep"])
+def test_other_starts_and_masks(
+    tmp_path: Path, start: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = sphere.dataset(tmp_path)
+    levels = np.full((sphere.SIZE, sphere.SIZE), 255, np.uint8)
+    levels[: sphere.SIZE // 3] = 0
+    Image.fromarray(levels).save(tmp_path / "mask.png")
+    mask = ImageSource(tmp_path / "mask.png", sphere.SIZE, sphere.SIZE)
+    data = replace(data, train=[replace(view, mask=mask) for view in data.train])
+    settings = replace(TrainConfig(), init=start, initial_points=300)
+
+    def first(device: torch.device) -> Tensor:
+        with ImageLoader(data.train, device=device) as images:
+            generator = torch.Generator().manual_seed(0)
+            return initial_gaussians(data, settings, images, generator, device).means.cpu()
+
+    expected = first(torch.device("cpu"))
+    with pretended_gpu(monkeypatch) as device:
+        found = first(device)
+    assert torch.equal(found, expected)
