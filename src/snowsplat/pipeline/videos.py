@@ -90,17 +90,8 @@ def render_video(
     if options.projection == "equirectangular":
         around = PanoramaRenderer(panorama_width(options.size), device)
         cameras = level_cameras(cameras)
-    video = Video(
-        gaussians=gaussians,
-        cameras=cameras,
-        around=around,
-        background=source.background,
-        file=source.file if target is None else Path(target),
-        fps=options.fps,
-        depth=options.depth,
-        side_by_side=options.side_by_side,
-    )
-    return video.write(observer)
+    file = source.file if target is None else Path(target)
+    return _Video(options, gaussians, cameras, around, source.background, file).write(observer)
 
 
 @dataclass(frozen=True)
@@ -193,20 +184,22 @@ def _in_frame_of(gaussians: Gaussians, cameras: list[Camera]) -> list[Camera]:
 
 
 @dataclass(frozen=True)
-class Video:
+class _Video:
     """A video to be rendered."""
 
+    options: VideoOptions
     gaussians: Gaussians
     cameras: Sequence[Camera]  # one per frame, all of the same size; width and height are even
     # Renders all directions from the places of the cameras; None: what the cameras see.
     around: PanoramaRenderer | None
     background: tuple[float, float, float]
     file: Path  # the file of the colour video; that of the depth has _depth in its name
-    fps: float
-    depth: bool  # also render a video of the depth
-    side_by_side: bool  # one video instead, with colour on the left and depth on the right
 
-    def write(self, observer: Observer = SILENT) -> list[Path]:
+    @property
+    def with_depth(self) -> bool:
+        return self.options.depth or self.options.side_by_side
+
+    def write(self, observer: Observer) -> list[Path]:
         """Render and write; returns the files. Raises: UserError: a file cannot be written."""
         first = self.around or self.cameras[0]
         width, height = first.width, first.height
@@ -220,7 +213,7 @@ class Video:
             around = self.around is not None
             adds = [
                 stack.enter_context(
-                    video_writer(file, factor * width, height, self.fps, panorama=around)
+                    video_writer(file, factor * width, height, self.options.fps, panorama=around)
                 )
                 for file, factor in files
             ]
@@ -238,32 +231,32 @@ class Video:
 
     def _files(self) -> list[tuple[Path, int]]:
         """For each video: its file, and the number of images in a frame (2 if side by side)."""
-        if self.side_by_side:
+        if self.options.side_by_side:
             return [(self.file, 2)]
         depth = self.file.with_name(f"{self.file.stem}_depth{self.file.suffix}")
-        return [(self.file, 1), (depth, 1)] if self.depth else [(self.file, 1)]
+        return [(self.file, 1), (depth, 1)] if self.options.depth else [(self.file, 1)]
 
     def _frame(self, camera: Camera, near: float, far: float) -> list[np.ndarray]:
         color, depth = self._render(camera)
         if depth is None:
             return [color]
         shown = image_files.depth_in_color(depth, near, far)
-        return [np.concatenate([color, shown], axis=1)] if self.side_by_side else [color, shown]
+        beside = self.options.side_by_side
+        return [np.concatenate([color, shown], axis=1)] if beside else [color, shown]
 
     def _depth_range(self) -> tuple[float, float]:
         """One range of depths for the whole video, so that its colours do not flicker."""
-        if not (self.depth or self.side_by_side):
+        if not self.with_depth:
             return 1.0, 2.0
         sample = self.cameras[:: -(-len(self.cameras) // _RANGE_FRAMES)]
         depths = (self._render(camera)[1] for camera in sample)
         return image_files.depth_range([depth for depth in depths if depth is not None])
 
     def _render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray | None]:
-        with_depth = self.depth or self.side_by_side
         background = torch.tensor(self.background)
         if self.around is not None:
             pose = camera.cam_from_world
             return to_8bit(self.around.render(self.gaussians, pose, background)), None
-        output = render(self.gaussians, camera, background, with_depth=with_depth)
+        output = render(self.gaussians, camera, background, with_depth=self.with_depth)
         depth = None if output.depth is None else image_files.mean_depth(output.depth, output.alpha)
         return to_8bit(output.image), depth

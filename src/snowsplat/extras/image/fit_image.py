@@ -25,10 +25,11 @@ from snowsplat.pipeline.output.image_files import write_png
 from snowsplat.scene.pixels import to_8bit
 from snowsplat.training.core.progress import Progress
 from snowsplat.trajectory.video_file import video_writer
-from snowsplat.util.errors import SettingError, UserError
+from snowsplat.util.errors import UserError
 from snowsplat.util.files import write_json
 from snowsplat.util.messages import message
 from snowsplat.util.process import single_threaded
+from snowsplat.util.settings import Setting, checked
 
 #: The files that `fit_image` writes to the output folder, and what they contain.
 FILES = {
@@ -39,7 +40,7 @@ FILES = {
     "metrics.json": message("PSNR and SSIM, and their course"),
     "report.html": message("this page"),
 }
-_SIDES = (8, 8192)  # pixels along the longer side
+_SIZE = Setting(least=8, most=8192)  # pixels along the longer side
 _VIDEO_SECONDS, _VIDEO_FPS = 5, 24
 _VIDEO_HOLD = 24  # frames in which the result is shown at the end
 _VIDEO_LEAST_SIDE = 480  # pixels along the longer side
@@ -95,7 +96,7 @@ def fit_image(
         OSError: a file cannot be written.
     """
     options, photo, output = options or FitOptions(), Path(photo), Path(output)
-    _check_size(size)
+    checked("size", size, int, _SIZE)
     if output.exists() and not output.is_dir():
         raise UserError("{output}: is a file; use a folder for the output", output=output)
     if (output / "metrics.json").exists() and not overwrite:
@@ -160,23 +161,11 @@ def decode_image(
     gaussians = read_compact(Path(compact))
     scale = 1.0
     if size is not None:
-        _check_size(size)
+        checked("size", size, int, _SIZE)
         scale = size / max(gaussians.width, gaussians.height)
     image = gaussians.render(scale)
     write_png(Path(target), to_8bit(image))
     return image.shape[1], image.shape[0]
-
-
-def _check_size(size: int) -> None:
-    least, most = _SIDES
-    if not least <= size <= most:
-        raise SettingError(
-            "size",
-            "{size} is out of range; use {least} to {most} pixels",
-            size=size,
-            least=least,
-            most=most,
-        )
 
 
 def load_photo(photo: Path, size: int) -> Tensor:

@@ -34,10 +34,11 @@ from snowsplat.trajectory.orbit import swing_path
 from snowsplat.trajectory.video_file import video_writer
 from snowsplat.util.errors import SettingError, UserError
 from snowsplat.util.files import write_json
+from snowsplat.util.settings import Setting, checked
 
 #: The folder of the dataset that `lift_photo` writes: the photo and its camera.
 PHOTO = "photo"
-_SIDES = (32, 4096)  # pixels along the longer side
+_SIZE = Setting(least=32, most=4096)  # pixels along the longer side
 # 35 mm equivalent of the focal length that is assumed without EXIF data: the main camera of phones.
 _USUAL_FOCAL = 28.0
 _FULL_FRAME_DIAGONAL = 43.2666  # mm, of 36×24
@@ -149,15 +150,7 @@ def read_photo(path: Path, size: int, focal: float | None) -> tuple[Tensor, Came
     Transparent photos are composited over white. The pose is the identity.
     Raises: UserError: see `lift_photo`.
     """
-    least, most = _SIDES
-    if not least <= size <= most:
-        raise SettingError(
-            "size",
-            "{size} is out of range; use {least} to {most} pixels",
-            size=size,
-            least=least,
-            most=most,
-        )
+    checked("size", size, int, _SIZE)
     if focal is not None and not 0.0 < focal < math.inf:
         raise SettingError(
             "focal", "{focal:g} is not a focal length; use one in pixels", focal=focal
