@@ -228,32 +228,38 @@ def resize_area(planes: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def resize_area_on_gpu(planes: Tensor, width: int, height: int) -> Tensor:
     """As `resize_area`, with the same values: each number is rounded in the same operations."""
-    old_height, old_width = planes.shape[1:]
+    channels, old_height, old_width = planes.shape
     if (old_width, old_height) == (width, height):
         return planes
     rows, columns = old_height // height, old_width // width
     if (rows * height, columns * width) == (old_height, old_width):
-        boxes = planes.reshape(-1, height, rows, width, columns)
         area = rows * columns
+        sums = torch.full_like(planes[:, ::rows, ::columns], area // 2, dtype=torch.int64)
+        for place in range(area):
+            sums += planes[:, place // columns :: rows, place % columns :: columns]
         # Pillow divides by a product with 2²⁴ / area, rounded down.
-        sums = boxes.sum((2, 4), dtype=torch.int64) + area // 2
         return (sums * ((1 << 24) // area) >> 24).to(torch.uint8)
-    transposed = planes.to(torch.float64).transpose(1, 2).contiguous()
-    means = _mean_over_rows(transposed, width).transpose(1, 2).contiguous()
-    return _mean_over_rows(means, height).round().to(torch.uint8)
+    means = _mean_over_rows(planes.permute(2, 0, 1).reshape(old_width, -1), width)
+    means = means.reshape(width, channels, old_height).permute(2, 1, 0).reshape(old_height, -1)
+    resized = _mean_over_rows(means, height).round().to(torch.uint8)
+    return resized.reshape(height, channels, width).transpose(0, 1).contiguous()
 
 
 def _mean_over_rows(values: Tensor, count: int) -> Tensor:
-    """(C, H, W) float64 to (C, count, W): means over equal intervals of each column."""
-    size = values.shape[1]
+    """(H, W) to (count, W) float64: means over equal intervals of each column."""
+    size = len(values)
     edges = np.arange(count + 1) * (size / count)
     whole = np.minimum(edges.astype(np.int64), size - 1)
     part = torch.from_numpy(edges - whole).to(values.device)[:, None]
     at = torch.from_numpy(whole).to(values.device)
-    # A GPU adds up along this dimension from the first row to the last one.
-    integral = pad(values.cumsum(1), (0, 0, 1, 0))
-    at_edges = integral[:, at] + part * values[:, at]
-    return at_edges.diff(dim=1) * (count / size)
+    means = []
+    for band in values.split(max(1, _BAND_PIXELS // size), 1):
+        band = band.to(torch.float64)
+        # A GPU adds up along the first dimension from the first row to the last one.
+        integral = pad(band.cumsum(0), (0, 0, 1, 0))
+        at_edges = integral[at] + part * band[at]
+        means.append(at_edges.diff(dim=0) * (count / size))
+    return torch.cat(means, 1)
 
 
 def _decode(source: ImageSource, background: Sequence[float] | None) -> np.ndarray:

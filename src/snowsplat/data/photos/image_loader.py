@@ -206,11 +206,11 @@ class ImageLoader:
         """Images of views of one photo, at one downscale factor."""
         with self._lock:
             whole = [self._cache.get((source, mask, 1)) for source, mask, _ in keys]
-        if any(image is None for image in whole):
+        if any(image is None or image.planes.device.type != "cpu" for image in whole):
             sources = [(source, mask) for source, mask, _ in keys]
             whole = [*load_views(sources, self._background)]
         factor = keys[0][2]
-        return [box_downscale(image.to(self.device), factor) for image in whole if image]
+        return [box_downscale(image, factor).to(self.device) for image in whole if image]
 
     def _fits(self, *factors: int) -> bool:
         """Whether all views stay in the cache at these sizes, so that no work is done in vain."""
