@@ -16,6 +16,10 @@ FROM ${BASE} AS python
 RUN apt-get update && apt-get install -y --no-install-recommends python3-venv && \
     rm -rf /var/lib/apt/lists/* && python3 -m venv /opt/snowsplat
 ENV PATH=/opt/snowsplat/bin:$PATH
+# Not root: what parses strangers' photos has no rights in the container. `docker run --user` names the
+# user whom the files belong to; HOME is writable for all users.
+RUN useradd --uid 1000 --create-home snowsplat && chmod 777 /home/snowsplat
+ENV HOME=/home/snowsplat
 WORKDIR /work
 ENTRYPOINT ["snowsplat"]
 CMD ["--help"]
@@ -23,6 +27,7 @@ CMD ["--help"]
 FROM python AS gpu
 RUN --mount=type=bind,from=wheel,source=/wheel,target=/wheel \
     pip install --no-cache-dir /wheel/snowsplat-*.whl
+USER snowsplat
 
 FROM python AS cpu
 # Empty: the default build of PyTorch.
@@ -32,3 +37,4 @@ RUN --mount=type=bind,from=wheel,source=/wheel,target=/wheel \
     uv pip install --no-cache --python /opt/snowsplat/bin/python \
         ${TORCH_BACKEND:+--torch-backend=${TORCH_BACKEND}} /wheel/snowsplat-*.whl && \
     pip uninstall --yes uv
+USER snowsplat
