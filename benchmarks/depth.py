@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from tests.scenes.depth import depth_map
 from torch.nn.functional import interpolate, normalize
 
 from snowsplat import Trainer, load_dataset, recipe
@@ -31,7 +32,7 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.scene.render import render
 from snowsplat.scene.surface_normals import normals_of_depth
-from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
 from snowsplat.synthetic.still_life import still_life
 from snowsplat.training.parts.normal_supervision import NormalSupervision
 

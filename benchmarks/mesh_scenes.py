@@ -15,6 +15,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tests.scenes.depth import depth_map
 from tests.scenes.street import street
 from tests.scenes.street_dataset import DATASET_FROM_SCENE, walk_along
 
@@ -22,7 +23,7 @@ from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import compose_rigid, invert_rigid, look_at
 from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import depth_map, take_photos, walk
+from snowsplat.synthetic.photographer import take_photos, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 

@@ -27,12 +27,13 @@ from snowsplat.data.colmap.model import write_posed
 from snowsplat.data.lens.models import lens_of
 from snowsplat.scene.geometry import invert_rigid
 from snowsplat.synthetic.lens import Lens
-from snowsplat.synthetic.photographer import depth_map, phone_lens, take_photos, walk
+from snowsplat.synthetic.photographer import phone_lens, take_photos, walk
 from snowsplat.synthetic.scene import Scene
 from snowsplat.synthetic.still_life import still_life
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.scenes.depth import depth_map
 from tests.scenes.passer_by import chosen_photos, passers_by
 from tests.scenes.shutter import shooting
 

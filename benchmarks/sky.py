@@ -35,6 +35,7 @@ from snowsplat.synthetic.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.scenes.depth import distances
 from tests.scenes.street import street
 from tests.scenes.street_dataset import DATASET_FROM_SCENE, write_street_dataset
 
@@ -58,7 +59,7 @@ def surface_distances(scene: Scene, camera: Camera) -> Tensor:
     pose = camera.world_from_cam.numpy()
     directions = scene_from_dataset @ pose[:, :3] @ (rays / np.linalg.norm(rays, axis=0))
     origin = scene_from_dataset @ pose[:, 3:]
-    found = scene.distances(origin.astype(np.float32), directions.astype(np.float32))
+    found = distances(scene, origin.astype(np.float32), directions.astype(np.float32))
     return torch.from_numpy(found.reshape(camera.height, camera.width))
 
 

@@ -24,10 +24,12 @@ from snowsplat.sfm.progress import Report, silent
 from snowsplat.synthetic import textures as paint
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import depth_map, roll, take_photos
+from snowsplat.synthetic.photographer import roll, take_photos
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
+from .depth import depth_map
+from .glass import GlassScene
 from .passer_by import figure
 from .shutter import Shutter, shooting
 from .street_dataset import DATASET_FROM_SCENE
@@ -136,7 +138,7 @@ def hall(gloss: bool, seed: int = 0) -> Scene:
     if gloss:
         case = Box((0, 0, _EYES + 0.02), (0.62, 0.62, 0.86), 0.4)
         clear = np.zeros((16, 16, 3), np.float32)
-        objects.append(SceneObject(case, [clear], gloss=0.08, glass=True))
+        return GlassScene(objects, [SceneObject(case, [clear], gloss=0.08)], _LAMP)
     return Scene(objects, _LAMP)
 
 

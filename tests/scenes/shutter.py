@@ -14,6 +14,8 @@ from snowsplat.synthetic.lens import CentredLens
 from snowsplat.synthetic.photographer import RAYS, develop, tiles
 from snowsplat.synthetic.scene import Scene
 
+from .depth import distances
+
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples are evenly distributed in time
 
 
@@ -62,7 +64,7 @@ def photograph(
         found = scene.radiance(origin, directions, spread)
         if passing is not None:
             start = origin - moved
-            near = passing.distances(start, directions) < scene.distances(origin, directions)
+            near = distances(passing, start, directions) < distances(scene, origin, directions)
             found = np.where(near, passing.radiance(start, directions, spread), found)
         return found.clip(0, 1)
 

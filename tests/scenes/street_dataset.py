@@ -18,6 +18,7 @@ from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.photographer import roll, take_photos
 from snowsplat.synthetic.scene import Scene
 
+from .depth import distances
 from .street import HALF_WIDTH, street
 
 #: Metres of the street per photo.
@@ -110,7 +111,7 @@ def _points(
     rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
     pixels = random.uniform(0, (lens.width, lens.height), (count, 2))
     directions = rotation @ lens.directions(pixels.T).astype(np.float32)
-    distance = scene.distances(origin, directions)
+    distance = distances(scene, origin, directions)
     xyz = (origin + distance * directions).T
     x, y = xyz[:, 0], xyz[:, 1]
     real = (distance < _FAR) & (np.abs(y) < HALF_WIDTH + 1) & (x > -8) & (x < length + 8)

@@ -8,9 +8,10 @@ import torch
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import depth_map
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
+
+from ..scenes.depth import depth_map
 
 WHITE = np.full((8, 8, 3), 0.8, np.float32)
 LAMP = Lamp((0.0, 0.0, 3.0), (0.5, 0.5), 1.0, 0.5)

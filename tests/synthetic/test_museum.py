@@ -12,6 +12,7 @@ from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
 
+from ..scenes.glass import GlassScene
 from ..scenes.museum import Museum, write_museum_dataset
 from ..scenes.shutter import Shutter, photograph
 
@@ -26,9 +27,14 @@ def ball(x: float, z: float, radius: float) -> SceneObject:
     )
 
 
-def photo(objects: list[SceneObject], passing: Scene | None = None, **shutter: float) -> np.ndarray:
+def photo(
+    objects: list[SceneObject],
+    passing: Scene | None = None,
+    panes: tuple[SceneObject, ...] = (),
+    **shutter: float,
+) -> np.ndarray:
     """(H, W) linear light, without visible noise."""
-    scene = Scene(objects or [ball(0.0, -9.0, 0.1)], LAMP)
+    scene = GlassScene(objects or [ball(0.0, -9.0, 0.1)], panes, LAMP)
     used = Shutter(samples=64, **shutter) if shutter else None
     pixels = photograph(scene, LENS, AHEAD, np.random.default_rng(0), passing, used) / 255.0
     return (pixels.mean(axis=2) ** 2.2) / 0.8**2.2
@@ -66,13 +72,13 @@ def test_what_moves_is_drawn_out_by_its_motion():
 def test_glass_shows_what_is_behind_it_and_reflects_what_is_before_it():
     behind, before = ball(0.0, 6.0, 0.4), ball(0.6, -6.0, 0.4)
     pane = SceneObject(
-        Box((0, 0, 3.0), (4.0, 4.0, 0.1)), [np.zeros((8, 8, 3), np.float32)], gloss=0.2, glass=True
+        Box((0, 0, 3.0), (4.0, 4.0, 0.1)), [np.zeros((8, 8, 3), np.float32)], gloss=0.2
     )
-    open_, closed = photo([behind, before]), photo([behind, before, pane])
+    open_, closed = photo([behind, before]), photo([behind, before], panes=(pane,))
     assert closed[45, 60] == pytest.approx(0.8 * open_[45, 60], abs=0.03)
     # The mirror image is at z = 2 · 2.95 + 6 and x = 0.6.
     column = 60 + round(150 * 0.6 / 11.9)
-    outside = photo([before, pane])
+    outside = photo([before], panes=(pane,))
     assert outside[45, column] == pytest.approx(0.2, abs=0.03)
     assert photo([before]).max() < 0.01
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import depth_map, phone_lens, walk
+from snowsplat.synthetic.photographer import phone_lens, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box
 
+from ..scenes.depth import depth_map
 from ..scenes.passer_by import chosen_photos, passers_by
 from ..scenes.shutter import photograph
 

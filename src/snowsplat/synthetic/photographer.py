@@ -172,16 +172,6 @@ def develop(light: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return np.rint(255 * srgb).astype(np.uint8)
 
 
-def depth_map(scene: Scene, lens: Lens, cam_from_world: Tensor) -> np.ndarray:
-    """(H, W) float32: camera z at the centres of the pixels, metres; infinite without a hit."""
-    world_from_cam = invert_rigid(cam_from_world).numpy()
-    rotation, origin = np.split(world_from_cam.astype(np.float32), [3], axis=1)
-    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    rays = lens.directions(np.stack([x.ravel(), y.ravel()])).astype(np.float32)
-    z = scene.distances(origin, rotation @ rays) * rays[2]
-    return z.reshape(lens.height, lens.width)
-
-
 @functools.lru_cache(1)
 def tiles(lens: CentredLens) -> list[tuple[slice, slice, np.ndarray]]:
     """Tiles of the image: rows, columns, and the directions (3, R) of their rays."""

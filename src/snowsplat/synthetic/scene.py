@@ -3,7 +3,7 @@
 The lamp does not move and most surfaces are matt, so the radiance of a point does not depend on the
 viewing direction. Direct light with soft shadows and ambient light with occlusion are computed once
 (`light`) and multiplied into the textures. Then a ray needs only an intersection and a texture
-look-up. Only gloss and glass depend on the viewing direction and need one reflected ray.
+look-up. Only gloss depends on the viewing direction and needs one reflected ray.
 """
 
 from __future__ import annotations
@@ -31,20 +31,16 @@ class SceneObject:
     paint: Sequence[np.ndarray]  # one for each face, or one for all: sRGB (H, W, 3), 0 to 1
     gloss: float = 0.0  # reflectance at normal incidence (Schlick's approximation)
     emissive: bool = False  # whether it radiates the colour of its texture; then it casts no shadow
-    glass: bool = False  # whether it shows what is behind it, and reflects; it casts no shadow
 
 
 class Scene:
     """A lit scene. `radiance` returns linear light, in which 1 is white in a photo."""
 
     def __init__(self, objects: Sequence[SceneObject], lamp: Lamp) -> None:
-        self._shapes = [item.shape for item in objects]
+        self.shapes = [item.shape for item in objects]
         self._gloss = np.array([item.gloss for item in objects], np.float32)
-        self._panes = frozenset(i for i, item in enumerate(objects) if item.glass)
         blockers = [
-            item.shape
-            for item in objects
-            if math.isfinite(item.shape.radius) and not (item.emissive or item.glass)
+            item.shape for item in objects if math.isfinite(item.shape.radius) and not item.emissive
         ]  # infinite shapes are rooms, whose walls cast no shadow on the objects inside
         textures: list[np.ndarray] = []
         texels, wraps, firsts = [], [], []
@@ -90,19 +86,10 @@ class Scene:
         for start in range(0, directions.shape[1], _BLOCK):
             block = slice(start, start + _BLOCK)
             own = origins if origins.shape[1] == 1 else origins[:, block]
-            result[:, block] = self._block(own, directions[:, block], spread, mirrored=True)
+            result[:, block] = self.block(own, directions[:, block], spread, mirrored=True)
         return result
 
-    def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distances (R,) float32 to the first hits along rays, in metres; infinite without a hit.
-
-        Glass is no hit. ``origins`` and ``directions``: see `radiance`.
-        """
-        candidates = self._candidates(origins, directions)
-        solid = [i for i in candidates if i not in self._panes]
-        return self._nearest(origins, directions, solid)[0]
-
-    def _nearest(
+    def nearest(
         self, origins: np.ndarray, directions: np.ndarray, candidates: Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distances (R,) to the first hits, and the indices (R,) of their shapes; -1: no hit."""
@@ -110,25 +97,25 @@ class Scene:
         nearest = np.full(count, np.inf, np.float32)
         owner = np.full(count, -1)
         for i in candidates:
-            distance = self._shapes[i].hit(origins, directions)
+            distance = self.shapes[i].hit(origins, directions)
             closer = distance < nearest
             np.copyto(nearest, distance, where=closer)
             owner[closer] = i
         return nearest, owner
 
-    def _block(
+    def block(
         self, origins: np.ndarray, directions: np.ndarray, spread: float, mirrored: bool
     ) -> np.ndarray:
+        """`radiance` of rays that are computed at once; ``mirrored``: surfaces reflect."""
         count = directions.shape[1]
-        every = self._candidates(origins, directions)
-        candidates = [i for i in every if i not in self._panes]
-        nearest, owner = self._nearest(origins, directions, candidates)
+        candidates = self.candidates(origins, directions)
+        nearest, owner = self.nearest(origins, directions, candidates)
         positions = origins + np.where(owner >= 0, nearest, 0) * directions
         texture = np.zeros(count, np.int64)
         uv, normals = np.zeros((2, count), np.float32), np.zeros_like(directions)
         for i in candidates:
             own = np.flatnonzero(owner == i)
-            face, uv[:, own], normals[:, own] = self._shapes[i].surface(positions[:, own])
+            face, uv[:, own], normals[:, own] = self.shapes[i].surface(positions[:, own])
             texture[own] = self._first_texture[i] + face
         cosine = np.maximum(-(directions * normals).sum(axis=0), np.float32(0.02))
         # The footprint on a slanted surface is longer in one direction: use the geometric mean.
@@ -137,20 +124,12 @@ class Scene:
         colours[:, owner < 0] = 0
         if mirrored:
             glossy = np.flatnonzero((self._gloss[owner] > 0) & (owner >= 0))
-            self._mirror(
+            self.mirror(
                 colours, glossy, owner[glossy], positions[:, glossy], normals, directions, spread
             )
-            panes = [i for i in every if i in self._panes]
-            distance, pane = self._nearest(origins, directions, panes)
-            before = np.flatnonzero(distance < nearest)
-            positions = (origins + np.where(pane >= 0, distance, 0) * directions)[:, before]
-            for i in panes:
-                own = np.flatnonzero(pane[before] == i)
-                normals[:, before[own]] = self._shapes[i].surface(positions[:, own])[2]
-            self._mirror(colours, before, pane[before], positions, normals, directions, spread)
         return colours
 
-    def _mirror(
+    def mirror(
         self,
         colours: np.ndarray,
         rays: np.ndarray,
@@ -173,18 +152,18 @@ class Scene:
         onward = directions[:, rays] + 2 * facing * normal
         onward /= np.sqrt((onward * onward).sum(axis=0))
         start = positions + np.float32(2e-3) * normal
-        seen = self._block(start, onward, 3 * spread, mirrored=False)
+        seen = self.block(start, onward, 3 * spread, mirrored=False)
         colours[:, rays] += share * (seen - colours[:, rays])
 
-    def _candidates(self, origins: np.ndarray, directions: np.ndarray) -> list[int]:
+    def candidates(self, origins: np.ndarray, directions: np.ndarray) -> list[int]:
         """Indices of shapes whose bounding sphere intersects the cone of the rays."""
         if origins.shape[1] > 1:
-            return list(range(len(self._shapes)))
+            return list(range(len(self.shapes)))
         axis = directions.mean(axis=1, keepdims=True)
         axis /= np.linalg.norm(axis)
         opening = math.acos(min(1.0, float((axis * directions).sum(axis=0).min())))
         kept = []
-        for i, shape in enumerate(self._shapes):
+        for i, shape in enumerate(self.shapes):
             offset = shape.centre - origins
             distance = float(np.linalg.norm(offset))
             if distance > shape.radius:

@@ -13,10 +13,12 @@ from snowsplat.scene.camera import Camera
 from snowsplat.scene.geometry import look_at
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
-from snowsplat.synthetic.photographer import depth_map, photograph
+from snowsplat.synthetic.photographer import photograph
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
 from snowsplat.synthetic.textures import noise
+
+from ...scenes.depth import depth_map
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 
