@@ -219,6 +219,7 @@ def killed(photos, tmp_path) -> Callable[..., str]:
     return killed
 
 
+@pytest.mark.nightly  # kill/test_kills.py kills at other moments
 @pytest.mark.sfm
 def test_kills_in_every_stage(run, killed, quick, photos, tmp_path):
     """The same command resumes each time; finished stages are not repeated."""

@@ -212,6 +212,7 @@ def test_a_full_disk_keeps_finished_stages(garden, photos, run, tmp_path, monkey
     assert result.out.count("done before") == 2
 
 
+@pytest.mark.nightly  # kill/test_kills.py kills at other moments
 @pytest.mark.parametrize("stage", ["photos", "poses", "images"])
 def test_after_a_kill_in_any_stage_the_same_command_resumes(stage, photos, run, start, tmp_path):
     out = tmp_path / "garden"

@@ -108,7 +108,7 @@ def test_ctrl_c_saves_the_scene_and_a_checkpoint(dataset, tmp_path):
     assert (out / f"checkpoints/step_{step:06d}.safetensors").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # test_shards.py has the same variables in forks
 def test_torchrun(dataset, scene, tmp_path):
     """Here, all processes are new ones, not forks."""
     command = [sys.executable, "-m", "torch.distributed.run"]

@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from snowsplat.data import Dataset, ImageSource, Points, View, load_dataset
+from snowsplat.data.judge import match_evidence
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.judge.verdict import judge
 from snowsplat.scene.camera import Camera
@@ -19,6 +20,30 @@ from snowsplat.scene.geometry import look_at, quat_from_rotation, rotation_from_
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def remembered_matches():
+    """The photos are the same in each test, so their features and matches are computed once."""
+    known: dict[tuple, tuple] = {}
+
+    def remembered(function, key):
+        def call(*arguments):
+            values = key(*arguments)
+            if values not in known:  # with the arguments, whose numbers thus remain theirs
+                known[values] = function(*arguments), arguments
+            return known[values][0]
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, key in {
+            "_features": lambda photo: (photo.tobytes(),),
+            "_matches": lambda a, b: (id(a), id(b)),
+            "_rigid": lambda pair, _: (pair.a, pair.b, pair.in_a.tobytes(), pair.in_b.tobytes()),
+        }.items():
+            patch.setattr(match_evidence, name, remembered(getattr(match_evidence, name), key))
+        yield
 
 
 @pytest.fixture(scope="module")

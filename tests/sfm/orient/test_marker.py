@@ -33,8 +33,8 @@ def paper(number: int) -> np.ndarray:
 
 
 def photograph(pose: np.ndarray, sizes: dict[int, float], places: dict) -> np.ndarray:
-    """A grey photo (H, W) of markers on a grey ground; every pixel is the mean of 9 rays."""
-    x, y = np.meshgrid((np.arange(3 * WIDTH) + 0.5) / 3, (np.arange(3 * HEIGHT) + 0.5) / 3)
+    """A grey photo (H, W) of markers on a grey ground; every pixel is the mean of 4 rays."""
+    x, y = np.meshgrid((np.arange(2 * WIDTH) + 0.5) / 2, (np.arange(2 * HEIGHT) + 0.5) / 2)
     rays = LENS.cam_from_img(np.stack([x.ravel(), y.ravel()], 1))
     rays = np.column_stack([rays, np.ones(len(rays))]) @ pose[:, :3]
     centre = -pose[:, :3].T @ pose[:, 3]
@@ -48,7 +48,7 @@ def photograph(pose: np.ndarray, sizes: dict[int, float], places: dict) -> np.nd
         rows, columns = ((np.array([v, u])[:, inside] + 0.75) * 280).astype(int)
         light[inside] = 0.03 + 0.8 * (sheet[rows, columns] > 0)
     noise = np.random.default_rng(0).normal(0, 3, (HEIGHT, WIDTH))
-    light = cv2.GaussianBlur(light.reshape(HEIGHT, 3, WIDTH, 3).mean((1, 3)), (0, 0), 0.7)
+    light = cv2.GaussianBlur(light.reshape(HEIGHT, 2, WIDTH, 2).mean((1, 3)), (0, 0), 0.7)
     return (255 * light ** (1 / 2.2) + noise).clip(0, 255).astype(np.uint8)
 
 
