@@ -165,14 +165,16 @@ pytest-best:
 	$(PYTEST) -m 'not nightly' $(if $(SANITIZERS),-k 'not ($(SANITIZED))')
 
 nightly: native $(ENVIRONMENT) pytest-isas
+	@$(MAKE) --no-print-directory neon NEON_SKIPPED='float64 or $(SAME)'
 	$(PYTEST) -m nightly
 
 # The kernels for Arm (NEON), in an emulator, which takes five times as long as the processor: with the
 # precision that trainings use. float64, for references, has the same source. The loader of the library,
-# which test_native.py tests, is not used for them.
+# which test_native.py tests, is not used for them. Random values are for `make nightly`.
+NEON_SKIPPED = float64 or test_fuzz or $(SAME)
 NEON_TESTS := tests/ops tests/sfm/colmap/pairs/test_matching.py tests/sfm/colmap/features/test_patches.py \
     tests/sfm/colmap/features/test_sift.py \
-    --ignore tests/ops/test_native.py -k 'not (float64 or $(SAME))'
+    --ignore tests/ops/test_native.py -k 'not ($(NEON_SKIPPED))'
 NEON_FOUND = $(shell command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64)
 
 neon: native $(ENVIRONMENT)
