@@ -20,6 +20,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from snowsplat.formats.damage import Damaged
+from snowsplat.util.errors import cause_of
 from snowsplat.util.safe_json import inside, is_file, parse_json, quoted
 
 MAGIC = b"glTF"
@@ -104,7 +105,7 @@ class Document:
             raise Damaged(
                 "{name} cannot be read ({strerror})",
                 name=quoted(name),
-                strerror=error.strerror or error,
+                strerror=cause_of(error),
             ) from None
 
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from snowsplat.formats.damage import Damaged
+from snowsplat.util.errors import cause_of
 from snowsplat.util.safe_json import is_file, quoted
 
 # Largest directory in bytes. Python creates an object for each entry, ten times as large as it.
@@ -40,7 +41,7 @@ def reading_file(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise Damaged(
-            "{name} cannot be read ({strerror})", name=path.name, strerror=error.strerror or error
+            "{name} cannot be read ({strerror})", name=path.name, strerror=cause_of(error)
         ) from None
 
 

@@ -7,8 +7,7 @@ import re
 from pathlib import Path
 
 from snowsplat.project.studio_scene import StudioScene, is_studio_scene
-from snowsplat.util.errors import UserError
-from snowsplat.util.messages import as_message
+from snowsplat.util.errors import UserError, cause_of
 from snowsplat.util.safe_json import printable
 
 _DEFAULT = "snowsplat_scenes"
@@ -47,7 +46,7 @@ class Library:
             try:
                 os.stat(path)
             except (OSError, ValueError) as error:
-                why = as_message(getattr(error, "strerror", None) or "No such file or directory")
+                why = cause_of(error)
                 raise UserError("{path}: {why}", path=printable(str(path))[:200], why=why) from None
         title = safe_title(title)
         name = safe_name(title)

@@ -16,8 +16,7 @@ from starlette.requests import Request
 from snowsplat.studio.picture_requests import SUFFIXES
 from snowsplat.studio.requests import File, Studio, json_object
 from snowsplat.studio.scene_requests import summary
-from snowsplat.util.errors import UserError
-from snowsplat.util.messages import as_message
+from snowsplat.util.errors import UserError, cause_of
 from snowsplat.util.safe_json import printable
 from snowsplat.util.theme import THEME
 
@@ -87,7 +86,7 @@ def listing(path: Path) -> dict[str, Any]:
         raise UserError(
             "{path}: {error}",
             path=printable(str(path)),
-            error=as_message(getattr(error, "strerror", None) or "No such file or directory"),
+            error=cause_of(error),
         ) from None
     shown = [entry for entry in entries if not entry.name.startswith(".")]
     folders = [entry.name for entry in shown if is_folder(entry)]

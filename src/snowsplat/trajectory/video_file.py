@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from snowsplat.trajectory.spherical_metadata import mark_as_spherical
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import UserError, cause_of
 from snowsplat.util.files import atomic_path
 from snowsplat.util.native_library import available_isas
 
@@ -105,11 +105,10 @@ def video_writer(
             if panorama:
                 mark_as_spherical(temporary)
     except av.FFmpegError as error:
-        reason = error.strerror or str(error)
         raise UserError(
             "{path}: the video cannot be written ({reason}); check the free disk space",
             path=path,
-            reason=reason,
+            reason=cause_of(error),
         ) from None
 
 

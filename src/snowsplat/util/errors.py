@@ -27,7 +27,7 @@ class UserError(Exception):
         return str(self.message)
 
 
-#: What systems say of files, as `message_of` finds it.
+#: What systems say of files, as `cause_of` finds it.
 SYSTEM_ERRORS = (
     message("No such file or directory"),
     message("Not a directory"),
@@ -38,15 +38,19 @@ SYSTEM_ERRORS = (
 )
 
 
+def cause_of(error: Exception) -> Message:
+    """What is wrong, without the file that an error of the system names."""
+    return as_message(getattr(error, "strerror", None) or error)
+
+
 def message_of(error: OSError, cause: str | None = None) -> Message:
     """An error of the system in one line: the file, and what is wrong.
 
     ``cause``: what is named in place of the file.
     """
-    what = as_message(error.strerror or error)
     if not error.filename:
-        return what
-    return message("{file}: {error}", file=cause or error.filename, error=what)
+        return cause_of(error)
+    return message("{file}: {error}", file=cause or error.filename, error=cause_of(error))
 
 
 class SettingError(UserError):

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import UserError, cause_of
 
 try:
     import fcntl
@@ -115,7 +115,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(
-            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror or error
+            "{path}: cannot be read ({strerror})", path=path, strerror=cause_of(error)
         ) from None
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Literal
 
+from snowsplat.util.errors import cause_of
 from snowsplat.util.natural_order import natural_key
 
 logger = logging.getLogger(__name__)
@@ -99,7 +100,7 @@ def files_below(
     def fail(error: OSError) -> None:
         if Path(error.filename) == root:
             raise error
-        logger.warning("%s: left out: %s", error.filename, error.strerror)
+        logger.warning("%s: left out: %s", error.filename, cause_of(error))
 
     found: list[str] = []
     visited = {root.resolve()}

@@ -9,8 +9,9 @@ from typing import BinaryIO
 
 from PIL import Image, features
 
-from snowsplat.util.errors import Problem
+from snowsplat.util.errors import Problem, cause_of
 from snowsplat.util.files import GIT_LFS
+from snowsplat.util.messages import Message, message
 
 #: Formats that depend on how Pillow was built.
 OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
@@ -20,9 +21,10 @@ MOST_PIXELS = 178_956_970
 #: The largest width or height: that of the JPEG format.
 LONGEST_SIDE = 65_535
 #: The reason in the error for a larger image.
-TOO_LARGE = (
-    f"more than {MOST_PIXELS // 1_000_000} million pixels, or {LONGEST_SIDE:,} a side; make it "
-    "smaller"
+TOO_LARGE = message(
+    "more than {millions} million pixels, or {side:,} a side; make it smaller",
+    millions=MOST_PIXELS // 1_000_000,
+    side=LONGEST_SIDE,
 )
 # Pixels in a tile of a TIFF. A tile may be larger than the image, but programs do not write tiles
 # that are much larger.
@@ -74,15 +76,15 @@ def open_image(
     return image
 
 
-def reason_of(error: Exception) -> str:
+def reason_of(error: Exception) -> Message:
     """A short reason why an image cannot be read, from an error of Pillow or `open_image`."""
     if isinstance(error, Image.UnidentifiedImageError):
-        return "not an image of a known format"
+        return message("not an image of a known format")
     if isinstance(error, Image.DecompressionBombError):
         return TOO_LARGE
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return " ".join(str(error).split())[:120] or type(error).__name__
+    if isinstance(error, Problem) or getattr(error, "strerror", None):
+        return cause_of(error)
+    return Message(" ".join(str(error).split())[:120] or type(error).__name__)
 
 
 def scaled_size(width: int, height: int, longest: int | None) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import centred_intrinsics, perspective
 from snowsplat.data.readers.reconstruction import PhotoFolder, Reconstruction, program
 from snowsplat.util.errors import Problem, UserError
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import is_file
 
 _COLUMNS = 17
@@ -33,7 +34,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
         if stored.ndim != 2 or stored.shape[1] != _COLUMNS or len(stored) > _MOST_ROWS:
             raise Problem("it has the shape {shape}", shape=stored.shape)
     except Exception as error:  # numpy raises many kinds
-        raise parse.damaged(path, f"not a table of poses ({reason_of(error)})") from None
+        raise parse.damaged(
+            path, message("not a table of poses ({error})", error=reason_of(error))
+        ) from None
     files = photos.sorted_files()
     if len(files) != len(stored):
         raise UserError(

@@ -13,6 +13,7 @@ import numpy as np
 
 from snowsplat.util.errors import Problem, UserError
 from snowsplat.util.files import reading
+from snowsplat.util.messages import Message
 from snowsplat.util.safe_json import encoding_of, quoted, read_json
 
 #: Memory for JSON values per byte of the text. A point of OpenSfM needs 7 times its text.
@@ -27,7 +28,7 @@ _MOST = 1e15
 _MOST_SIDE = 1_000_000
 
 
-def damaged(where: object, problem: str) -> UserError:
+def damaged(where: object, problem: str | Message) -> UserError:
     """The error for a file that does not follow its format."""
     return UserError("{where}: {problem}; export the file again", where=where, problem=problem)
 

@@ -27,7 +27,7 @@ import torch
 from snowsplat.extras.image.model import ANGLE, OPACITY_LOGIT, ImageGaussians, column_count
 from snowsplat.extras.image.options import MOST_GAUSSIANS, Blending
 from snowsplat.util.errors import Problem, UserError
-from snowsplat.util.files import write_bytes
+from snowsplat.util.files import reading, write_bytes
 
 SUFFIX = ".gimg"
 _MAGIC = b"GIMG"
@@ -59,12 +59,8 @@ def write_compact(path: Path, gaussians: ImageGaussians) -> ImageGaussians:
 
 def read_compact(path: Path) -> ImageGaussians:
     """Read a compact file. Raises: UserError: it is missing or damaged, or of another kind."""
-    try:
+    with reading(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise UserError(
-            "{path}: cannot be read ({strerror})", path=path, strerror=error.strerror
-        ) from None
     try:
         return decode(data)
     except ValueError as error:

@@ -6,7 +6,7 @@ import errno
 import socket
 import sys
 
-from snowsplat.util.errors import SettingError
+from snowsplat.util.errors import SettingError, cause_of
 
 DEFAULT_PORT = 8080
 _TRIED = 20  # ports that are tried if none is given
@@ -75,6 +75,6 @@ def _listen(host: str, port: int) -> socket.socket:
             "host",
             "cannot listen at {host} ({strerror}); use e.g. 127.0.0.1",
             host=host,
-            strerror=error.strerror,
+            strerror=cause_of(error),
         ) from None
     return listener

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from snowsplat.util.errors import Problem, UserError
+from snowsplat.util.errors import Problem, UserError, cause_of
 from snowsplat.util.files import new_folder, shown
 from snowsplat.util.messages import Message, as_message, message
 
@@ -100,7 +100,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     except Exception as error:  # zipfile raises many kinds of exceptions for damaged files
         reason = as_message(error)
         if isinstance(error, OSError):
-            reason = as_message(error.strerror or error)
+            reason = cause_of(error)
         elif not isinstance(error, Problem):
             reason = Message(" ".join(str(error).split())[:80]) or message("it is damaged")
         raise UserError(

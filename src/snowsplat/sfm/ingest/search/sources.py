@@ -23,9 +23,9 @@ from snowsplat.sfm.ingest.search.copies import find_copies
 from snowsplat.sfm.ingest.search.names import free_name
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
 from snowsplat.sfm.ingest.video.clip import ONLY_SOUND, why_no_video
-from snowsplat.util.errors import UserError
+from snowsplat.util.errors import UserError, cause_of
 from snowsplat.util.files import shown
-from snowsplat.util.messages import Message, as_message, message, plural
+from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.names import first_names
 
 
@@ -395,7 +395,7 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
         raise UserError(
             "{path}: cannot be read ({error})",
             path=shown(path),
-            error=as_message(error.strerror or error),
+            error=cause_of(error),
         ) from None
     suffix = path.suffix.lower()
     if suffix in _UNREAD_SUFFIXES:  # many are TIFF files with a small preview
