@@ -329,8 +329,14 @@ class _Rasterize(torch.autograd.Function):
             grad_alpha = None  # alpha is always 0
         grad_alpha = None if grad_alpha is None else grad_alpha.contiguous()
         grad_packed = _grad_packed(
-            *(ctx.frame, ctx.groups, ctx.states),
-            *(planes, grad_planes, alpha, grad_alpha, ctx.abs_grad),
+            ctx.frame,
+            ctx.groups,
+            ctx.states,
+            planes,
+            grad_planes,
+            alpha,
+            grad_alpha,
+            ctx.abs_grad,
         )
         grad_background = None
         if ctx.needs_input_grad[1]:

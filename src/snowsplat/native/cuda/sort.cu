@@ -104,9 +104,8 @@ SNOW_INLINE void apply_scan(int64_t n, const uint32_t* values, const uint64_t* s
 constexpr int kDigitBits = 8, kDigits = 1 << kDigitBits;
 static_assert(kDigits == kThreads, "a thread for each digit");
 
-// Keys per thread. A block has 16 kB of them in shared memory.
-template <class Key>
-constexpr int kSortItems = sizeof(Key) == 8 ? 8 : 16;
+// Keys per thread. Few keys are sorted by more blocks, because the time of one block decides.
+constexpr int kManyItems = 16, kFewItems = 4, kWideItems = 8;  // kWideItems: keys of 64 bits
 
 struct Digit {
   int shift;
@@ -141,9 +140,8 @@ SNOW_INLINE uint32_t lanes_with(int digit) {
 }
 
 // How often each digit is in the keys of a block.
-template <class Key>
+template <int kItems, class Key>
 SNOW_INLINE void count_digits(const SortPassParams<Key>& p) {
-  constexpr int kItems = kSortItems<Key>;
   const Digit digit_of = digit_at(p.shift, p.bits);
   SNOW_SHARED(uint32_t, histogram, kDigits);
   histogram[threadIdx.x] = 0;
@@ -222,9 +220,9 @@ SNOW_INLINE void scan_counts(int64_t blocks, uint32_t* counts, uint32_t* totals)
 // and from there to global memory, so that neighbouring threads write to neighbouring addresses.
 // Then the values are written in the same way. Invalid items are at the end and have the last
 // digit, so they stay at the end.
-template <class Key>
+template <int kItems, class Key>
 SNOW_INLINE void scatter_block(const SortPassParams<Key>& p, int64_t first, int valid) {
-  constexpr int kItems = kSortItems<Key>, kWarps = kThreads / kWarp, kAll = kThreads * kItems;
+  constexpr int kWarps = kThreads / kWarp, kAll = kThreads * kItems;
   constexpr int kWords = kAll * int(sizeof(Key) == 8 ? 2 : 1) / 2;
   SNOW_SHARED(uint16_t, histograms, kWarps* kDigits);
   // For each digit, the position of its first key in the output, minus that in the block:
@@ -315,11 +313,11 @@ SNOW_INLINE void scatter_block(const SortPassParams<Key>& p, int64_t first, int 
   }
 }
 
-template <class Key>
+template <int kItems, class Key>
 SNOW_INLINE void scatter(const SortPassParams<Key>& p) {
-  constexpr int kAll = kThreads * kSortItems<Key>;
+  constexpr int kAll = kThreads * kItems;
   const int64_t first = int64_t(blockIdx.x) * kAll, left = valid_items(p.n, p.count) - first;
-  if (left > 0) scatter_block(p, first, left < kAll ? int(left) : kAll);
+  if (left > 0) scatter_block<kItems>(p, first, left < kAll ? int(left) : kAll);
 }
 
 }  // namespace
@@ -331,10 +329,13 @@ SNOW_KERNEL(scan_sums, kThreads, ScanParams) { sum_blocks(p.n, p.values, p.sums)
 SNOW_KERNEL(scan_of_sums, kThreads, ScanParams) { scan_blocks(p.n, p.sums, p.total); }
 SNOW_KERNEL(scan_apply, kThreads, ScanParams) { apply_scan(p.n, p.values, p.sums, p.out); }
 
-SNOW_KERNEL(sort_count_u16, kThreads, SortPassParams<uint16_t>) { count_digits(p); }
-SNOW_KERNEL(sort_count_u32, kThreads, SortPassParams<uint32_t>) { count_digits(p); }
-SNOW_KERNEL(sort_count_u64, kThreads, SortPassParams<uint64_t>) { count_digits(p); }
+#define SNOW_SORT_KERNELS(SUFFIX, KEY, ITEMS)                                                \
+  SNOW_KERNEL(sort_count##SUFFIX, kThreads, SortPassParams<KEY>) { count_digits<ITEMS>(p); } \
+  SNOW_KERNEL(sort_scatter##SUFFIX, kThreads, SortPassParams<KEY>) { scatter<ITEMS>(p); }
+
+SNOW_SORT_KERNELS(_u16, uint16_t, kManyItems)
+SNOW_SORT_KERNELS(_u32, uint32_t, kManyItems)
+SNOW_SORT_KERNELS(_u64, uint64_t, kWideItems)
+SNOW_SORT_KERNELS(_few_u16, uint16_t, kFewItems)
+SNOW_SORT_KERNELS(_few_u32, uint32_t, kFewItems)
 SNOW_KERNEL(sort_offsets, kThreads, SortOffsetsParams) { scan_counts(p.n, p.counts, p.totals); }
-SNOW_KERNEL(sort_scatter_u16, kThreads, SortPassParams<uint16_t>) { scatter(p); }
-SNOW_KERNEL(sort_scatter_u32, kThreads, SortPassParams<uint32_t>) { scatter(p); }
-SNOW_KERNEL(sort_scatter_u64, kThreads, SortPassParams<uint64_t>) { scatter(p); }

@@ -298,7 +298,10 @@ SNOW_INLINE void fill_tiles(const TilesFillKernelParams<T>& p) {
                         done += uint32_t(__popc(votes));
                       });
     // Because of rounding, the test may find fewer tiles than in tiles_count; the splat is not
-    // visible in the missing ones. The remaining instances get a tile index after the last tile.
+    // visible in the missing ones. The remaining instances get a tile index after the last tile, and
+    // their slots, which no block writes, do not belong to the splat.
+    if (p.slot_range && done < count && lane_id() == 0)
+      p.slot_range[2 * int64_t(its_splat) + 1] = clamped(its_slot + done, p.capacity);
     for (uint32_t k = done + uint32_t(lane_id()); k < count; k += kWarp)
       set_instance(p, its_slot + k, tiles_x * tiles_y, its_splat);
   }

@@ -56,6 +56,11 @@ KERNELS: dict[str, Kernel] = {
     "sort_scatter_u16": Kernel("sort", 256, 4096),
     "sort_scatter_u32": Kernel("sort", 256, 4096),
     "sort_scatter_u64": Kernel("sort", 256, 2048),
+    **{
+        f"sort_{step}_few_{key}": Kernel("sort", 256, 1024)
+        for step in ("count", "scatter")
+        for key in ("u16", "u32")
+    },
     "splats_prepare": Kernel("tiles", 256, 256),
     "tiles_count": Kernel("tiles", 256, 256),
     "tiles_fill": Kernel("tiles", 256, 256),

@@ -12,7 +12,8 @@ from torch import Tensor
 from snowsplat.ops.cuda.kernels import KERNELS, Run
 
 _DIGIT_BITS = 8
-MOST_ADDED = 64  # blocks whose counts `sort_scatter` adds; for more, `sort_offsets` does it first
+FEW = 1 << 19  # keys of at most 32 bits that are sorted with few keys per block
+MOST_ADDED = 128  # blocks whose counts `sort_scatter` adds; for more, `sort_offsets` does it first
 _KEYS = {torch.int16: "u16", torch.int32: "u32", torch.int64: "u64"}
 
 
@@ -57,6 +58,8 @@ def sort_pairs(
     values2. The other two are overwritten.
     """
     name, device = _KEYS[keys.dtype], keys.device
+    if n <= FEW and keys.dtype != torch.int64:
+        name = f"few_{name}"
     blocks = KERNELS[f"sort_count_{name}"].blocks(n)
     counts = torch.empty(blocks << _DIGIT_BITS, dtype=torch.int32, device=device)
     totals = None
