@@ -7,6 +7,11 @@ import av
 import numpy as np
 from PIL import Image, ImageFilter
 
+from snowsplat.sfm.ingest.content.sharpness import CONTENT_SIDE, grey_copy
+from snowsplat.sfm.ingest.inputs import gather
+from snowsplat.sfm.options import GatherOptions
+from snowsplat.sfm.progress import silent
+
 WIDTH, HEIGHT = 320, 240
 
 
@@ -53,6 +58,23 @@ def exif(tags=None, details=None, gps=None) -> Image.Exif:
     data.get_ifd(0x8769).update(details or {})
     data.get_ifd(0x8825).update(gps or {})
     return data
+
+
+def gathered(inputs, dataset, report=silent, **options):
+    """`gather` one or several inputs for a dataset."""
+    dataset.mkdir(exist_ok=True)
+    inputs = inputs if isinstance(inputs, list) else [inputs]
+    return gather(inputs, dataset, GatherOptions(**options), report)
+
+
+def grey(picture: np.ndarray) -> np.ndarray:
+    """The copy of a picture that is tested for content and for motion."""
+    return grey_copy(Image.fromarray(picture), CONTENT_SIDE)
+
+
+def noisy(picture: np.ndarray, level: float, seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(0, level, picture.shape)
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
 
 def write_photos(folder, count=3, ending="jpg", start=0):

@@ -255,7 +255,7 @@ def test_an_interruption_leaves_no_model_and_no_threads(dataset):
         undistort(dataset, PHOTOS, scene(), False, stop, 1)
     assert not (dataset / "sparse").exists()
     assert not list(dataset.rglob("*.tmp"))
-    assert not [t for t in threading.enumerate() if t.name.startswith("snowsplat-undistort")]
+    assert not [t for t in threading.enumerate() if t.name.startswith("snowsplat-photos")]
 
 
 def test_missing_and_changed_photos_are_named(dataset):
@@ -265,7 +265,7 @@ def test_missing_and_changed_photos_are_named(dataset):
     with pytest.raises(UserError, match="one.jpg: missing"):
         undistort(dataset, PHOTOS, scene(), False, silent)
     path.write_bytes(good[: len(good) // 2])
-    with pytest.raises(UserError, match="one.jpg: cannot be decoded"):
+    with pytest.raises(UserError, match="one.jpg: cannot be read"):
         undistort(dataset, PHOTOS, scene(), False, silent)
     path.write_bytes(b"not an image")
     with pytest.raises(UserError, match="one.jpg: cannot be read"):

@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -117,8 +118,8 @@ def _run(
     watcher: Watcher,
     later: Later | None,
 ) -> dict[str, Outcome]:
-    surveyed = survey(sources, options.gather)
     size, effort, threads = options.gather.size, options.sfm.effort, options.sfm.threads
+    surveyed = survey(sources, options.gather)
     left = SfmTimeLeft(surveyed, size, effort, thread_count(threads), later or Later())
     outcomes: dict[str, Outcome] = {}
 
@@ -143,13 +144,14 @@ def _run(
     if options.skip_matching:
         chosen_photos = replace(chosen_photos, as_stored=True)
 
-    def gather_photos(report: Report) -> dict[str, Any]:
-        return _gather(sources, folder, chosen_photos, report, stages.about["in_place"])
-
-    of_photos = {"input": _fingerprint(sources.paths), **asdict(chosen_photos)}
-    stage("photos", of_photos, [_PHOTOS, DatasetFolder.distorted_masks.name], gather_photos)
+    stage(
+        "photos",
+        {"input": _fingerprint(sources.paths), **asdict(chosen_photos)},
+        [_PHOTOS, DatasetFolder.distorted_masks.name],
+        partial(_gather, sources, folder, chosen_photos, stages.about["in_place"]),
+    )
     photos = _photos(folder, outcomes["photos"].result)
-    left.gathered(len(photos))
+    left.expect_photos(len(photos))
     if options.skip_matching:
         left.finished_before("poses")
 
@@ -167,11 +169,8 @@ def _run(
         find_poses,
     )
 
-    def make_images(report: Report) -> dict[str, Any]:
-        return _undistort(folder, photos, options, report)
-
     of_images = {"resize": options.resize, "marker": options.marker}
-    stage("images", of_images, IMAGE_FOLDERS, make_images)
+    stage("images", of_images, IMAGE_FOLDERS, partial(_undistort, folder, photos, options))
 
     def write(report: Report) -> dict[str, Any]:
         sfm, coverage = outcomes["poses"].result, measure_coverage(DatasetFolder(folder).model)
@@ -198,7 +197,7 @@ def _run(
 
 
 def _gather(
-    sources: Sources, folder: Path, options: GatherOptions, report: Report, in_place: bool
+    sources: Sources, folder: Path, options: GatherOptions, in_place: bool, report: Report
 ) -> dict[str, Any]:
     """Gather the photos into a temporary folder, then replace `input/` and the masks by them. If
     the photos are in `input/` already (``in_place``), only the masks are written."""
@@ -299,21 +298,17 @@ def _remove_on_failure(folder: Path) -> Iterator[None]:
         record = folder / _RECORD
         resumable = record.is_file() and Stages(record, STAGES).is_finished("photos")
         if _RECORD not in before and (isinstance(error, UserError) or not resumable):
-            for name in {_PHOTOS, ".new", *_OUTPUT_NAMES} - before:
-                _remove(folder / name)
+            for path in (folder / name for name in {_PHOTOS, ".new", *_OUTPUT_NAMES} - before):
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise UserError(
                 "{folder}: the disk is full; free some space, then run the same command again",
                 folder=folder,
             ) from None
         raise
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
 
 
 # JSON

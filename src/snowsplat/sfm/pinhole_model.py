@@ -124,7 +124,7 @@ def in_views(
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(first), np.zeros(3)) * pose
             rays = views[camera_id][0].lens.directions(xy)
             for view, camera in zip(views[camera_id], cameras[camera_id], strict=True):
-                pixels, rows = _seen(view, rays)
+                pixels, rows = _pixels_in_view(view, rays)
                 points = [ids[row] for row in rows]
                 name = view_name(image.name, view)
                 images.append(image_of(name, camera.camera_id, number, pixels[rows], points))
@@ -164,7 +164,7 @@ def _rotation(view: LensView) -> np.ndarray:
     return np.eye(3) if view.rotation is None else np.array(view.rotation)
 
 
-def _seen(view: LensView, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pixels_in_view(view: LensView, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The pixels (N, 2) of directions (N, 3) of a lens in a view, and the rows that it shows."""
     x, y, z = _rotation(view) @ rays.T
     fx, fy, cx, cy = view.params

@@ -1,9 +1,10 @@
-"""The progress callback of a long job."""
+"""The progress callback of a long job, and work in threads that calls it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Protocol
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,3 +41,30 @@ class ShowPoses(Protocol):
     """
 
     def __call__(self, photos: Sequence[PlacedPhoto], points: np.ndarray) -> None: ...
+
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def in_threads(
+    work: Callable[[_Item], _Result],
+    photos: Sequence[_Item],
+    threads: int,
+    report: Report,
+    begin: Callable[[], None] = lambda: None,
+) -> list[_Result]:
+    """The results of ``work`` for each of ``photos``, in their order.
+
+    Each thread calls ``begin`` first. After the first error or Ctrl-C, running work is finished,
+    and the rest is cancelled.
+    """
+    results: list[_Result] = []
+    pool = ThreadPoolExecutor(threads, "snowsplat-photos", begin)
+    try:
+        for result in pool.map(work, photos):
+            results.append(result)
+            report(len(results), len(photos), "photos")
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return results

@@ -83,10 +83,6 @@ class TimeLeft:
         self._steps |= steps
         self._estimate = self._sum()
 
-    def child_used(self, cpu_seconds: float) -> None:
-        """The child process of the job has used this processor time so far."""
-        self._child = cpu_seconds
-
     def update(self, step: str, share: float) -> None:
         """``share`` (0 to 1) of the work of ``step`` is finished.
 
@@ -173,7 +169,7 @@ class Later:
     deadline: float | None = None
 
 
-class SfmTimeLeft:
+class SfmTimeLeft(TimeLeft):
     """Adds the time left to the progress of the stages of `make_dataset.make_dataset`."""
 
     def __init__(
@@ -188,7 +184,7 @@ class SfmTimeLeft:
         self._photos, self._size, self._effort = photos, size, effort
         steps = steps_of(photos, size, effort)
         del steps["start"]  # its time is spread over other steps, so it is not measured
-        self._left = TimeLeft({**steps, "later": Step(later.work)}, threads)
+        super().__init__({**steps, "later": Step(later.work)}, threads)
         self._pairs = 0  # number of pairs that are matched; 0: not known yet
         self._features = 0.0  # mean number of features of a photo; 0: not known yet
         self._deadline = later.deadline
@@ -197,15 +193,15 @@ class SfmTimeLeft:
         """A progress callback for a stage: it adds the time left and calls ``report``."""
 
         def with_time(done: int, total: int, what: str = "", left: float | None = None) -> None:
-            self._update(stage, done, total, what)
-            left = self._left.seconds
+            self._update_stage(stage, done, total, what)
+            left = self.seconds
             if self._deadline is not None:
                 left = max(left, self._deadline - time.monotonic())
             report(done, total, what, left)
 
         return with_time
 
-    def _update(self, stage: str, done: int, total: int, what: str) -> None:
+    def _update_stage(self, stage: str, done: int, total: int, what: str) -> None:
         step = stage
         if stage == "poses":
             step = _STEP_OF_ITEMS[what]
@@ -215,11 +211,11 @@ class SfmTimeLeft:
             self._pairs = total
             self._expect_pairs()
         share = done / total if total else 0.0
-        self._left.update(step, share_of_poses(done, total) if step == "poses" else share)
+        self.update(step, share_of_poses(done, total) if step == "poses" else share)
 
     def figures(self, cpu_seconds: float, features: float) -> None:
         """Figures about the child process that estimates the poses; see `progress.Figures`."""
-        self._left.child_used(cpu_seconds)
+        self._child = cpu_seconds
         if features and features != self._features:
             self._features = features
             self._expect_pairs()
@@ -227,15 +223,15 @@ class SfmTimeLeft:
     def _expect_pairs(self) -> None:
         pairs = self._pairs or expected_pairs(self._photos.count, self._effort)
         features = self._features or EFFORTS[self._effort].features
-        self._left.expect(steps_of_pairs(pairs, features))
+        self.expect(steps_of_pairs(pairs, features))
 
-    def gathered(self, count: int) -> None:
+    def expect_photos(self, count: int) -> None:
         """The stage "photos" is finished, with ``count`` photos and frames."""
         self._photos = replace(self._photos, stills=count, frames=0)
         steps = steps_of(self._photos, self._size, self._effort)
         names = (*_STEPS_OF_STAGE["poses"], *_STEPS_OF_STAGE["images"])
-        self._left.expect({name: steps[name] for name in names})
+        self.expect({name: steps[name] for name in names})
 
     def finished_before(self, stage: str) -> None:
         """``stage`` takes no time: an earlier run finished it, or it has nothing to do."""
-        self._left.expect(dict.fromkeys(_STEPS_OF_STAGE[stage], Step(0.0)))
+        self.expect(dict.fromkeys(_STEPS_OF_STAGE[stage], Step(0.0)))

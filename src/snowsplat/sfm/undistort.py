@@ -13,8 +13,7 @@ import logging
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -35,6 +34,7 @@ from snowsplat.data.photos.image_file import open_image, reason_of
 from snowsplat.data.photos.image_loader import available_memory
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.pinhole_model import in_views, view_name, write_model
+from snowsplat.sfm.progress import Report, in_threads
 from snowsplat.util.errors import UserError
 from snowsplat.util.files import atomic_path
 
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from snowsplat.scene.geometry import Similarity
     from snowsplat.sfm.ingest.photo import Photo
-    from snowsplat.sfm.progress import Report
 
 logger = logging.getLogger(__name__)
 
@@ -78,15 +77,44 @@ class Undistorted:
 class _Job:
     """One photo to undistort."""
 
+    dataset: DatasetFolder
     name: str  # path relative to input/
     camera_size: tuple[int, int]  # width and height of the distorted camera
     views: Sequence[tuple[str, LensView]]  # the images of the photo, and their names
     mask: bool  # whether the photo has a mask
+    divisors: Sequence[int]  # of the sizes of smaller copies
 
     @property
     def resampled(self) -> bool:
         """Whether the image differs from the photo."""
         return not all(view.is_photo for _, view in self.views)
+
+    def decode(self, path: Path) -> tuple[Image.Image, str]:
+        """The photo, or its mask, in mode L or RGB, or RGBA if it may have transparent pixels; and
+        its format. Raises UserError: it is missing or damaged, or has another size."""
+        try:
+            with open_image(path, list(_SAVING)) as opened:
+                form, size = str(opened.format), opened.size
+                image = plain_pixels(opened, path) if size == self.camera_size else opened
+        except FileNotFoundError:
+            raise UserError("{path}: missing; restore it, or run sfm again", path=path) from None
+        except Exception as error:  # Pillow may raise any exception for a damaged file
+            raise UserError(
+                "{path}: cannot be read ({reason_of}); replace it",
+                path=path,
+                reason_of=reason_of(error),
+            ) from None
+        if size != self.camera_size:
+            raise UserError(
+                "{path}: size is {width}x{height}, but its pose was estimated at "
+                "{camera_size}x{camera_size2}; restore the image, or run sfm again",
+                path=path,
+                width=size[0],
+                height=size[1],
+                camera_size=self.camera_size[0],
+                camera_size2=self.camera_size[1],
+            )
+        return image, "JPEG" if form == "MPO" else form
 
 
 def undistort(
@@ -117,53 +145,47 @@ def undistort(
     """
     import pycolmap
 
-    model = pycolmap.Reconstruction(DatasetFolder(dataset).distorted_model)
-    known = {photo.name: photo for photo in photos}
+    folder = DatasetFolder(dataset)
+    model = pycolmap.Reconstruction(folder.distorted_model)
+    masked = {photo.name for photo in photos if photo.mask}
+    registered = [model.images[number] for number in sorted(model.reg_image_ids())]
     views = dict[int, Sequence[LensView]]()
     for number, camera in model.cameras.items():
-        masked = [
-            DatasetFolder(dataset).mask_of(image.name)
-            for image in (model.images[i] for i in sorted(model.reg_image_ids()))
-            if image.camera_id == number and image.name in known and known[image.name].mask
-        ]
-        views[number] = _views_of(camera, masked)
+        names = [image.name for image in registered if image.camera_id == number]
+        views[number] = _views_of(camera, [folder.mask_of(n) for n in names if n in masked])
+    divisors = _DIVISORS if resize else ()
     jobs = []
-    for number in model.reg_image_ids():
-        image = model.images[number]
-        photo, camera = known.get(image.name), model.cameras[image.camera_id]
-        has_mask = photo is not None and photo.mask
+    for image in registered:
+        camera = model.cameras[image.camera_id]
         size = (camera.width, camera.height)
         named = [(view_name(image.name, view), view) for view in views[image.camera_id]]
-        jobs.append(_Job(image.name, size, named, has_mask))
+        jobs.append(_Job(folder, image.name, size, named, image.name in masked, divisors))
     jobs.sort(key=lambda job: job.name)
     count = Counter(name for job in jobs for name, _ in job.views)
     for name in (name for name, times in count.items() if times > 1):
         raise UserError(
             "{name}: is the name of a photo and of a part of one; rename this photo",
-            name=DatasetFolder(dataset).images / name,
+            name=folder.images / name,
         )
-    divisors = _DIVISORS if resize else ()
-    folders = ["images", *(f"images_{divisor}" for divisor in divisors)]
-    pixels = max(w * h for w, h in (job.camera_size for job in jobs))
-    pixels = max(pixels, *(view.width * view.height for job in jobs for _, view in job.views))
+    sizes = Counter((view.width, view.height) for job in jobs for _, view in job.views)
+    pixels = max(w * h for w, h in (*(job.camera_size for job in jobs), *sizes))
     threads = min(
         threads or min(4, os.cpu_count() or 1),
         max(1, available_memory() // (2 * _BYTES_PER_PIXEL * pixels)),
     )
-    masks = _run(
-        [partial(_undistort_photo, dataset, job, divisors) for job in jobs], report, threads
-    )
+    report(0, len(jobs), "photos")
+    # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
+    masks = in_threads(_undistort_photo, jobs, threads, report, partial(torch.set_num_threads, 1))
     wide = {number: some for number, some in views.items() if some[0].rotation is not None}
     pinholes = {number: some[0] for number, some in views.items() if number not in wide}
     if wide:
         model = in_views(model, wide)
     write_model(model, pinholes, scene_from_sfm, dataset / "sparse")
-    sizes = Counter((view.width, view.height) for job in jobs for _, view in job.views)
     return Undistorted(
         images=sum(sizes.values()),
         masks=sum(masks),
         sizes=[(*size, count) for size, count in sizes.most_common()],
-        folders=folders,
+        folders=["images", *(f"images_{divisor}" for divisor in divisors)],
         resampled=any(job.resampled for job in jobs),
     )
 
@@ -217,119 +239,56 @@ def _circle(camera: pycolmap.Camera, masks: Sequence[Path]) -> float | None:
     return reach if 0 < reach < _CIRCLE * radius.max() and is_full else None
 
 
-def _run(jobs: Sequence[Callable[[], int]], report: Report, threads: int) -> list[int]:
-    """Run jobs in threads; returns their results in any order. After the first error or Ctrl-C,
-    running jobs finish and the others are cancelled."""
-    report(0, len(jobs), "photos")
-    # Pillow and torch release the GIL while they compute. Each job uses torch with one thread.
-    pool = ThreadPoolExecutor(threads, "snowsplat-undistort", torch.set_num_threads, (1,))
-    try:
-        results = []
-        running = [pool.submit(job) for job in jobs]
-        for done, future in enumerate(as_completed(running), 1):
-            results.append(future.result())
-            report(done, len(jobs), "photos")
-        return results
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
 # One photo
 
 
-def _undistort_photo(dataset: Path, job: _Job, divisors: Sequence[int]) -> int:
+def _undistort_photo(job: _Job) -> int:
     """Write the images, their smaller copies and their masks; returns the number of masks."""
-    source = DatasetFolder(dataset).photos / job.name
-    opaque = None
-    with _open_photo(source, job) as opened:
-        form = "JPEG" if opened.format == "MPO" else str(opened.format)
-        if not job.resampled:
-            with _atomic_path_in_new_folder(DatasetFolder(dataset).images / job.name) as temporary:
-                shutil.copyfile(source, temporary)
-        if job.resampled or divisors or job.mask:
-            photo = _decode(opened, source)
-            opaque = np.asarray(photo)[..., 3] > 0 if photo.mode == "RGBA" else None
-        for name, view in job.views if job.resampled or divisors else ():
-            image = undistort_image(photo, view)
-            if job.resampled:
-                _save(image, DatasetFolder(dataset).images / name, form)
-            for divisor in divisors:
-                folder = dataset / f"images_{divisor}"
-                _save(_reduced(image, divisor), folder / name, form)
-    return _undistort_masks(dataset, job, opaque)
+    source, opaque = job.dataset.photos / job.name, None
+    photo, form = job.decode(source)
+    if photo.mode == "RGBA":
+        opaque = np.asarray(photo)[..., 3] > 0
+    if not job.resampled:
+        with _atomic_path_in_new_folder(job.dataset.images / job.name) as temporary:
+            shutil.copyfile(source, temporary)
+    for name, view in job.views if job.resampled or job.divisors else ():
+        image = undistort_image(photo, view)
+        if job.resampled:
+            _save(image, job.dataset.images / name, form)
+        for divisor in job.divisors:
+            folder = job.dataset.path / f"images_{divisor}"
+            _save(_reduce(image, divisor), folder / name, form)
+    return _undistort_masks(job, opaque)
 
 
-def _undistort_masks(dataset: Path, job: _Job, opaque: np.ndarray | None) -> int:
+def _undistort_masks(job: _Job, opaque: np.ndarray | None) -> int:
     """Write the masks of the images of a photo; returns their number.
 
     A mask of transparent pixels only, and one of no pixels of a view, is not written. ``opaque``:
     (H, W) bool, the pixels of the photo that are not transparent; None: all.
     """
-    mask = None
-    if job.mask:
-        path = DatasetFolder(dataset).mask_of(job.name)
-        with _open_photo(path, job) as opened:
-            mask = _decode(opened, path).convert("L")
-        if opaque is not None:
-            # SfM ignores transparent pixels; training uses them as empty space.
-            used = (np.asarray(mask) >= 128) | ~opaque
-            mask = None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
+    mask = job.decode(job.dataset.mask_of(job.name))[0].convert("L") if job.mask else None
+    if mask is not None and opaque is not None:
+        # SfM ignores transparent pixels; training uses them as empty space.
+        mask = _mask_of((np.asarray(mask) >= 128) | ~opaque)
     written = 0
     for name, view in job.views:
         made = None if mask is None else undistort_mask(mask, view)
-        if view.rotation is not None:
-            made = _with_blank(made, view)
+        if view.rotation is not None:  # the pixels that show nothing of the photo are masked
+            used = covered_pixels(view, view.width, view.height)
+            made = _mask_of(used if made is None else used & (np.asarray(made) >= 128))
         if made is not None:
-            _save(made, DatasetFolder(dataset).masks / f"{name}.png", "PNG")
+            _save(made, job.dataset.masks / f"{name}.png", "PNG")
             written += 1
     return written
 
 
-def _with_blank(mask: Image.Image | None, view: LensView) -> Image.Image | None:
-    """``mask`` of a view, with the pixels masked that show nothing of the photo; None: nothing."""
-    used = np.ones((view.height, view.width), bool) if mask is None else np.asarray(mask) >= 128
-    used &= covered_pixels(view, view.width, view.height)
+def _mask_of(used: np.ndarray) -> Image.Image | None:
+    """A mask of the pixels ``used`` (H, W) bool; None: all of them are."""
     return None if used.all() else Image.fromarray(used.astype(np.uint8) * 255)
 
 
-def _open_photo(path: Path, job: _Job) -> Image.Image:
-    try:
-        image = open_image(path, list(_SAVING))
-    except FileNotFoundError:
-        raise UserError("{path}: missing; restore it, or run sfm again", path=path) from None
-    except Exception as error:  # Pillow may raise any exception for a damaged file
-        raise UserError(
-            "{path}: cannot be read ({reason_of}); replace it",
-            path=path,
-            reason_of=reason_of(error),
-        ) from None
-    if image.size != job.camera_size:
-        image.close()
-        raise UserError(
-            "{path}: size is {width}x{height}, but its pose was estimated at "
-            "{camera_size}x{camera_size2}; restore the image, or run sfm again",
-            path=path,
-            width=image.width,
-            height=image.height,
-            camera_size=job.camera_size[0],
-            camera_size2=job.camera_size[1],
-        )
-    return image
-
-
-def _decode(opened: Image.Image, path: Path) -> Image.Image:
-    """Mode L or RGB, or RGBA if the image may have transparent pixels."""
-    try:
-        return plain_pixels(opened, path)
-    except Exception as error:  # as in `_open_photo`
-        raise UserError(
-            "{path}: cannot be decoded ({reason_of}); replace it",
-            path=path,
-            reason_of=reason_of(error),
-        ) from None
-
-
-def _reduced(image: Image.Image, divisor: int) -> Image.Image:
+def _reduce(image: Image.Image, divisor: int) -> Image.Image:
     """The image at 1/``divisor`` of its size, averaged over areas; rounded as in `data`."""
     width, height = (max(1, round(side / divisor)) for side in image.size)
     # Premultiplied alpha, so that the colours of transparent pixels do not affect other pixels.

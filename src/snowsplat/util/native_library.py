@@ -151,6 +151,13 @@ def call_with_arrays(name: str, **fields: NDArray[Any] | float | None) -> int:
     )
 
 
+def check_array(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: Any) -> None:
+    """Raises ValueError if an array, whose memory a function reads, has another shape or type."""
+    if array.shape != shape or array.dtype != dtype:
+        expected = f"{shape} {np.dtype(dtype)}"
+        raise ValueError(f"{name} must be {expected}, got {array.shape} {array.dtype}")
+
+
 class _ArrayPointer:
     __slots__ = ("array",)
 

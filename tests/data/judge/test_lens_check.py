@@ -7,9 +7,9 @@ import pytest
 from snowsplat.data.judge.lens_check import field_of_view, lens_findings
 
 
-def found(*intrinsics: float, known: float | None = None) -> list[tuple[str, bool]]:
+def found(*intrinsics: float) -> list[tuple[str, bool]]:
     width, height, *rest = intrinsics
-    findings = lens_findings(int(width), int(height), *rest, known_focal=known)
+    findings = lens_findings(int(width), int(height), *rest)
     return [(finding.about, finding.impossible) for finding in findings]
 
 
@@ -23,7 +23,7 @@ def found(*intrinsics: float, known: float | None = None) -> list[tuple[str, boo
     ],
 )
 def test_real_lenses(width: int, height: int, focal: float) -> None:
-    findings = found(width, height, focal, focal, width / 2, height / 2, known=focal * 1.1)
+    findings = found(width, height, focal, focal, width / 2, height / 2)
     assert all(not impossible for _, impossible in findings)
     assert len(findings) == (field_of_view(width, focal) < 5)
 
@@ -45,8 +45,3 @@ def test_angle() -> None:
 )
 def test_unusual(intrinsics: tuple[float, ...], expected: tuple[str, bool]) -> None:
     assert found(*intrinsics) == [expected]
-
-
-def test_known_focal() -> None:
-    assert found(1024, 768, 700, 700, 512, 384, known=995) == [("focal length", False)]
-    assert found(1024, 768, 700, 700, 512, 384, known=800) == []

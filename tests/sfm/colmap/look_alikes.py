@@ -13,30 +13,26 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from snowsplat.sfm.colmap.database import open_database
 from snowsplat.sfm.colmap.lenses.lens import Lens
 from snowsplat.sfm.ingest.photo import Photo
 
-from .walks import write_features
+from . import walks
+from .walks import FOCAL, HEIGHT, WIDTH
 
 COUNT, FAR = 16, range(9, 16)
 STEP, SHIFT = 1.5, np.array([18.0, 0.0, 0.0])
-WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
 TWINS = 100
 NEIGHBOURS = 4  # a camera is matched with this number of following ones
 
 
 @dataclass(frozen=True)
-class Walk:
+class Walk(walks.Walk):
     """The true scene, and which features and matches the photos have."""
 
     xyz: np.ndarray  # (P, 3) points
     twins: np.ndarray  # (T, 2) pairs of points that look alike, the near point first
-    centres: np.ndarray  # (COUNT, 3) of the cameras
     rotations: list[pycolmap.Rotation3d]  # of the cameras, from the world
     seen: list[np.ndarray]  # for each camera, the points of its features
-    pixels: list[np.ndarray]  # for each camera, (features, 2)
-    matches: dict[tuple[int, int], np.ndarray]  # (M, 2) features, of verified pairs i < j
 
 
 def walk() -> Walk:
@@ -71,21 +67,16 @@ def walk() -> Walk:
                 )
             if len(one) >= 30:
                 matches[i, j] = np.stack([one, two], 1).astype(np.uint32)
-    return Walk(xyz, twins, centres, rotations, seen, pixels, matches)
+    return Walk(centres, pixels, matches, xyz, twins, rotations, seen)
 
 
 def photos() -> list[Photo]:
-    return [
-        Photo(name, name, WIDTH, HEIGHT, "camera", None, FOCAL, None, False, False)
-        for name in (f"{i:02}.png" for i in range(COUNT))
-    ]
+    return walks.Walk(np.zeros((COUNT, 3)), [], {}).photos(FOCAL)
 
 
 def write_database(path: Path, scene: Walk) -> Path:
-    open_database(path, photos(), Lens("SIMPLE_PINHOLE"), "none")
     config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
-    write_features(path, scene.pixels, scene.matches, config)
-    return path
+    return scene.write(path, FOCAL, Lens("SIMPLE_PINHOLE"), config)
 
 
 def model(scene: Walk, folded: bool) -> pycolmap.Reconstruction:

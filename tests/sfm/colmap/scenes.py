@@ -143,13 +143,7 @@ def save(dataset: Path, name: str, image: np.ndarray, **of_it) -> Photo:
     path = dataset / "input" / name
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path)
-    facts = {
-        "group": "camera",
-        "sequence": None,
-        "focal": None,
-        "location": None,
-        "mask": False,
-        "alpha": False,
-    }
     height, width = image.shape[:2]
-    return Photo(name=name, source=name, width=width, height=height, **(facts | of_it))
+    return Photo(
+        name=name, source=name, width=width, height=height, **({"group": "camera"} | of_it)
+    )

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from snowsplat.sfm.colmap.database import (
-    Pair,
+    VerifiedPair,
     closing_database,
     displacement_of,
     feature_counts,
@@ -17,7 +17,6 @@ from snowsplat.sfm.colmap.database import (
     read_descriptors,
     replace_database,
     set_cameras,
-    set_names,
     verified_pairs,
 )
 from snowsplat.sfm.colmap.lenses.lens import Lens
@@ -25,7 +24,7 @@ from snowsplat.sfm.ingest.photo import Photo
 
 
 def photo(name, group="phone", focal=None, size=(640, 480)):
-    return Photo(name, name, *size, group, None, focal, None, False, False)
+    return Photo(name, name, *size, group, focal=focal)
 
 
 PHOTOS = [photo(f"ünter wegs/{i} b.jpg") for i in range(8)] + [
@@ -106,12 +105,6 @@ def test_another_camera_model_keeps_the_features(path):
         assert {c.model_name for c in database.read_all_cameras()} == {"RADIAL"}
 
 
-def test_names_are_restored_after_a_kill_during_matching(path):
-    set_names(path, [str(i) for i in range(len(PHOTOS))])
-    open_database(path, PHOTOS, Lens("auto"), "one")
-    assert names(path) == {i: p.name for i, p in enumerate(PHOTOS, start=1)}
-
-
 @pytest.mark.parametrize("how", ["truncated", "no fingerprint", "text", "empty"])
 def test_a_damaged_database_is_replaced(path, how):
     add_features(path, 5000)
@@ -145,8 +138,8 @@ def test_verified_pairs_have_their_kind(path):
             geometry.config = getattr(pycolmap.TwoViewGeometryConfiguration, config)
             geometry.inlier_matches = matches
             database.write_two_view_geometry(1, other, geometry)
-    pairs = {(p.first, p.second): (p.inliers, p.flat) for p in verified_pairs(path)}
-    assert pairs == {(0, 1): (20, False), (0, 2): (20, True)}
+    pairs = {(p.first, p.second): (p.matches, p.flat) for p in verified_pairs(path)}
+    assert pairs == {(1, 2): (20, False), (1, 3): (20, True)}
 
 
 def test_descriptors_of_the_largest_features_are_read(path):
@@ -181,5 +174,5 @@ def test_matches_of_a_logo_do_not_hide_the_displacement(path, moving, expected):
         database.write_keypoints(1, first)
         database.write_keypoints(2, second.astype(np.float32))
         database.write_two_view_geometry(1, 2, geometry)
-    pair = Pair(0, 1, 100, False)
+    pair = VerifiedPair(1, 2, 100)
     assert displacement_of(path, [pair], still=6.4) == pytest.approx(expected, abs=1e-3)

@@ -250,20 +250,6 @@ def test_camera_that_did_not_move(tmp_path, poses, message):
         assert not (tmp_path / "distorted" / "sparse").exists()
 
 
-def test_photos_of_different_scenes(tmp_path):
-    different = [
-        scenes.photograph(scenes.boards(i), scenes.arc(3)[i % 3], zoom=MANY_FEATURES)
-        for i in range(1, 4)
-    ]
-    with pytest.raises(UserError, match="do not overlap"):
-        estimate_poses(tmp_path, scenes.write(tmp_path, different), DRAFT, silent)
-
-
-def test_black_photos(tmp_path):
-    with pytest.raises(UserError, match="too dark, blurred or plain"):
-        estimate_poses(tmp_path, scenes.write(tmp_path, [BLACK] * 4), DRAFT, silent)
-
-
 def test_two_photos(tmp_path, pictures):
     with pytest.raises(UserError, match="photos: 2 are not enough"):
         estimate_poses(tmp_path, scenes.write(tmp_path, pictures[:2]), DRAFT, silent)

@@ -23,9 +23,7 @@ def photos_of(images, sequence=None):
     for path in sorted(images.glob("*.jpg")):
         with Image.open(path) as image:
             width, height = image.size
-        photos.append(
-            Photo(path.name, path.name, width, height, "", sequence, None, None, False, False)
-        )
+        photos.append(Photo(path.name, path.name, width, height, sequence=sequence))
     return photos
 
 

@@ -1,4 +1,4 @@
-"""Whether further attempts to estimate poses are made."""
+"""Whether further attempts to estimate poses are made, and which of them is the best."""
 
 import time
 from types import SimpleNamespace
@@ -14,6 +14,25 @@ from snowsplat.sfm.options import SfmOptions
 from snowsplat.sfm.progress import silent
 
 
+def attempt(registered, agreement=0.99, error=1.0, misfit=1.0, lens=None, doubts=()):
+    return SimpleNamespace(
+        registered=registered,
+        agreement=agreement,
+        error=error,
+        misfit=misfit,
+        lens=lens or Lens(),
+        doubts=doubts,
+    )
+
+
+@pytest.fixture
+def job(tmp_path):
+    """10 photos are usable."""
+    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
+    job.evidence = SimpleNamespace(usable=10)
+    return job
+
+
 @pytest.mark.parametrize(
     ("seconds", "elapsed", "registered", "enough"),
     [
@@ -24,13 +43,10 @@ from snowsplat.sfm.progress import silent
         (90.0, 40.0, 0, False),  # without any pose, the time does not matter
     ],
 )
-def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registered, enough):
-    progress = WorkerProgress(silent)
-    options = SfmOptions(seconds=seconds)
-    job = PoseEstimation(DatasetFolder(tmp_path), [], options, 1, progress)
+def test_attempts_end_early_if_time_is_short(job, seconds, elapsed, registered, enough):
+    job.options = SfmOptions(seconds=seconds)
     job.started = time.monotonic() - elapsed
-    job.attempts = [SimpleNamespace(registered=registered)]
-    job.evidence = SimpleNamespace(usable=10)
+    job.attempts = [attempt(registered)]
     assert job._enough == enough
 
 
@@ -43,44 +59,27 @@ def test_attempts_end_early_if_time_is_short(tmp_path, seconds, elapsed, registe
         ([(10, 0.8), (4, 0.99)], False, 0),
     ],
 )
-def test_a_bent_model_is_not_good(tmp_path, attempts, good, best):
-    progress = WorkerProgress(silent)
-    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, progress)
-    job.attempts = [
-        SimpleNamespace(
-            registered=n, agreement=share, error=1.0, lens=Lens(), doubts=[], misfit=1.0
-        )
-        for n, share in attempts
-    ]
-    job.evidence = SimpleNamespace(usable=10)
+def test_a_bent_model_is_not_good(job, attempts, good, best):
+    job.attempts = [attempt(*each) for each in attempts]
     assert job._good == good
     assert best_attempt(job.attempts) is job.attempts[best]
 
 
-def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors(tmp_path):
-    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
-    fisheye = Lens(fisheyes=frozenset([1]))
-    job.attempts = [
-        SimpleNamespace(registered=n, agreement=share, error=e, lens=lens, doubts=[], misfit=e)
-        for n, share, e, lens in ((9, 0.95, 0.24, fisheye), (10, 0.99, 0.62, Lens()))
-    ]
-    assert best_attempt(job.attempts) is job.attempts[0]
-    job.attempts[1].error = 0.25
-    assert best_attempt(job.attempts) is job.attempts[1]
+def test_a_model_of_the_wrong_kind_of_lens_has_larger_errors():
+    fisheye = attempt(9, 0.95, 0.24, 0.24, Lens(fisheyes=frozenset([1])))
+    ordinary = attempt(10, 0.99, 0.62, 0.62)
+    assert best_attempt([fisheye, ordinary]) is fisheye
+    ordinary.error = 0.25
+    assert best_attempt([fisheye, ordinary]) is ordinary
 
 
-def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_path):
+def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches():
     """A few photos of a flat field: with a wrong focal length, the poses are bent."""
-    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
-    job.attempts = [
-        SimpleNamespace(registered=5, agreement=0.79, error=0.69, misfit=1.10e-3, lens=Lens()),
-        SimpleNamespace(registered=5, agreement=0.75, error=0.61, misfit=1.00e-3, lens=Lens()),
-    ]
-    bent, other = job.attempts
-    bent.doubts, other.doubts = ["the focal length in EXIF does not agree with the photos"], []
-    assert best_attempt(job.attempts) is other
+    bent = attempt(5, 0.79, 0.69, 1.10e-3, doubts=["the focal length in EXIF does not agree"])
+    other = attempt(5, 0.75, 0.61, 1.00e-3)
+    assert best_attempt([bent, other]) is other
     other.misfit = 1.2e-3  # the photos contradict the focal length in EXIF
-    assert best_attempt(job.attempts) is bent
+    assert best_attempt([bent, other]) is bent
 
 
 @pytest.mark.parametrize(
@@ -93,15 +92,10 @@ def test_a_lens_that_contradicts_exif_has_to_agree_better_with_the_matches(tmp_p
     ],
 )
 def test_the_focal_length_in_exif_is_held_if_the_lens_contradicts_it(
-    tmp_path, monkeypatch, doubts, known, exif, tried
+    job, monkeypatch, doubts, known, exif, tried
 ):
     """Even if the poses agree with the matches: a bent model of a street may."""
     monkeypatch.setattr(reconstruct, "exif_focals", lambda photos: known)
-    job = PoseEstimation(DatasetFolder(tmp_path), [], SfmOptions(), 1, WorkerProgress(silent))
-    job.attempts = [
-        SimpleNamespace(
-            registered=9, agreement=0.95, error=1.0, lens=Lens(), doubts=doubts, misfit=1.0
-        )
-    ]
+    job.attempts = [attempt(9, 0.95, doubts=doubts)]
     job.lens = Lens(exif=exif)
     assert job._contradicts_exif() == tried

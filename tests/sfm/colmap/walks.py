@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from snowsplat.synthetic.lens import Lens as PhoneLens
 from ...scenes.lenses import FisheyeLens
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
+CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 ORDINARY = PhoneLens(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, 0.0, 0.0))
 
 
@@ -31,33 +31,20 @@ class Walk:
     def photos(self, exif: float | None) -> list[Photo]:
         """``exif``: the focal length in EXIF, in pixels."""
         names = [f"{i:02}.png" for i in range(len(self.centres))]
-        return [Photo(n, n, WIDTH, HEIGHT, "", None, exif, None, False, False) for n in names]
+        return [Photo(n, n, WIDTH, HEIGHT, focal=exif) for n in names]
 
-    def write(self, path: Path, exif: float | None, lens: Lens) -> Path:
+    def write(self, path: Path, exif: float | None, lens: Lens, config=CALIBRATED) -> Path:
+        """Write the photos, their features, and the verified matches, all of one kind."""
         open_database(path, self.photos(exif), lens, "none")
-        config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-        write_features(path, self.pixels, self.matches, config)
+        with closing_database(path) as database:
+            for i, positions in enumerate(self.pixels):
+                database.write_keypoints(i + 1, positions.astype(np.float32))
+            for (i, j), rows in self.matches.items():
+                geometry = pycolmap.TwoViewGeometry()
+                geometry.config = config
+                geometry.inlier_matches = rows
+                database.write_two_view_geometry(i + 1, j + 1, geometry)
         return path
-
-
-def write_features(
-    path: Path,
-    pixels: Sequence[np.ndarray],
-    matches: Mapping[tuple[int, int], np.ndarray],
-    config: pycolmap.TwoViewGeometryConfiguration,
-) -> None:
-    """Write the features and the verified matches of photos into their database.
-
-    ``pixels`` and ``matches`` as in `Walk`; ``config``: of all pairs.
-    """
-    with closing_database(path) as database:
-        for i, positions in enumerate(pixels):
-            database.write_keypoints(i + 1, positions.astype(np.float32))
-        for (i, j), rows in matches.items():
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = config
-            geometry.inlier_matches = rows
-            database.write_two_view_geometry(i + 1, j + 1, geometry)
 
 
 def forward(count: int = 12, step: float = 1.5) -> Walk:

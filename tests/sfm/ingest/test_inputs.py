@@ -9,23 +9,25 @@ import pillow_heif
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.inputs import gather
 from snowsplat.sfm.ingest.photo import Photo, not_used
 from snowsplat.sfm.ingest.search.sources import find_sources
-from snowsplat.sfm.options import GatherOptions
-from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 
-from ..pictures import HEIGHT, WIDTH, blurred, exif, pan, photo, wall, write_photos, write_video
+from ..pictures import (
+    HEIGHT,
+    WIDTH,
+    blurred,
+    exif,
+    gathered,
+    pan,
+    photo,
+    wall,
+    write_photos,
+    write_video,
+)
 
 pytestmark = pytest.mark.slow  # decodes and writes photos and videos
-
-
-def gathered(inputs, dataset, report=silent, **options):
-    dataset.mkdir(exist_ok=True)
-    inputs = inputs if isinstance(inputs, list) else [inputs]
-    return gather(inputs, dataset, GatherOptions(**options), report)
 
 
 def files(folder):
@@ -52,11 +54,6 @@ def test_ready_photos_are_linked_unchanged(tmp_path):
         width=WIDTH,
         height=HEIGHT,
         group=made.photos[1].group,
-        sequence=None,
-        focal=None,
-        location=None,
-        mask=False,
-        alpha=False,
     )
     assert made.photos[0].group != next(p for p in made.photos if "grey" in p.name).group
     assert not (tmp_path / "out" / "distorted").exists()

@@ -78,7 +78,7 @@ def dataset(folder: Path, poses: list[np.ndarray], sizes: dict[int, float], plac
         own[:, 3] /= SCALE
         image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(own))
-        photos.append(Photo(name, name, WIDTH, HEIGHT, "", None, None, None, False, False))
+        photos.append(Photo(name, name, WIDTH, HEIGHT, ""))
     return model, photos
 
 

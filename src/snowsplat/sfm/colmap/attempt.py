@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,7 +22,7 @@ from snowsplat.sfm.colmap.database import (
     set_cameras,
 )
 from snowsplat.sfm.colmap.features.extraction import WorkerProgress, extract_features
-from snowsplat.sfm.colmap.lenses.lens import Lens, Refine, misfit, settle_lens, with_all_parameters
+from snowsplat.sfm.colmap.lenses.lens import Lens, misfit, settle_lens, with_all_parameters
 from snowsplat.sfm.colmap.mapping.mapping import Mapping, usable_models
 from snowsplat.sfm.colmap.options import Effort, detection_size
 from snowsplat.sfm.colmap.pairs.choice import PairChoice, choose_pairs
@@ -88,22 +89,15 @@ class Attempt:
         return misfit(self.models[0]) if self.models else float("inf")
 
 
+@dataclass
 class AttemptRunner:
     """Matches photos and makes attempts with the matches."""
 
-    def __init__(
-        self,
-        dataset: DatasetFolder,
-        photos: list[Photo],
-        camera_model: str,
-        threads: int,
-        progress: WorkerProgress,
-    ) -> None:
-        self.dataset = dataset
-        self.photos = photos  # their groups may be changed between two attempts
-        self.camera_model = camera_model
-        self.threads = threads
-        self.progress = progress
+    dataset: DatasetFolder
+    photos: list[Photo]  # their groups may be changed between two attempts
+    camera_model: str
+    threads: int
+    progress: WorkerProgress
 
     def match(
         self, database: Path, effort: Effort, pairing: Effort, *, reserve: bool = True
@@ -125,28 +119,19 @@ class AttemptRunner:
         ]
         scale = max(1.0, float(np.median(scales)))
         matched = Matched(database, effort, choice.whole() if reserve else choice, scale)
-        self._match_pairs(matched)
+        self._for_pairs(match_pairs, matched)
         return matched
 
-    def match_more(self, matched: Matched, choice: PairChoice, lens: Lens) -> Matched:
-        """Match and verify those pairs of ``choice`` that are not matched yet."""
-        if choice.pairs == matched.choice.pairs:
-            return matched
-        more = dataclasses.replace(matched, choice=choice)
-        self._match_pairs(more)
-        self.verify(more, lens)
-        return more
-
-    def _match_pairs(self, matched: Matched) -> None:
-        pairs, error = matched.choice.pairs, matched.max_error
-        match_pairs(matched.database, pairs, error, self.threads, self.progress)
-
     def verify(self, matched: Matched, lens: Lens) -> None:
-        """Verify those matches of ``matched`` that are not verified yet. The cameras of ``lens``
-        replace those in the database."""
+        """Match and verify those pairs of ``matched`` that are not verified yet. The cameras of
+        ``lens`` replace those in the database."""
         set_cameras(matched.database, self.photos, lens)
-        pairs, error = matched.choice.pairs, matched.max_error
-        verify_pairs(matched.database, pairs, error, self.threads, self.progress)
+        self._for_pairs(match_pairs, matched)
+        self._for_pairs(verify_pairs, matched)
+
+    def _for_pairs(self, work: Callable[..., None], matched: Matched) -> None:
+        pairs = matched.choice.pairs
+        work(matched.database, pairs, matched.max_error, self.threads, self.progress)
 
     def evidence(self, matched: Matched) -> Evidence:
         """What the matches tell about the photos."""
@@ -183,10 +168,10 @@ class AttemptRunner:
             repaired = repair(models[0], mapping, matched.max_error)
             excluded = repaired.excluded
             check = f"; {repaired.description}" if repaired.description else ""
-            refine = _refine_with(mapping)
-            found = settle_lens(repaired.model, self.photos, lens, refine)
+            found = settle_lens(repaired.model, self.photos, lens, mapping.with_cameras)
             mapping, doubts = dataclasses.replace(mapping, held=found.held), found.notes
             if found.model:
+                refine = mapping.with_cameras
                 model = with_all_parameters(found.model, self.photos, lens, refine, found.held)
                 models = usable_models([model, *models[1:]])
             else:
@@ -203,9 +188,3 @@ class AttemptRunner:
             f"{registered} of {len(self.photos)} photos registered{weak}{check}"
         )
         return Attempt(matched, lens, mapping, models, agreement, excluded, doubts, description)
-
-
-def _refine_with(mapping: Mapping) -> Refine:
-    return lambda model, cameras, held: dataclasses.replace(mapping, held=held).with_cameras(
-        model, cameras
-    )

@@ -6,28 +6,14 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
+from snowsplat.data.lens.models import COLMAP_MODELS
 from snowsplat.sfm.options import EffortName
 from snowsplat.util.machine import processor_count
 from snowsplat.util.messages import Message
 
 # The camera models of COLMAP that can be undistorted to pinhole cameras.
-CAMERA_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "FOV",
-    "OPENCV_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "EQUIRECTANGULAR",
-)
+_NOT_UNDISTORTED = ("SIMPLE_DIVISION", "DIVISION", "EUCM")
+CAMERA_MODELS = tuple(m.name for m in COLMAP_MODELS if m.name not in _NOT_UNDISTORTED)
 #: The camera model of 360° panoramas, twice as wide as high.
 PANORAMA_MODEL = "EQUIRECTANGULAR"
 

@@ -1,42 +1,27 @@
 """Estimates camera poses from photos, in several attempts with increasing effort.
 
-With the same features and matches:
-    1  as configured
-    2  the other mapper
-    3  the focal length is held, and the camera may move forward (`Lens.fixed`)
-    4  registered in COLMAP's own order
-With further matches:
-    5  more pairs; weaker matches are accepted
-    6  twice as many features, from larger photos; about 4 times the work of the first attempt
-    7  these, with a held focal length
-    8  these, with the other mapper
-
-If pairs of similar photos were held in reserve (`pairs`), and the first attempt is not good, it is
-repeated with them.
-
-After the first four, bundle adjustment shows whether one focal length fits all photos of a camera.
-If not, the attempt is made with several, which remain for the others (`camera_groups`).
+`PoseEstimation._make_attempts` has the attempts in their order, and when each of them is made:
+first others with the same features and matches, then with more pairs, then with more features, at
+about 4 times the work of the first attempt.
 
 Before the first attempt, the matches tell whether a camera has a fisheye lens (`fisheye`); so does
-the picture, if it is a disc. If this attempt is not good, it is also made with an ordinary lens,
-and the better model decides.
-
-The matches may show only a rotation because the focal length in EXIF is wrong. In this case, they
-are verified again without it.
+the picture, if it is a disc. After the first attempts, bundle adjustment shows whether one focal
+length fits all photos of a camera. If not, the attempt is made with several, which remain for the
+others (`camera_groups`).
 
 The attempts end when one of them finds poses for 90% of the usable photos (`Evidence.usable`), or
 when the matches show that no further attempt can succeed. If these poses do not agree with the
-matches, the second and third attempts are made, too; the third one also if their lens contradicts
-EXIF. The result is the possible model (see `lens`) with the most registered photos, weighted by its
-agreement with the matches.
+matches, some further attempts are made, too. The result is the possible model (see `lens`) with the
+most registered photos, weighted by its agreement with the matches.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 from snowsplat.project.dataset_folder import DatasetFolder
 from snowsplat.sfm.colmap.attempt import AnyMapper, Attempt, AttemptRunner, Matched
@@ -62,6 +47,7 @@ from snowsplat.sfm.colmap.lenses.lens import (
 )
 from snowsplat.sfm.colmap.mapping.mapping import write_models
 from snowsplat.sfm.colmap.options import Effort, SfmResult
+from snowsplat.sfm.colmap.pairs.choice import PairChoice
 from snowsplat.sfm.colmap.result import names_in, result_of
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import Mapper, SfmOptions
@@ -80,11 +66,7 @@ _ZOOM_ATTEMPTS = 3
 
 
 class PoseEstimation:
-    """The attempts for one set of photos. `run` makes them and writes the best result.
-
-    Each method ``_try_…`` is a remedy for one cause of a failure: it makes an attempt if the
-    attempts before show this cause.
-    """
+    """The attempts for one set of photos. `run` makes them and writes the best result."""
 
     matched: Matched  # of the last attempt
     evidence: Evidence  # of the matches of the first attempts
@@ -102,8 +84,6 @@ class PoseEstimation:
         self.dataset = dataset
         self.strong_database = dataset.distorted / "database_strong.db"  # with more features
         self.options = options
-        self.threads = threads
-        self.progress = progress
         self.runner = AttemptRunner(dataset, photos, options.camera_model, threads, progress)
         self.lens_evidence: dict[int, LensEvidence] = {}  # by camera id
         self.started = time.monotonic()
@@ -128,23 +108,15 @@ class PoseEstimation:
             error = failure(self.runner.evidence(self.matched), doubts)
             remove_database(self.strong_database)
             raise error
-        self.progress.show_poses(best.models[0], True)
+        self.runner.progress.show_poses(best.models[0], True)
         for model in best.models:
             best.mapping.align_features(model, best.matched.effort.image_size)
             best.mapping.add_points(model)
-            model.extract_colors_for_all_images(self.dataset.photos, self.threads)
+            model.extract_colors_for_all_images(self.dataset.photos, self.runner.threads)
         write_models(best.models, self.dataset.distorted_models)
         names = [names_in(model) for model in best.models]
         evidence = self.runner.evidence(best.matched)
-        result = result_of(
-            best.models,
-            self.photos,
-            explain(self.photos, evidence, names, best.excluded),
-            best.matched.choice.description,
-            self.log,
-            exif=best.lens.exif,
-            held=best.mapping.held,
-        )
+        unregistered = explain(self.photos, evidence, names, best.excluded)
         if best.matched.database == self.strong_database:
             replace_database(self.dataset.database, by=self.strong_database)
         remove_database(self.strong_database)
@@ -154,8 +126,14 @@ class PoseEstimation:
                 f"the poses may be bent: where they fit least, {best.agreement:.0%} of the matches "
                 "between neighbouring photos agree with them"
             )
-        return dataclasses.replace(
-            result,
+        return result_of(
+            best.models,
+            self.photos,
+            exif=best.lens.exif,
+            held=best.mapping.held,
+            unregistered=unregistered,
+            pairs=best.matched.choice.description,
+            attempts=self.log,
             doubts=doubts + self._doubt_about_fisheye(best),
             zooms="" if self.photos is given else camera_groups.describe(best.models[0]),
             agreement=best.agreement,
@@ -163,21 +141,46 @@ class PoseEstimation:
         )
 
     def _make_attempts(self, effort: Effort) -> None:
-        """Make as many attempts as needed, the first with ``effort``."""
-        self._try_first(effort)
-        self._try_reserved_pairs()
-        self._try_without_exif()
-        self._try_ordinary_lens()
+        """Make as many attempts as needed, the first with ``effort``. Each of the others is a
+        remedy for one cause of a failure, if the attempts before show this cause."""
+        self._match_first(effort)
+        self._try("as configured")
+        if not self._good and self.matched.choice.reserve:
+            # Pairs of similar photos were held in reserve, because places may only look alike.
+            self._verify(self.matched.choice.whole())
+            self._try("with more pairs")
+        if not self._found and self.evidence.flat and exif_focals(self.photos):
+            # With a wrong focal length, the matches may show only a rotation.
+            self.lens = replace(self.lens, exif=False)
+            forget_verification(self.matched.database)
+            self._verify(self.matched.choice)
+            self._try("as configured")
+        if self.lens.fisheyes and not self._good:
+            # The matches, or a disc, may suggest a fisheye lens where there is none.
+            self._try("as configured", lens=replace(self.lens, fisheyes=frozenset(), focals={}))
+            self.lens = best_attempt(self.attempts).lens
         if not self._found and self.evidence.more_effort_is_useless:
             return
-        self._try_other_mapper()
-        self._try_held_focal_length()
-        self._try_plain_order()
+        other: Mapper = "incremental" if self.mapper == "global" else "global"
+        if not (self._good or self.evidence.flat):
+            self._try("as configured", other)
+        if not self._good or self._contradicts_exif():
+            # The photos may not determine the focal length.
+            self._try("as configured", "incremental", self.lens.fixed)
+        if not self._enough:
+            self._try("as configured", "plain")
         self._try_zooms()
+        if not (self._enough or (self._found and self.evidence.matched_all)):
+            self._match_again(self.dataset.database, effort, effort.stronger())
+            self._try("with more pairs and weaker matches", "incremental", weak=True)
+        how, stronger = "with more features, from larger photos", effort.stronger()
         if not self._enough:
-            self._try_more_pairs(effort)
-        if not self._enough:
-            self._try_more_features(effort.stronger())
+            self._match_again(self.strong_database, stronger, stronger)
+            self._try(how, weak=True)
+            if not self._enough:
+                self._try(how, "incremental", self.lens.fixed)
+            if not self._enough and not self.evidence.flat:
+                self._try(how, other, weak=True)
 
     def _try(
         self,
@@ -192,73 +195,27 @@ class PoseEstimation:
         self.attempts.append(attempt)
         self.log.append(attempt.description)
 
-    def _try_first(self, effort: Effort) -> None:
+    def _match_first(self, effort: Effort) -> None:
+        """The matches and the lens of the first attempt."""
         database = self.dataset.database
         self.matched = self.runner.match(database, effort, effort, reserve=False)
         self.lens_evidence = lens_evidence(database, self.photos, self.matched.scale)
         self.lens = self._first_lens()
         self.runner.verify(self.matched, self.lens)
-        completed = self.matched.choice.completed(verified_pairs(database), len(self.photos))
-        self.matched = self.runner.match_more(self.matched, completed, self.lens)
-        self.evidence = self.runner.evidence(self.matched)
+        choice = self.matched.choice
+        self._verify(choice.complete(verified_pairs(database), len(self.photos)))
         # The global mapper returns a wrong depth for flat scenes.
         self.mapper = "incremental" if self.evidence.flat else self.options.mapper
-        self._try("as configured")
 
-    def _try_reserved_pairs(self) -> None:
-        """Pairs of similar photos were held in reserve, because places may only look alike."""
-        if self._good or not self.matched.choice.reserve:
-            return
-        self.matched = self.runner.match_more(self.matched, self.matched.choice.whole(), self.lens)
-        self.evidence = self.runner.evidence(self.matched)
-        self._try("with more pairs")
-
-    def _try_without_exif(self) -> None:
-        """With a wrong focal length, the matches may show only a rotation."""
-        if self._found or not (self.evidence.flat and exif_focals(self.photos)):
-            return
-        self.lens = dataclasses.replace(self.lens, exif=False)
-        forget_verification(self.matched.database)
+    def _verify(self, choice: PairChoice) -> None:
+        """Match and verify those of these pairs that are not verified yet."""
+        self.matched = replace(self.matched, choice=choice)
         self.runner.verify(self.matched, self.lens)
         self.evidence = self.runner.evidence(self.matched)
-        self._try("as configured")
 
-    def _try_ordinary_lens(self) -> None:
-        """The matches, or a disc, may suggest a fisheye lens where there is none."""
-        if self.lens.fisheyes and not self._good:
-            ordinary = dataclasses.replace(self.lens, fisheyes=frozenset(), focals={})
-            self._try("as configured", lens=ordinary)
-            self.lens = best_attempt(self.attempts).lens
-
-    def _try_other_mapper(self) -> None:
-        if not (self._good or self.evidence.flat):
-            self._try("as configured", self._other_mapper)
-
-    def _try_held_focal_length(self) -> None:
-        """The photos may not determine the focal length."""
-        if not self._good or self._contradicts_exif():
-            self._try("as configured", "incremental", self.lens.fixed)
-
-    def _try_plain_order(self) -> None:
-        if not self._enough:
-            self._try("as configured", "plain")
-
-    def _try_more_pairs(self, effort: Effort) -> None:
-        if self._found and self.evidence.matched_all:
-            return
-        self.matched = self.runner.match(self.dataset.database, effort, effort.stronger())
+    def _match_again(self, database: Path, effort: Effort, pairing: Effort) -> None:
+        self.matched = self.runner.match(database, effort, pairing)
         self.runner.verify(self.matched, self.lens)
-        self._try("with more pairs and weaker matches", "incremental", weak=True)
-
-    def _try_more_features(self, effort: Effort) -> None:
-        how = "with more features, from larger photos"
-        self.matched = self.runner.match(self.strong_database, effort, effort)
-        self.runner.verify(self.matched, self.lens)
-        self._try(how, weak=True)
-        if not self._enough:
-            self._try(how, "incremental", self.lens.fixed)
-        if not self._enough and not self.evidence.flat:
-            self._try(how, self._other_mapper, weak=True)
 
     def _try_zooms(self) -> None:
         """The photos of a camera may have several focal lengths, which remain for the others.
@@ -274,13 +231,13 @@ class PoseEstimation:
             models = self.runner.mapping(self.matched, pinhole).run("incremental")
             focals = camera_groups.focals_of(models[0]) if models else {}
         else:
-            focals = camera_groups.own_focals(best.models[0], self.threads)
+            focals = camera_groups.own_focals(best.models[0], self.runner.threads)
         for _ in range(_ZOOM_ATTEMPTS):
             before, several = self.photos, camera_groups.group_by_zoom(one, focals)
             if several is None or camera_ids(several) == camera_ids(before):
                 break
             self.runner.photos = several
-            begin = dataclasses.replace(lens, focals=focals_by_camera(several, focals))
+            begin = replace(lens, focals=focals_by_camera(several, focals))
             self._try("with several focal lengths", lens=begin)
             made, best = self.attempts.pop(), best_attempt(self.attempts)
             made_better = bool(made.models) and camera_groups.better(
@@ -291,13 +248,11 @@ class PoseEstimation:
                 break
             self.attempts, lens = [made], begin  # the other models are bent
             model = made.models[0]
-            focals = camera_groups.focals_of(model) | camera_groups.own_focals(model, self.threads)
+            focals = camera_groups.focals_of(model) | camera_groups.own_focals(
+                model, self.runner.threads
+            )
         set_cameras(self.matched.database, self.photos, lens)
         self.lens = lens
-
-    @property
-    def _other_mapper(self) -> Mapper:
-        return "incremental" if self.mapper == "global" else "global"
 
     def _first_lens(self) -> Lens:
         """The lens of the first attempt, with the focal lengths that discs and matches propose."""
@@ -306,10 +261,10 @@ class PoseEstimation:
         sure = {n: focal for n, focal in proposed.items() if self.lens_evidence[n].fisheye}
         if lens.model == "auto":
             focals = circles | sure
-            return dataclasses.replace(lens, fisheyes=frozenset(focals), focals=focals)
+            return replace(lens, fisheyes=frozenset(focals), focals=focals)
         if not lens.any_fisheye:
             return lens
-        return dataclasses.replace(lens, focals=proposed | circles | sure)
+        return replace(lens, focals=proposed | circles | sure)
 
     def _describe_fisheye(self, best: Attempt) -> str:
         """`SfmResult.fisheye` of the attempt ``best``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,28 +14,29 @@ from snowsplat.sfm.colmap.options import SfmResult
 from snowsplat.sfm.colmap.process.check_model import can_be_read
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.errors import SettingError, UserError
-from snowsplat.util.messages import Message, message
+from snowsplat.util.messages import message
 from snowsplat.util.safe_json import inside, quoted
 
 
 def result_of(
     models: Sequence[pycolmap.Reconstruction],
     photos: Sequence[Photo],
-    unregistered: dict[str, Message],
-    pairs: str,
-    attempts: list[str],
     exif: bool = True,
     held: bool = False,
+    **found: Any,
 ) -> SfmResult:
-    """Statistics of the first of ``models`` (at least one, the largest first).
+    """The result with the statistics of the first of ``models`` (at least one, the largest first).
 
-    ``exif``: the focal length in EXIF was used; ``held``: the focal length was not refined.
+    Args:
+        exif: the focal length in EXIF was used.
+        held: the focal length was not refined.
+        found: the fields of `SfmResult` that the models do not tell.
     """
-    model = models[0]
+    model, names = models[0], names_in(models[0])
     with_focal = {photo.name for photo in photos if photo.focal and exif}
     cameras = []
     for camera_id, camera in sorted(model.cameras.items()):
-        taken = {n for n in names_in(model) if model.find_image_with_name(n).camera_id == camera_id}
+        taken = {n for n in names if model.find_image_with_name(n).camera_id == camera_id}
         if taken:
             cameras.append(
                 {
@@ -47,24 +49,17 @@ def result_of(
                     "images": len(taken),
                 }
             )
+    # The points of two photos have small errors even if a pose is slightly wrong.
+    errors = [p.error for p in model.points3D.values() if p.track.length() > 2]
     return SfmResult(
-        registered=sorted(names_in(model)),
-        unregistered=unregistered,
+        registered=sorted(names),
         points=model.num_points3D(),
         observations=model.compute_num_observations(),
-        reprojection_error=_reprojection_error(model),
+        reprojection_error=float(np.mean(errors)) if errors else 0.0,
         sub_models=[m.num_reg_images() for m in models],
         cameras=cameras,
-        pairs=pairs,
-        attempts=attempts,
+        **found,
     )
-
-
-def _reprojection_error(model: pycolmap.Reconstruction) -> float:
-    """The mean over the points that at least three photos see, in pixels; 0 without such points.
-    The points of two photos have small errors even if a pose is slightly wrong."""
-    errors = [p.error for p in model.points3D.values() if p.track.length() > 2]
-    return float(np.mean(errors)) if errors else 0.0
 
 
 def names_in(model: pycolmap.Reconstruction) -> set[str]:
@@ -102,7 +97,8 @@ def describe_model(dataset: Path, photos: Sequence[Photo]) -> SfmResult:
         raise _cannot_skip(f"the model in {numbered[0]} has none of the photos in {files.photos}")
     missing = message("it is not in the existing model")
     unregistered = {photo.name: missing for photo in photos if photo.name not in names}
-    return result_of(models, photos, unregistered, "not matched: the model existed already", [])
+    pairs = "not matched: the model existed already"
+    return result_of(models, photos, unregistered=unregistered, pairs=pairs, attempts=[])
 
 
 def _cannot_skip(reason: str) -> UserError:

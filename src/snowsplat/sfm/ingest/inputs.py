@@ -24,7 +24,6 @@ from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.ingest.photos.gather_photos import (
     Planned,
     plan_photos,
-    spread_evenly,
     write_photos,
 )
 from snowsplat.sfm.ingest.photos.set_aside import set_fixed_parts_aside
@@ -42,6 +41,26 @@ from snowsplat.util.natural_order import natural_key
 logger = logging.getLogger(__name__)
 
 _NAMED = 3  # photos that an error names
+_COLOURS = {BLACK: message("black"), WHITE: message("white"), FLAT: message("of one colour")}
+#: The error if most images are unusable for one of these reasons.
+_ADVICE = {
+    SAME_VIEW: message(
+        "{video}: the camera does not move ({who} show the same view), but depth needs motion; "
+        "film while walking around the scene"
+    ),
+    STITCHED: message(
+        "photos: {who} are stitched panoramas, which no lens has taken; use the single photos, or "
+        "panoramas of all directions (equirectangular, twice as wide as high)"
+    ),
+    BLURRED: message(
+        "photos: {who} are too blurred to be matched; hold the camera still for each photo, in "
+        "good light and in focus"
+    ),
+    **dict.fromkeys(
+        _COLOURS,
+        message("photos: {who} are completely {what}; check the lens cap, the light and the files"),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -82,11 +101,7 @@ def gather(
         logger.warning("%s", note)
     left_out = list(sources.left_out)
     in_place = sources.contain(folder)
-    planned = plan_photos(
-        sources.photos, options.size, left_out, options.panoramas, options.as_stored
-    )
-    if options.photos is not None:
-        planned = spread_evenly(planned, options.photos)
+    planned = plan_photos(sources.photos, options, left_out)
     clips = [(video, read_clip(video.path)) for video in sources.videos]
     around = [_shows_all_around(clip, options) for _, clip in clips]
     if in_place:
@@ -202,10 +217,6 @@ def _take_frames(
             height=frame.height,
             group=f"{label} {frame.width}x{frame.height}" + " panorama" * frames.panoramas,
             sequence=label,
-            focal=None,
-            location=None,
-            mask=False,
-            alpha=False,
             panorama=frames.panoramas,
         )
         for frame in frames.kept
@@ -262,37 +273,10 @@ def _too_few(usable: int, left_out: Sequence[LeftOut]) -> UserError:
             min_photos=MIN_PHOTOS,
             left_out=reasons_of_some,
         )
-    if reason == SAME_VIEW:
+    if reason in _ADVICE:
         video = left_out[0].photo.partition(" at ")[0]
-        return UserError(
-            "{video}: the camera does not move ({who} show the same view), but depth needs "
-            "motion; film while walking around the scene",
-            video=video,
-            who=who,
-        )
-    if reason == STITCHED:
-        return UserError(
-            "photos: {who} are stitched panoramas, which no lens has taken; use the single "
-            "photos, or panoramas of all directions (equirectangular, twice as wide as high)",
-            who=who,
-        )
-    if reason in (BLACK, WHITE, FLAT):
-        colours = {
-            BLACK: message("black"),
-            WHITE: message("white"),
-            FLAT: message("of one colour"),
-        }
-        return UserError(
-            "photos: {who} are completely {what}; check the lens cap, the light and the files",
-            who=who,
-            what=colours[reason],
-        )
-    if reason == BLURRED:
-        return UserError(
-            "photos: {who} are too blurred to be matched; hold the camera still for each photo, "
-            "in good light and in focus",
-            who=who,
-        )
+        values = {"who": who, "video": video, "what": _COLOURS.get(reason, "")}
+        return UserError(Message(_ADVICE[reason].key, values))
     first = next(each.photo for each in left_out if each.reason == reason)
     return UserError(
         "photos: {count}; {who} cannot be used, e.g. {first}, which {reason}; use at least "

@@ -35,12 +35,12 @@ class Photo:
     source: str  # the original, as text for users: a path, or "walk.mp4 at 3.2 s"
     width: int  # pixels, as stored in input/
     height: int
-    group: str  # photos of a group have the same camera and zoom, so they share intrinsics
-    sequence: str | None  # video of a frame; its frames sorted by name are in the order of time
-    focal: float | None  # pixels, from EXIF; None if unknown
-    location: tuple[float, float, float] | None  # GPS: latitude, longitude (degrees), altitude (m)
-    mask: bool  # whether distorted/masks/NAME.png exists
-    alpha: bool  # whether the photo has transparent pixels
+    group: str = ""  # photos of a group have the same camera and zoom, so they share intrinsics
+    sequence: str | None = None  # video of a frame; its frames sorted by name are in time order
+    focal: float | None = None  # pixels, from EXIF; None if unknown
+    location: tuple[float, float, float] | None = None  # GPS: latitude, longitude (°), altitude (m)
+    mask: bool = False  # whether distorted/masks/NAME.png exists
+    alpha: bool = False  # whether the photo has transparent pixels
     location_error: float | None = None  # m, horizontal, as the receiver states it
     attitude: Attitude | None = None
     panorama: bool = False  # equirectangular, of all directions

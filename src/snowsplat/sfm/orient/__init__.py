@@ -4,8 +4,7 @@ SfM determines the scene only up to a similarity transform. A viewer also needs 
 known scale, and the photographed object at the origin.
 
     scene_frame    the frame of the scene, from the parts below
-    up             the up direction, from sensors and from the way people hold cameras
-    ground         the up direction from the largest plane below the cameras
+    up             the up direction, from sensors, the way people hold cameras, and the ground
     positions      scale, north and level from GPS positions
     cameras        the data of the model
 

@@ -113,7 +113,7 @@ def scale_of_markers(
 
     def search(image: pycolmap.Image) -> list[tuple[str, _Seen]]:
         camera = model.cameras[image.camera_id]
-        return _seen(folder / image.name, camera, image.cam_from_world().matrix())
+        return _find_markers(folder / image.name, camera, image.cam_from_world().matrix())
 
     # OpenCV releases the GIL.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
@@ -141,10 +141,10 @@ def scale_of_markers(
     for name, square in squares.items():
         kinds[name.split()[0]] += square.photos
     kind = kinds.most_common(1)[0][0]
-    return _combined({n: s for n, s in squares.items() if n.split()[0] == kind}, side)
+    return _combine({n: s for n, s in squares.items() if n.split()[0] == kind}, side)
 
 
-def _combined(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | None, list[Message]]:
+def _combine(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | None, list[Message]]:
     """One scale from all markers, weighted by their errors."""
     sides = np.array([square.side for square in squares.values()])
     errors = np.array([square.error for square in squares.values()])
@@ -176,7 +176,7 @@ def _combined(squares: dict[str, _Square], side: float) -> tuple[MarkerScale | N
     return MarkerScale(side / float(middle), relative, name, normals, tilts), doubts
 
 
-def _seen(
+def _find_markers(
     path: Path, camera: pycolmap.Camera, cam_from_world: np.ndarray
 ) -> list[tuple[str, _Seen]]:
     """The markers in a photo, by dictionary and number."""
@@ -189,7 +189,9 @@ def _seen(
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, detector).detectMarkers(grey)
         for square, number in zip(corners, [] if numbers is None else numbers.ravel(), strict=True):
-            exact = _refined(light, square.reshape(4, 2).astype(np.float64), dictionary.markerSize)
+            exact = _refine_corners(
+                light, square.reshape(4, 2).astype(np.float64), dictionary.markerSize
+            )
             if exact is None:
                 continue
             # OpenCV counts from the centre of the first pixel, COLMAP from its corner.
@@ -203,7 +205,7 @@ def _seen(
     return found
 
 
-def _refined(light: np.ndarray, corners: np.ndarray, bits: int) -> np.ndarray | None:
+def _refine_corners(light: np.ndarray, corners: np.ndarray, bits: int) -> np.ndarray | None:
     """(4, 2) the corners of a marker where lines along its sides meet; None if they do not.
 
     A corner is rounded by blur, an edge is not moved by it. Across each side, the share of dark

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,16 +14,18 @@ from snowsplat.data.frame.placement import Placement
 from snowsplat.scene.geometry import Similarity
 from snowsplat.scene.orientation import VIEWING_DISTANCE
 from snowsplat.sfm.gps import east_north_up, location_of, middle_of, position_errors
-from snowsplat.sfm.ingest.photo import Photo
+from snowsplat.sfm.ingest.photo import Attitude, Photo
 from snowsplat.sfm.ingest.photos.attitude import UPRIGHT
 from snowsplat.sfm.orient.cameras import Cameras, read_cameras
-from snowsplat.sfm.orient.ground import of_ground
 from snowsplat.sfm.orient.marker import MarkerScale
 from snowsplat.sfm.orient.positions import Alignment, align
 from snowsplat.sfm.orient.up import (
+    FEWEST_SENSORS,
     Evidence,
     combine_evidence,
+    directions_of,
     of_cameras,
+    of_ground,
     of_sensors,
     robust_mean,
     with_markers,
@@ -98,7 +100,12 @@ def orientation(
     by_name = {photo.name: photo for photo in photos}
     known = [by_name.get(name) for name in cameras.names]
     cameras = _upright(cameras, known)
-    up, doubts = _up(cameras, known)
+    attitudes = [None if photo is None else photo.attitude for photo in known]
+    evidence, doubts = of_sensors(cameras, attitudes)
+    held = of_cameras(cameras)
+    ground = None if evidence else of_ground(cameras, held)
+    up, more = combine_evidence([*evidence, held, *([] if ground is None else [ground])])
+    doubts += more
     measured, of_markers = marker
     if measured is not None:
         up, more = with_markers(up, measured.normals, measured.tilts)
@@ -111,35 +118,36 @@ def orientation(
         if gps.alignment.level_error < _BETTER * level_error:
             up_from.append(gps.name)
         level_error = gps.alignment.level_error
-    north = _north_of_gps(gps) or _north_of_sensors(cameras, known, direction)
+    north: _North | None
+    if gps is not None and gps.alignment.north_error <= _NORTH_ERROR:
+        north = _North(gps.alignment.rotation[1], gps.name, gps.alignment.north_error)
+    else:
+        north = _north_of_sensors(cameras, attitudes, direction)
     if north is not None and north.error < _NORTH_ERROR:
         ahead = _horizontal(north.direction, direction)
     else:
         ahead = _viewing_direction(cameras, direction)
     rotation = np.stack([np.cross(-direction, ahead), -direction, ahead])
     scale = VIEWING_DISTANCE / cameras.distance
-    placement = Placement(up_from, math.degrees(level_error), doubts=doubts)
+    found: dict[str, Any] = {}
     if north is not None:
-        x, y, z = (round(float(v), 12) for v in rotation @ _horizontal(north.direction, direction))
-        placement = replace(
-            placement, north=(x, y, z), north_from=north.name, north_error=math.degrees(north.error)
-        )
+        towards = rotation @ _horizontal(north.direction, direction)
+        found["north"] = tuple(round(float(value), 12) for value in towards)
+        found["north_from"], found["north_error"] = north.name, math.degrees(north.error)
     if gps is not None:
         scale = gps.alignment.scale
-        placement = replace(
-            placement,
-            metres_per_unit=1.0,
-            scale_from=gps.name,
-            scale_error=gps.alignment.scale_error,
-            position_error=gps.alignment.error,
-            origin=location_of(gps.alignment.place(cameras.subject[None])[0], gps.origin),
-        )
+        found |= {
+            "metres_per_unit": 1.0,
+            "scale_from": gps.name,
+            "scale_error": gps.alignment.scale_error,
+            "position_error": gps.alignment.error,
+            "origin": location_of(gps.alignment.place(cameras.subject[None])[0], gps.origin),
+        }
     if measured is not None:
         if gps is not None:
             ratio = measured.metres_per_unit / scale
-            if abs(math.log(ratio)) > _CONTRADICTION * math.hypot(
-                gps.alignment.scale_error, measured.error
-            ):
+            errors = math.hypot(gps.alignment.scale_error, measured.error)
+            if abs(math.log(ratio)) > _CONTRADICTION * errors:
                 doubts.append(
                     message(
                         "by the marker, the scene is {share:.0f}% {larger} than by GPS; is its "
@@ -149,13 +157,13 @@ def orientation(
                     )
                 )
         scale = measured.metres_per_unit
-        placement = replace(
-            placement,
-            metres_per_unit=1.0,
-            scale_from=measured.name,
-            scale_error=measured.error,
-            position_error=None,
-        )
+        found |= {
+            "metres_per_unit": 1.0,
+            "scale_from": measured.name,
+            "scale_error": measured.error,
+            "position_error": None,
+        }
+    placement = Placement(up_from, math.degrees(level_error), doubts=doubts, **found)
     shift = -scale * rotation @ cameras.subject
     return Oriented(
         Similarity(scale, torch.from_numpy(rotation), torch.from_numpy(shift)), placement
@@ -169,19 +177,6 @@ def _upright(cameras: Cameras, photos: Sequence[Photo | None]) -> Cameras:
         if photo is not None and photo.turned in UPRIGHT:
             matrix[:2, :2] = UPRIGHT[photo.turned]
     return replace(cameras, rotations=turned @ cameras.rotations)
-
-
-def _up(cameras: Cameras, photos: Sequence[Photo | None]) -> tuple[Evidence, list[Message]]:
-    """The up direction without GPS, and doubts as text for users."""
-    attitudes = [None if photo is None else photo.attitude for photo in photos]
-    evidence, doubts = of_sensors(cameras, attitudes)
-    measured = bool(evidence)
-    evidence.append(of_cameras(cameras))
-    if not measured:
-        ground = of_ground(cameras, evidence[-1])
-        evidence += [] if ground is None else [ground]
-    up, contradictions = combine_evidence(evidence)
-    return up, doubts + contradictions
 
 
 def _gps(
@@ -218,35 +213,22 @@ def _gps(
     return _Gps(alignment, name, origin), doubts
 
 
-def _north_of_gps(gps: _Gps | None) -> _North | None:
-    if gps is None or gps.alignment.north_error > _NORTH_ERROR:
-        return None
-    return _North(gps.alignment.rotation[1], gps.name, gps.alignment.north_error)
-
-
 def _north_of_sensors(
-    cameras: Cameras, photos: Sequence[Photo | None], up: np.ndarray
+    cameras: Cameras, attitudes: Sequence[Attitude | None], up: np.ndarray
 ) -> _North | None:
     """North from the yaw of gimbals or else from compasses, if most of them agree."""
     for gimbal, name, usual in (
         (True, message("gimbal angles"), _GIMBAL_YAW),
         (False, message("compasses"), _COMPASS),
     ):
-        rows = [
-            _horizontal(rotation.T @ np.array(photo.attitude.north), up)
-            for rotation, photo in zip(cameras.rotations, photos, strict=True)
-            if photo is not None
-            and photo.attitude is not None
-            and photo.attitude.north is not None
-            and photo.attitude.gimbal is gimbal
-        ]
-        if len(rows) < _FEWEST:
+        found = directions_of(cameras, attitudes, "north", gimbal)
+        if len(found) < FEWEST_SENSORS:
             continue
-        norths = np.array(rows)
+        norths = np.array([_horizontal(north, up) for north in found])
         mean, spread = robust_mean(norths)
         wrong = (norths @ mean < math.cos(_WRONG_NORTH)).mean()
         if wrong <= _MOST_WRONG:
-            about = message("the {name} of {n} photos", name=name, n=len(rows))
+            about = message("the {name} of {n} photos", name=name, n=len(norths))
             return _North(mean, about, math.hypot(usual, spread))
     return None
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -30,8 +31,8 @@ from snowsplat.util.names import all_names
 # lens exactly.
 _GIMBAL = (math.radians(2.0), math.radians(0.5))
 _ACCELEROMETER = (math.radians(3.0), math.radians(1.0))
-# Fewer photos with a sensor may all be wrong: the accelerometer also measures the hand.
-_FEWEST = 3
+#: Fewer photos with a sensor may all be wrong: the accelerometer also measures the hand.
+FEWEST_SENSORS = 3
 # Standard deviation of the slope of what a marker lies on, and the largest angle to level at which
 # it may lie flat.
 _PAPER, _LYING = math.radians(1.5), math.radians(20)
@@ -43,6 +44,20 @@ _CONTRADICTION = 3.0
 _SAID = math.radians(20)
 # Evidence with a smaller share of the precision in all directions is not named.
 _SHARE = 0.2
+# Standard deviation of the slope of the ground, a table or a street.
+_SLOPE = math.radians(3)
+# The plane is searched within this angle of the up direction that is known otherwise.
+_LARGEST_ANGLE = math.radians(30)
+# Points belong to a plane within this share of the distance of the cameras from their points; and
+# points farther from the cameras than this many times the distance are not used.
+_THICKNESS, _REACH = 0.015, 3.0
+# The plane must have this share of the points. Their standard deviation along both of its axes must
+# be at least this share of the distance of the cameras from their points: a step is no ground.
+_OF_POINTS, _EXTENT = 0.2, 0.15
+# Share of the cameras above it.
+_BELOW = 0.9
+_TRIALS = 1000
+_FEWEST_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -79,14 +94,9 @@ def of_sensors(
         (True, message("gimbal angles")),
         (False, message("accelerometers")),
     ):
-        rows = [
-            rotation.T @ np.array(attitude.up)
-            for rotation, attitude in zip(cameras.rotations, attitudes, strict=True)
-            if attitude is not None and attitude.up is not None and attitude.gimbal is gimbal
-        ]
-        if len(rows) < _FEWEST:
+        ups = directions_of(cameras, attitudes, "up", gimbal)
+        if len(ups) < FEWEST_SENSORS:
             continue
-        ups = np.array(rows)
         mean, spread = robust_mean(ups)
         if spread > _LARGEST_SPREAD:
             doubts.append(
@@ -103,6 +113,68 @@ def of_sensors(
         about = message("the {name} of {n} photos", name=name, n=len(ups))
         found.append(Evidence((about,), mean, isotropic(mean, error)))
     return found, doubts
+
+
+def directions_of(
+    cameras: Cameras,
+    attitudes: Sequence[Attitude | None],
+    which: Literal["up", "north"],
+    gimbal: bool,
+) -> np.ndarray:
+    """(N, 3) a direction in the world frame, by the gimbals or by the other sensors that tell it.
+
+    ``attitudes``: one per camera.
+    """
+    rows = [
+        rotation.T @ np.array(getattr(attitude, which))
+        for rotation, attitude in zip(cameras.rotations, attitudes, strict=True)
+        if attitude is not None and attitude.gimbal is gimbal and getattr(attitude, which)
+    ]
+    return np.array(rows).reshape(-1, 3)
+
+
+def of_ground(cameras: Cameras, known: Evidence) -> Evidence | None:
+    """The normal of the ground; None if there is no large plane below the cameras.
+
+    ``known``: the up direction from other evidence.
+    """
+    typical = cameras.distance
+    nearest = np.full(len(cameras.points), np.inf)
+    for centre in cameras.centres:
+        nearest = np.minimum(nearest, np.linalg.norm(cameras.points - centre, axis=1))
+    points = cameras.points[nearest < _REACH * typical]
+    if len(points) < _FEWEST_POINTS:
+        return None
+    random = np.random.default_rng(0)
+    a, b, c = points[random.integers(0, len(points), (3, _TRIALS))]
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    kept = lengths > 1e-9 * typical**2
+    normals, a = normals[kept] / lengths[kept, None], a[kept]
+    normals *= np.sign(normals @ known.up)[:, None]
+    kept = normals @ known.up > math.cos(_LARGEST_ANGLE)
+    normals, a = normals[kept], a[kept]
+    if not len(normals):
+        return None
+    thickness = _THICKNESS * typical
+    heights = points @ normals.T - np.einsum("ij,ij->i", a, normals)  # (P, trials)
+    above = cameras.centres @ normals.T - np.einsum("ij,ij->i", a, normals) > thickness
+    counts = np.where(above.mean(axis=0) >= _BELOW, (np.abs(heights) < thickness).sum(axis=0), 0)
+    best = int(counts.argmax())
+    inside = np.abs(heights[:, best]) < thickness
+    for _ in range(10):
+        middle = points[inside].mean(axis=0)
+        extents, axes = np.linalg.svd(points[inside] - middle, full_matrices=False)[1:]
+        normal = axes[2] * np.sign(axes[2] @ known.up)
+        inside = np.abs((points - middle) @ normal) < thickness
+        if inside.sum() < _FEWEST_POINTS:
+            return None
+    extents = extents / math.sqrt(inside.sum())
+    large = inside.mean() > _OF_POINTS and extents[1] > _EXTENT * typical
+    below = ((cameras.centres - middle) @ normal > thickness).mean() >= _BELOW
+    if not (large and below and normal @ known.up > math.cos(_LARGEST_ANGLE)):
+        return None
+    return Evidence((message("the ground"),), normal, isotropic(normal, _SLOPE))
 
 
 def with_markers(

@@ -6,6 +6,7 @@ of the scene.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -61,18 +62,55 @@ def capture_verdict(
     """
     # A photo of a wide lens becomes several images.
     photos = min(len(sfm["registered"]), len(coverage.names))
-    reasons = [
-        *_lost(sfm),
-        *_distances(coverage),
-        *_doubts(sfm),
-        *_count(coverage, photos),
-        *_ends(coverage),
-        *_errors(sfm),
-        *_bad_photos(problems, len(coverage.names)),
-        *_one_side(coverage),
-    ]
+    confirmed, step = _median(coverage.confirmed), _median(coverage.step)
+    one_way = float(np.quantile(coverage.directions, 0.9)) < _ONE_SIDE
+    reasons = list(_lost(sfm))
+    if not np.isnan(coverage.confirmed).all():  # the model has observations
+        reasons += _distances(confirmed, step)
+    # In a bent model, parts of the scene are doubled.
+    grade: Grade = "poor" if sfm.get("agreement", 1.0) < _BENT else "usable"
+    reasons += [Reason(grade, as_message(doubt)) for doubt in sfm.get("doubts", ())]
+    many = message("take 30 to 100 photos of an object or a room, and more of a larger place")
+    # A few photos are enough for one side of a scene.
+    if photos < _TOO_FEW:
+        too_few = message("{count} photos are too few", count=photos)
+        reasons.append(Reason("poor", too_few, many))
+    elif photos < _FEW and not (one_way and step <= _SMALL_STEP):
+        reasons.append(Reason("usable", message("{count} photos are few", count=photos), many))
+    reasons += _ends(coverage, confirmed)
+    error = sfm["reprojection_error"]
+    if error is not None and error > _MAX_ERROR:
+        text = message("the reprojection error is high: {error:.1f} pixels", error=error)
+        advice = message(
+            "leave out photos that are blurred or show moving objects, or try another --camera"
+        )
+        reasons.append(Reason("usable", text, advice))
+    if problems and len(problems) >= _BAD_PHOTOS * len(coverage.names):
+        most, number = Counter(problems.values()).most_common(1)[0]
+        text = message(
+            "{number} of {count} photos: each {what}",
+            number=number,
+            count=len(coverage.names),
+            what=PROBLEMS[most].what,
+        )
+        reasons.append(Reason("usable", text, PROBLEMS[most].advice))
+    if one_way:
+        text = message(
+            "all photos look in about the same direction: the scene can be seen from there only"
+        )
+        reasons.append(Reason("good", text))
     verdict = Verdict.of(reasons)
-    return Verdict.of([_praise(coverage, photos), *reasons]) if verdict.grade == "good" else verdict
+    if verdict.grade != "good":
+        return verdict
+    praise = message("{photos} photos", photos=photos)
+    if confirmed > 0.0:
+        praise = message(
+            "{photos} photos; in a typical one, {share:.0%} of the points are in at least two "
+            "others",
+            photos=photos,
+            share=confirmed,
+        )
+    return Verdict.of([Reason("good", praise), *reasons])
 
 
 def recorded_verdict(dataset: Path) -> Verdict | None:
@@ -97,18 +135,10 @@ def _lost(sfm: Mapping[str, Any]) -> list[Reason]:
     return [Reason("poor" if share >= _MANY_LOST else "usable", text, advice)]
 
 
-def _doubts(sfm: Mapping[str, Any]) -> list[Reason]:
-    """What is doubtful about the cameras. In a bent model, parts of the scene are doubled."""
-    grade: Grade = "poor" if sfm.get("agreement", 1.0) < _BENT else "usable"
-    return [Reason(grade, as_message(doubt)) for doubt in sfm.get("doubts", ())]
-
-
-def _distances(coverage: Coverage) -> list[Reason]:
-    """The steps from photo to photo, and the points that only two photos show."""
-    if np.isnan(coverage.confirmed).all():  # the model has no observations
-        return []
+def _distances(confirmed: float, step: float) -> list[Reason]:
+    """The steps from photo to photo, and the points that only two photos show: typical values of
+    `Coverage`."""
     reasons = []
-    confirmed, step = _median(coverage.confirmed), _median(coverage.step)
     far = message(
         "the photos are far apart: the next one is typically {step:.0%} of the distance to the "
         "scene away",
@@ -128,21 +158,11 @@ def _distances(coverage: Coverage) -> list[Reason]:
     return reasons
 
 
-def _count(coverage: Coverage, count: int) -> list[Reason]:
-    advice = message("take 30 to 100 photos of an object or a room, and more of a larger place")
-    if count < _TOO_FEW:
-        return [Reason("poor", message("{count} photos are too few", count=count), advice)]
-    # A few photos are enough for one side of a scene.
-    if count < _FEW and not (_looks_one_way(coverage) and _median(coverage.step) <= _SMALL_STEP):
-        return [Reason("usable", message("{count} photos are few", count=count), advice)]
-    return []
-
-
-def _ends(coverage: Coverage) -> list[Reason]:
-    """The first and the last photo, by name, of a path."""
+def _ends(coverage: Coverage, typical: float) -> list[Reason]:
+    """The first and the last photo, by name, of a path. ``typical``: of `Coverage.confirmed`."""
     if len(coverage.names) < _TOO_FEW:
         return []
-    least = _WEAK_END * _median(coverage.confirmed)
+    least = _WEAK_END * typical
     weak = [coverage.names[i] for i in (0, -1) if coverage.confirmed[i] < least]
     if not weak:
         return []
@@ -154,56 +174,6 @@ def _ends(coverage: Coverage) -> list[Reason]:
     )
     advice = message("begin earlier and end later than the place that you want to show")
     return [Reason("good", text, advice)]
-
-
-def _errors(sfm: Mapping[str, Any]) -> list[Reason]:
-    error = sfm["reprojection_error"]
-    if error is None or error <= _MAX_ERROR:
-        return []
-    text = message("the reprojection error is high: {error:.1f} pixels", error=error)
-    advice = message(
-        "leave out photos that are blurred or show moving objects, or try another --camera"
-    )
-    return [Reason("usable", text, advice)]
-
-
-def _bad_photos(problems: Mapping[str, Problem], count: int) -> list[Reason]:
-    if len(problems) < _BAD_PHOTOS * count:
-        return []
-    kinds = list(problems.values())
-    most = max(dict.fromkeys(kinds), key=kinds.count)
-    text = message(
-        "{number} of {count} photos: each {what}",
-        number=kinds.count(most),
-        count=count,
-        what=PROBLEMS[most].what,
-    )
-    return [Reason("usable", text, PROBLEMS[most].advice)]
-
-
-def _one_side(coverage: Coverage) -> list[Reason]:
-    if not _looks_one_way(coverage):
-        return []
-    text = message(
-        "all photos look in about the same direction: the scene can be seen from there only"
-    )
-    return [Reason("good", text)]
-
-
-def _looks_one_way(coverage: Coverage) -> bool:
-    return float(np.quantile(coverage.directions, 0.9)) < _ONE_SIDE
-
-
-def _praise(coverage: Coverage, photos: int) -> Reason:
-    confirmed = _median(coverage.confirmed)
-    if confirmed <= 0.0:
-        return Reason("good", message("{photos} photos", photos=photos))
-    text = message(
-        "{photos} photos; in a typical one, {share:.0%} of the points are in at least two others",
-        photos=photos,
-        share=confirmed,
-    )
-    return Reason("good", text)
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:

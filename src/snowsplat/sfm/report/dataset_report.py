@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from snowsplat.project.dataset_folder import DatasetFolder, left_out_of
 from snowsplat.sfm.colmap.options import PANORAMA_MODEL
 from snowsplat.sfm.pinhole_model import photo_of
 from snowsplat.sfm.report.more_photos import Advice, advice
-from snowsplat.sfm.report.photo_problems import Problem, what_to_do
+from snowsplat.sfm.report.photo_problems import what_to_do
 from snowsplat.sfm.report.scene_map import PlacedPhoto, draw_scene
 from snowsplat.util.files import write_text
 from snowsplat.util.html import render_page
@@ -33,7 +32,7 @@ _MAX_PICTURES = 24  # evenly spaced over the photos
 _PICTURE_HEIGHT = 480  # pixels, of the pictures that can be opened
 _MAX_UNUSED = 200  # number of unused photos that are listed; the others are only counted
 
-# By `focal_from` and `focal_held` of a camera; earlier versions did not have the latter.
+# By `focal_from` and `focal_held` of a camera.
 _FOCAL_FROM = {
     ("exif", False): message("from EXIF, refined"),
     ("exif", True): message("from EXIF; the photos do not determine it"),
@@ -45,22 +44,6 @@ _STAGES = {
     "poses": message("estimating poses"),
     "images": message("undistorting"),
 }
-
-
-@dataclass(frozen=True)
-class _BadPhoto:
-    name: str
-    image: Image.Image
-    problem: Message
-
-
-@dataclass(frozen=True)
-class _Lens:
-    photos: int
-    size: str
-    focal: Message
-    model: str
-    parameters: str
 
 
 def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
@@ -75,23 +58,25 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
     """
     sfm, gathered, undistorted = facts["sfm"], facts["gathered"], facts["undistorted"]
     photos = _photos_with_poses(dataset, gathered["photos"])
-    name, names = _name(facts["inputs"]), [photo.name for photo in photos]
+    first, folder = Path(facts["inputs"][0]), DatasetFolder(dataset)
+    name = first.parent.name if first.name == "input" else first.stem
     xyz, rgb = _points(dataset)
     more = advice(photos, xyz)
     placement = placement_of(undistorted)
     unit = "m" if placement is not None and placement.is_metric else message("units")
-    path = DatasetFolder(dataset).report
+    bad = list(facts["problems"].items())[:_MAX_PICTURES]
+    command = f"snowsplat train {quote(str(dataset))} -o {quote(dataset.name + '-out')}"
     values = {
         "title": f"{name} – dataset",
         "name": name,
         "photos": photos,
         "verdict": Verdict.from_json(facts["verdict"]),
         "advice": more,
-        "more_photos": _numbered(more),
-        "bad_photos": _bad_photos(dataset, facts["problems"]),
+        "more_photos": _number_places(more),
+        "bad_photos": [(_small(folder, each), each, what_to_do(what)) for each, what in bad],
         "drawings": draw_scene(photos, xyz, rgb, more.places, unit),
         "placement": None if placement is None else placement.rows(),
-        "strip": _strip(dataset, names),
+        "strip": _strip(folder, photos),
         "lenses": [_lens(camera) for camera in sfm["cameras"]],
         "sizes": [f"{width} × {height}" for width, height, *_ in undistorted["sizes"]],
         "unused": sorted(left_out_of(gathered, sfm), key=lambda each: each.stage != "poses"),
@@ -99,10 +84,10 @@ def write_report(dataset: Path, facts: dict[str, Any]) -> Path:
         "stages": _STAGES,
         "longest": max([*facts["seconds"].values(), 1e-9]),
         "settings": json.dumps(facts["settings"], indent=2, ensure_ascii=False),
-        "command": _next_step(dataset) if facts["alone"] else None,
+        "command": command if facts["alone"] else None,
     }
-    write_text(path, render_page("sfm/report/dataset_report.html.j2", **facts | values))
-    return path
+    write_text(folder.report, render_page("sfm/report/dataset_report.html.j2", **facts | values))
+    return folder.report
 
 
 def draw_from_above(dataset: Path) -> str:
@@ -137,14 +122,7 @@ def _photos_with_poses(dataset: Path, gathered: Sequence[dict[str, Any]]) -> lis
     return photos
 
 
-def _bad_photos(dataset: Path, bad: dict[str, Problem]) -> list[_BadPhoto]:
-    return [
-        _BadPhoto(name, _reduced(_file_of(dataset, name)), what_to_do(problem))
-        for name, problem in list(bad.items())[:_MAX_PICTURES]
-    ]
-
-
-def _numbered(more: Advice) -> list[tuple[Message, Message]]:
+def _number_places(more: Advice) -> list[tuple[Message, Message]]:
     """The places for more photos, "1" or "1 to 3", and why."""
     numbers = iter(range(1, len(more.reasons) + 1))
     rows = []
@@ -157,23 +135,16 @@ def _numbered(more: Advice) -> list[tuple[Message, Message]]:
     return rows
 
 
-def _strip(dataset: Path, names: Sequence[str]) -> list[tuple[Image.Image, str]]:
-    count = min(len(names), _MAX_PICTURES)
-    chosen = [names[i * len(names) // count] for i in range(count)]
-    return [
-        (_reduced(dataset / "images" / name), name)
-        for name in chosen
-        if (dataset / "images" / name).is_file()
-    ]
+def _strip(folder: DatasetFolder, photos: Sequence[PlacedPhoto]) -> list[tuple[Image.Image, str]]:
+    count = min(len(photos), _MAX_PICTURES)
+    names = [photos[i * len(photos) // count].name for i in range(count)]
+    return [(_small(folder, name), name) for name in names if (folder.images / name).is_file()]
 
 
-def _file_of(dataset: Path, photo: str) -> Path:
-    """The undistorted photo, or the photo itself if it became several views."""
-    path = DatasetFolder(dataset).images / photo
-    return path if path.is_file() else DatasetFolder(dataset).photos / photo
-
-
-def _reduced(path: Path) -> Image.Image:
+def _small(folder: DatasetFolder, photo: str) -> Image.Image:
+    """The undistorted photo, or the photo itself if it became several views; reduced."""
+    path = folder.images / photo
+    path = path if path.is_file() else folder.photos / photo
     with Image.open(path) as image:
         image.draft("RGB", (2 * _PICTURE_HEIGHT, _PICTURE_HEIGHT))  # faster JPEG decoding
         scale = min(1.0, _PICTURE_HEIGHT / image.height)
@@ -185,29 +156,20 @@ def _reduced(path: Path) -> Image.Image:
     return small
 
 
-def _lens(camera: Mapping[str, Any]) -> _Lens:
+def _lens(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page shows of a camera of `SfmResult`."""
     width, height, focal = camera["width"], camera["height"], float(camera["params"][0])
-    photos, size, model = int(camera["images"]), f"{width} × {height}", str(camera["model"])
-    if model == PANORAMA_MODEL:
-        return _Lens(photos, size, message("all directions"), model, "")
+    shown = {"photos": camera["images"], "size": f"{width} × {height}", "model": camera["model"]}
+    if camera["model"] == PANORAMA_MODEL:
+        return shown | {"focal": message("all directions"), "parameters": ""}
     # The angle of view without distortion; that of the distorted lens differs a little.
     half = max(width, height) / 2 / focal if focal > 0 else 0.0
-    angle = math.degrees(2 * (half if model.endswith("FISHEYE") else math.atan(half)))
+    fisheye = camera["model"].endswith("FISHEYE")
     about = message(
         "{focal:.0f} px ({angle:.0f}°), {origin}",
         focal=focal,
-        angle=angle,
+        angle=math.degrees(2 * (half if fisheye else math.atan(half))),
         origin=_FOCAL_FROM[camera["focal_from"], bool(camera.get("focal_held"))],
     )
     parameters = ", ".join(f"{value:.5g}" for value in camera["params"])
-    return _Lens(photos, size, about, model, parameters)
-
-
-def _name(inputs: Sequence[str]) -> str:
-    """The name of the dataset: that of the input, or if it is ``input``, of its parent folder."""
-    first = Path(inputs[0])
-    return first.parent.name if first.name == "input" else first.stem
-
-
-def _next_step(dataset: Path) -> str:
-    return f"snowsplat train {shlex.quote(str(dataset))} -o {shlex.quote(dataset.name + '-out')}"
+    return shown | {"focal": about, "parameters": parameters}

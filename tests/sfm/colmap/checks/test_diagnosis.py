@@ -5,26 +5,26 @@ import itertools
 import pytest
 
 from snowsplat.sfm.colmap.checks.diagnosis import Evidence, explain, failure
-from snowsplat.sfm.colmap.database import Pair
+from snowsplat.sfm.colmap.database import VerifiedPair
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.util.messages import Message
 
 
 def photos(count):
-    return [
-        Photo(f"{i}.jpg", f"{i}.jpg", 640, 480, "", None, None, None, False, False)
-        for i in range(count)
-    ]
+    return [Photo(f"{i}.jpg", f"{i}.jpg", 640, 480, "") for i in range(count)]
 
 
 def all_pairs(count, inliers=200, flat=False):
-    return [Pair(i, j, inliers, flat) for i, j in itertools.combinations(range(count), 2)]
+    return [
+        VerifiedPair(i, j, inliers, flat=flat)
+        for i, j in itertools.combinations(range(1, count + 1), 2)
+    ]
 
 
 def test_each_photo_without_a_pose_has_its_own_reason():
     features = [2000, 2000, 2000, 12, 2000, 2000, 2000, 2000, 2000, 2000]
-    pairs = [Pair(0, 1, 300, False), Pair(0, 5, 22, False), Pair(2, 5, 18, False)]
-    pairs += [Pair(1, 6, 400, False), Pair(7, 8, 90, False)]
+    pairs = [VerifiedPair(1, 2, 300), VerifiedPair(1, 6, 22), VerifiedPair(3, 6, 18)]
+    pairs += [VerifiedPair(2, 7, 400), VerifiedPair(8, 9, 90)]
     evidence = Evidence(features, pairs, 0.2, 36)
     models = [{"0.jpg", "1.jpg", "2.jpg"}, {"7.jpg", "8.jpg"}]
     wrong = {"9.jpg": Message("its place is wrong")}
@@ -43,9 +43,9 @@ def test_each_photo_without_a_pose_has_its_own_reason():
     ("evidence", "message"),
     [
         (Evidence([0] * 5, [], None, 10), "only 0 of 5 show enough detail"),
-        (Evidence([0, 2000, 2000, 3], [Pair(1, 2, 99, False)], 0.1, 6), "only 2 of 4 show enough"),
+        (Evidence([0, 2000, 2000, 3], [VerifiedPair(2, 3, 99)], 0.1, 6), "only 2 of 4 show enough"),
         (Evidence([2000] * 5, [], None, 10), "no two of them match"),
-        (Evidence([2000] * 5, [Pair(0, 4, 80, False)], 0.1, 10), "only 2 of them match"),
+        (Evidence([2000] * 5, [VerifiedPair(1, 5, 80)], 0.1, 10), "only 2 of them match"),
         (Evidence([2000] * 5, all_pairs(5, flat=True), 0.001, 10), "camera hardly moved"),
         (Evidence([2000] * 5, all_pairs(5, flat=True), 0.1, 10), "only rotated"),
         (Evidence([2000] * 5, all_pairs(5), 0.1, 10), "too few or inconsistent"),

@@ -59,8 +59,8 @@ def mapped(tmp_path, lens):
     database = WALK.write(tmp_path / "database.db", None, lens)
     mapping = Mapping(database, tmp_path, 1.0, 1, silent)
     model = mapping.run("incremental")[0]
-    refine = lambda model, cameras, held: mapping.with_cameras(model, cameras)  # noqa: E731
-    return with_all_parameters(model, WALK.photos(None), lens, refine, False), database
+    photos = WALK.photos(None)
+    return with_all_parameters(model, photos, lens, mapping.with_cameras, False), database
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_photos_of_a_fisheye_lens_are_placed(tmp_path, lens):
     (camera,) = model.cameras.values()
     assert camera.model_name == ("OPENCV_FISHEYE" if lens.model == "auto" else lens.model)
     assert camera.mean_focal_length() == pytest.approx(FISHEYE.focal, rel=0.01)
-    assert findings_of(camera, None) == []
+    assert findings_of(camera) == []
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda i: i.name)
     centres = np.array([image.projection_center() for image in images])
     steps, true = (np.linalg.norm(c[:, None] - c[None], axis=-1) for c in (centres, WALK.centres))
@@ -123,7 +123,7 @@ def camera(model, params, size=(640, 480)):
     ],
 )
 def test_fisheye_lenses_of_real_cameras_are_possible(model, params):
-    assert findings_of(camera(model, params), None) == []
+    assert findings_of(camera(model, params)) == []
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_fisheye_lenses_of_real_cameras_are_possible(model, params):
     ],
 )
 def test_a_wrong_lens_is_named(model, params, message):
-    (found,) = findings_of(camera(model, params), None)
+    (found,) = findings_of(camera(model, params))
     assert message in found.text
 
 

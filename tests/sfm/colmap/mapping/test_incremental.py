@@ -1,11 +1,13 @@
 """Photos are registered in the order of their strongest pairs."""
 
+import sqlite3
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from snowsplat.sfm.colmap.database import closing_database, set_names
+from snowsplat.sfm.colmap.database import VerifiedPair, closing_database
 from snowsplat.sfm.colmap.mapping import mapping as mapping_module
 from snowsplat.sfm.colmap.mapping.incremental import _Growth
 from snowsplat.sfm.colmap.mapping.mapping import Mapping
@@ -35,7 +37,9 @@ def mapping(tmp_path, scene):
 @pytest.mark.parametrize("ordered", [True, False], ids=["numbered", "unordered"])
 def test_a_walk_past_look_alikes(mapping, scene, ordered):
     if not ordered:
-        set_names(mapping.database, UNORDERED)
+        rows = [(name, i) for i, name in enumerate(UNORDERED, start=1)]
+        with closing(sqlite3.connect(mapping.database)) as connection, connection:
+            connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", rows)
     (model,) = mapping.run("incremental")
     assert set(model.reg_image_ids()) == EVERY
     assert largest_centre_error(model, scene) < 0.05
@@ -122,7 +126,8 @@ def test_photos_that_follow_each_other_come_first_then_those_with_the_most_match
     names = {1: "IMG_1.jpg", 2: "IMG_2.jpg", 3: "IMG_3.jpg", 8: "x.jpg", 9: "y.jpg"}
     pairs = [(1, 2, 14), (1, 3, 20), (1, 8, 500), (1, 9, 900), (3, 8, 2000)]
     growth = SimpleNamespace(
-        graph=ViewGraph.from_pairs(names, pairs), model=SimpleNamespace(reg_image_ids=lambda: [1])
+        graph=ViewGraph.from_pairs(names, [VerifiedPair(*pair) for pair in pairs]),
+        model=SimpleNamespace(reg_image_ids=lambda: [1]),
     )
     assert _Growth._in_order(growth, [2, 3, 8, 9]) == [3, 9, 8, 2]
 

@@ -5,12 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from snowsplat.sfm.colmap.mapping.view_graph import (
-    VerifiedPair,
-    ViewGraph,
-    following_pairs,
-    spread_subset,
-)
+from snowsplat.sfm.colmap.database import VerifiedPair
+from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, following_pairs, spread_subset
+
+
+def graph_of(names, pairs):
+    return ViewGraph.from_pairs(names, [VerifiedPair(*pair) for pair in pairs])
+
 
 NAMES = {i: f"IMG_{10 + i}.jpg" for i in range(1, 7)}
 
@@ -29,7 +30,7 @@ def test_photos_follow_each_other_if_at_most_one_photo_is_between_them():
 
 
 def test_the_pairs_of_a_graph_are_those_between_its_photos():
-    graph = ViewGraph.from_pairs(NAMES, [(2, 3, 80), (1, 2, 90), (1, 9, 70), (1, 5, 60)])
+    graph = graph_of(NAMES, [(2, 3, 80), (1, 2, 90), (1, 9, 70), (1, 5, 60)])
     found = [(pair.first, pair.second, pair.matches, pair.follows) for pair in graph.pairs]
     assert found == [(1, 2, 90, True), (1, 5, 60, False), (2, 3, 80, True)]
     assert [pair.other(2) for pair in graph.pairs_of[2]] == [3, 1]
@@ -37,21 +38,21 @@ def test_the_pairs_of_a_graph_are_those_between_its_photos():
 
 
 def test_a_part_of_the_photos_has_its_own_order():
-    graph = ViewGraph.from_pairs(NAMES, [(1, 2, 90), (1, 5, 60), (5, 6, 70)])
+    graph = graph_of(NAMES, [(1, 2, 90), (1, 5, 60), (5, 6, 70)])
     (pair,) = graph.of_photos([1, 3, 5]).pairs
     assert (pair.first, pair.second, pair.matches, pair.follows) == (1, 5, 60, True)
     assert list(graph.of_photos([1, 3, 5]).names) == [1, 3, 5]
 
 
 def test_the_matrix_is_symmetric():
-    ids, matches = ViewGraph.from_pairs({4: "x", 2: "y", 9: "z"}, [(2, 9, 30), (2, 4, 5)]).matrix()
+    ids, matches = graph_of({4: "x", 2: "y", 9: "z"}, [(2, 9, 30), (2, 4, 5)]).matrix()
     assert ids == [2, 4, 9]
     assert matches.tolist() == [[0, 5, 30], [5, 0, 0], [30, 0, 0]]
 
 
 @pytest.mark.parametrize("names", [{}, {1: "only.jpg"}])
 def test_a_graph_without_pairs(names):
-    graph = ViewGraph.from_pairs(names, [])
+    graph = graph_of(names, [])
     assert graph.pairs == []
     assert graph.matrix()[1].shape == (len(names), len(names))
 
@@ -72,7 +73,7 @@ def walk(matches, named=True, weak=()):
         for d, number in enumerate(matches, start=1)
         for i in range(1, COUNT + 1 - d)
     ]
-    return ViewGraph.from_pairs(names, pairs)
+    return graph_of(names, pairs)
 
 
 def test_the_photos_are_spread():
@@ -107,14 +108,9 @@ def test_nothing_is_left_out_without_strong_pairs():
     assert spread_subset(walk([90, 80, 70]), 5) == set(range(1, COUNT + 1))
 
 
-def test_the_same_photos_give_the_same_subset():
-    graph = walk([900, 700, 500, 300])
-    assert spread_subset(graph, 12) == spread_subset(graph, 12)
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_very_few_photos(count):
-    graph = ViewGraph.from_pairs({i: f"{i}.jpg" for i in range(count)}, [])
+    graph = graph_of({i: f"{i}.jpg" for i in range(count)}, [])
     assert spread_subset(graph, count) == set(range(count))
 
 
@@ -127,7 +123,7 @@ def test_photos_left_out_at_once_or_one_by_one_are_the_same():
         for step in steps
         for i in range(1, COUNT + 1 - step)
     ]
-    graph = ViewGraph.from_pairs(walk([], named=False).names, pairs)
+    graph = graph_of(walk([], named=False).names, pairs)
     left = set(graph.names)
     for _ in range(COUNT):
         left = spread_subset(graph.of_photos(left), len(left) - 1)
@@ -138,7 +134,7 @@ def test_photos_left_out_at_once_or_one_by_one_are_the_same():
 def test_no_long_gaps_in_a_series():
     """Photos far apart by name have many matches, too: two rooms look alike."""
     pairs = [(i, j, 200 + i + j) for i in range(1, 41) for j in range(i + 1, 41)]
-    graph = ViewGraph.from_pairs({i: f"{i:03}.jpg" for i in range(1, 41)}, pairs)
+    graph = graph_of({i: f"{i:03}.jpg" for i in range(1, 41)}, pairs)
     subset = sorted(spread_subset(graph, 5))
     assert max(b - a for a, b in itertools.pairwise(subset)) == 4
     assert {1, 40} <= set(subset)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from snowsplat.sfm.colmap.database import Pair
+from snowsplat.sfm.colmap.database import VerifiedPair
 from snowsplat.sfm.colmap.options import EFFORTS
 from snowsplat.sfm.colmap.pairs.choice import choose_pairs
 from snowsplat.sfm.ingest.photo import Photo
@@ -15,7 +15,7 @@ EFFORT = EFFORTS["normal"]
 
 def photo(number, sequence=None, location=None):
     name = f"{sequence or 'photo'}/{number:04}.jpg"
-    return Photo(name, name, 640, 480, "phone", sequence, None, location, False, False)
+    return Photo(name, name, 640, 480, "phone", sequence, location=location)
 
 
 def not_needed():
@@ -110,10 +110,10 @@ def partners(pairs, photo):
 def test_the_reserve_is_for_photos_with_few_matches():
     photos = [photo(i) for i in range(200)]
     choice = choose_pairs(photos, EFFORT, lambda: ring(200, 200))
-    clear = [Pair(i, j, 200, False) for i, j in choice.pairs]
-    assert choice.completed(clear, 200).pairs == choice.pairs
-    weak = [dataclasses.replace(p, inliers=20) if 50 in (p.first, p.second) else p for p in clear]
-    completed = choice.completed(weak, 200).pairs
+    clear = [VerifiedPair(i + 1, j + 1, 200) for i, j in choice.pairs]
+    assert choice.complete(clear, 200).pairs == choice.pairs
+    weak = [dataclasses.replace(p, matches=20) if 51 in (p.first, p.second) else p for p in clear]
+    completed = choice.complete(weak, 200).pairs
     assert partners(completed, 50) == partners(choice.whole().pairs, 50)
     assert set(completed) - set(choice.pairs) == {pair for pair in choice.reserve if 50 in pair}
 
@@ -121,16 +121,14 @@ def test_the_reserve_is_for_photos_with_few_matches():
 def test_the_whole_reserve_is_needed_between_two_groups():
     photos = [photo(i) for i in range(200)]
     choice = choose_pairs(photos, EFFORT, lambda: ring(200, 200))
-    within = [Pair(i, j, 200, False) for i, j in choice.pairs if (i < 100) == (j < 100)]
-    assert choice.completed(within, 200).pairs == choice.whole().pairs
+    within = [VerifiedPair(i + 1, j + 1, 200) for i, j in choice.pairs if (i < 100) == (j < 100)]
+    assert choice.complete(within, 200).pairs == choice.whole().pairs
 
 
 def test_numbered_photos_are_matched_with_the_next_photos_by_name():
     """The order is that of the numbers, not of the text, and each prefix is a series of its own."""
     names = [f"walk/IMG_{i}.JPG" for i in range(2, 102)] + [f"other{i}.png" for i in range(100)]
-    photos = [
-        Photo(name, name, 640, 480, "phone", None, None, None, False, False) for name in names
-    ]
+    photos = [Photo(name, name, 640, 480, "phone") for name in names]
     unlike = np.random.default_rng(0).random((200, 200))
     choice = choose_pairs(photos, EFFORT, lambda: unlike)
     chosen, overlap = set(choice.pairs), EFFORT.overlap // 2
@@ -142,9 +140,7 @@ def test_numbered_photos_are_matched_with_the_next_photos_by_name():
 
 def test_photos_without_numbers_are_matched_with_similar_ones_only():
     names = [f"{a}{b}.jpg" for a in "abcdefghijklmnopqrst" for b in "abcdefghij"]
-    photos = [
-        Photo(name, name, 640, 480, "phone", None, None, None, False, False) for name in names
-    ]
+    photos = [Photo(name, name, 640, 480, "phone") for name in names]
     choice = choose_pairs(photos, EFFORT, lambda: ring(200, 200))
     assert "by name" not in choice.description
 

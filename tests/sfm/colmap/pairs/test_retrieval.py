@@ -25,11 +25,6 @@ def test_photos_of_one_place_find_each_other():
         assert i // 4 == j // 4
 
 
-def test_same_features_have_the_same_neighbours():
-    photos = places(6, 3, seed=1)
-    assert np.array_equal(similarity(photos), similarity([d.copy() for d in photos]))
-
-
 def test_photos_without_features_are_similar_to_none():
     photos = places(3, 3)
     photos[4] = np.zeros((0, 128))

@@ -14,13 +14,10 @@ from snowsplat.sfm.ingest.content.panorama import (
     shows_all_around,
     spherical_video,
 )
-from snowsplat.sfm.ingest.inputs import gather
 from snowsplat.sfm.ingest.photo import not_used
-from snowsplat.sfm.options import GatherOptions
-from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
-from ...pictures import pan, photo, wall, write_photos, write_video
+from ...pictures import gathered, pan, photo, wall, write_photos, write_video
 
 _XMP = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description '
@@ -141,11 +138,6 @@ def test_metadata_of_spherical_videos(tmp_path):
     half = second[:-8] + b"\x40\0\0\0" * 2
     assert "a part" in found("i.mp4", head, (b"moov", half))
     assert "cube" in found("j.mp4", head, (b"moov", b"sv3d....cbmp" + bytes(20)))
-
-
-def gathered(source, dataset, **options):
-    dataset.mkdir()
-    return gather([source], dataset, GatherOptions(**options), silent)
 
 
 @pytest.mark.parametrize("xmp", [_WHOLE, None])

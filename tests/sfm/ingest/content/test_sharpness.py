@@ -7,7 +7,6 @@ from PIL import Image
 from snowsplat.sfm.ingest.content.sharpness import (
     BLACK,
     BLURRED,
-    CONTENT_SIDE,
     FLAT,
     WHITE,
     grey_copy,
@@ -15,16 +14,7 @@ from snowsplat.sfm.ingest.content.sharpness import (
     why_unusable,
 )
 
-from ...pictures import blurred, pan, wall
-
-
-def grey(picture: np.ndarray) -> np.ndarray:
-    return grey_copy(Image.fromarray(picture), CONTENT_SIDE)
-
-
-def noisy(picture: np.ndarray, level: float, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(0, level, picture.shape)
-    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+from ...pictures import blurred, grey, noisy, pan, wall
 
 
 def test_grey_copy_has_the_requested_side_and_is_never_larger():

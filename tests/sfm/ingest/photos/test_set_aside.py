@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.inputs import gather
-from snowsplat.sfm.options import GatherOptions
-from snowsplat.sfm.progress import silent
-
-from ...pictures import HEIGHT, WIDTH, pan, write_video
+from ...pictures import HEIGHT, WIDTH, gathered, pan, write_video
 
 pytestmark = pytest.mark.slow  # writes and decodes photos and videos
 
@@ -41,11 +37,6 @@ def folder_of(folder: Path, made: list[np.ndarray], ending="jpg") -> Path:
     for i, picture in enumerate(made):
         Image.fromarray(picture).save(folder / f"{i}.{ending}", quality=95)
     return folder
-
-
-def gathered(source: Path, dataset: Path):
-    dataset.mkdir(exist_ok=True)
-    return gather([source], dataset, GatherOptions(), silent)
 
 
 def mask(dataset: Path, name: str) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.search.names import free_names
+from snowsplat.sfm.ingest.search.names import free_name
 from snowsplat.sfm.ingest.search.sources import find_sources, kind_of_file
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.util.errors import UserError
@@ -145,7 +145,7 @@ def test_photos_are_in_the_order_of_their_numbers_and_names_are_short(tmp_path):
     root = write_photos(tmp_path / "p", 11)
     assert names(root) == [f"{i}.jpg" for i in range(11)]
     long = [f"{'雪' * 80}_{i:02d}.jpg" for i in range(3)]
-    shorter = list(free_names(long))
+    shorter = [free_name(name, set()) for name in long]
     assert [name[-7:] for name in shorter] == ["_00.jpg", "_01.jpg", "_02.jpg"]
     assert {len(name.encode()) <= 200 for name in shorter} == {True}
 
@@ -197,7 +197,9 @@ def test_a_name_that_is_not_utf_8(tmp_path):
 
 def test_free_names_are_unique_if_case_is_ignored():
     wanted = ["a.jpg", "A.jpg", "b/a.jpg", "a.jpg", "a_2.jpg"]
-    assert list(free_names(wanted)) == ["a.jpg", "A_2.jpg", "b/a.jpg", "a_3.jpg", "a_2_2.jpg"]
+    taken = set()
+    made = [free_name(name, taken) for name in wanted]
+    assert made == ["a.jpg", "A_2.jpg", "b/a.jpg", "a_3.jpg", "a_2_2.jpg"]
 
 
 def test_what_lies_beside_photos_is_told_by_name_and_content(tmp_path):

@@ -4,19 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from snowsplat.sfm.ingest.content.sharpness import CONTENT_SIDE, grey_copy
 from snowsplat.sfm.ingest.video.motion import FrameMotion, has_moved
 
-from ...pictures import blurred, pan, wall
-
-
-def grey(picture: np.ndarray) -> np.ndarray:
-    return grey_copy(Image.fromarray(picture), CONTENT_SIDE)
-
-
-def noisy(picture: np.ndarray, level: float, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(0, level, picture.shape)
-    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+from ...pictures import blurred, grey, noisy, pan, wall
 
 
 def textures(count: int) -> list[np.ndarray]:

@@ -27,12 +27,12 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.data.lens.models import lens_of
-from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.database import VerifiedPair, closing_database, verified_pairs
+from snowsplat.sfm.colmap.epipolar import Floats, homogeneous, sampson_distances
 from snowsplat.sfm.colmap.features.extraction import SEED
 from snowsplat.sfm.colmap.lenses.lens import is_fisheye, pixels_per_radian
-from snowsplat.sfm.colmap.mapping.view_graph import VerifiedPair, database_names, following_pairs
+from snowsplat.sfm.colmap.mapping.view_graph import database_names, following_pairs
 
-Floats = NDArray[np.floating[Any]]
 Ints = NDArray[np.integer[Any]]
 # The points of a model: their ids (P,), ascending, and their positions (P, 3).
 _Points = tuple[NDArray[np.uint64], Floats]
@@ -195,7 +195,7 @@ def check_pairs(
             return rays[image_id][features]
 
         for found in sorted(verified_pairs(database), key=lambda p: (p.first, p.second)):
-            first, second = found.first + 1, found.second + 1
+            first, second = found.first, found.second
             if first not in placed or second not in placed:
                 continue
             rows = source.read_two_view_geometry(first, second).inlier_matches
@@ -310,12 +310,8 @@ def agreement(
     rotation, translation = cam2_from_cam1.rotation.matrix(), cam2_from_cam1.translation
     x, y, z = translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    one, two = (_homogeneous(rays) for rays in (rays1, rays2))
-    lines1, lines2 = two @ essential, one @ essential.T
-    # The squared gradient of the product below, along the image plane or the sphere. There, the
-    # part across the sphere is zero on the epipolar line, and small near it.
-    length = (lines1[:, : rays1.shape[1]] ** 2).sum(1) + (lines2[:, : rays2.shape[1]] ** 2).sum(1)
-    distance = np.abs((two * lines2).sum(1)) / np.sqrt(np.maximum(length, 1e-300))
+    distance = sampson_distances(essential, rays1, rays2)
+    one, two = homogeneous(rays1), homogeneous(rays2)
     # depth1 · one + translation ≈ depth2 · two, with both rays in the frame of the second camera.
     one = one @ rotation.T
     one /= np.linalg.norm(one, axis=1, keepdims=True)
@@ -325,8 +321,3 @@ def agreement(
     is_in_front = (cosine * along2 > along1) & (along2 > cosine * along1)
     is_parallel = cosine > np.cos(np.radians(_MIN_ANGLE))
     return float(np.mean((distance <= max_error) & (is_in_front | is_parallel)))
-
-
-def _homogeneous(rays: Floats) -> Floats:
-    """(M, 3): ``rays``, with z = 1 if they are in an image plane."""
-    return rays.copy() if rays.shape[1] == 3 else np.pad(rays, ((0, 0), (0, 1)), constant_values=1)

@@ -6,7 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from snowsplat.sfm.colmap.database import Pair, displacement_of, feature_counts, verified_pairs
+from snowsplat.sfm.colmap.database import (
+    VerifiedPair,
+    displacement_of,
+    feature_counts,
+    verified_pairs,
+)
 from snowsplat.sfm.ingest.photo import Photo
 from snowsplat.sfm.options import MIN_PHOTOS
 from snowsplat.util.errors import UserError
@@ -29,8 +34,8 @@ _FLAT_SHARE = 0.8
 class Evidence:
     """The data about the photos that the COLMAP database contains after matching."""
 
-    features: list[int]  # number of features of each photo
-    pairs: list[Pair]  # the pairs with verified matches
+    features: list[int]  # number of features of each photo; the first photo has the image id 1
+    pairs: list[VerifiedPair]  # the pairs with verified matches
     # Typical displacement of a match between two photos, relative to the longest side; None if
     # there are no matches.
     displacement: float | None
@@ -55,14 +60,14 @@ class Evidence:
         no_match_limit = _MANY_FEATURES if self.matched_all else float("inf")
         return sum(
             count >= _FEW_FEATURES and (i in paired or count < no_match_limit)
-            for i, count in enumerate(self.features)
+            for i, count in enumerate(self.features, start=1)
         )
 
     @property
     def flat(self) -> bool:
         """Whether one plane, or a pure rotation of the camera, explains most matches."""
-        flat = sum(pair.inliers for pair in self.pairs if pair.flat)
-        return flat > 0 and flat >= _FLAT_SHARE * sum(pair.inliers for pair in self.pairs)
+        flat = sum(pair.matches for pair in self.pairs if pair.flat)
+        return flat > 0 and flat >= _FLAT_SHARE * sum(pair.matches for pair in self.pairs)
 
     @property
     def still(self) -> bool:
@@ -97,14 +102,11 @@ def explain(
         models: the names of the photos in each model, the largest model first.
         excluded: name -> reason, for photos that had a pose in a wrong place (`repair`).
     """
-    partners: list[list[int]] = [[] for _ in photos]
-    for pair in evidence.pairs:
-        partners[pair.first].append(pair.inliers)
-        partners[pair.second].append(pair.inliers)
     reasons = {}
-    for photo, features, matches in zip(photos, evidence.features, partners, strict=True):
+    for i, (photo, features) in enumerate(zip(photos, evidence.features, strict=True), start=1):
         if photo.name in models[0]:
             continue
+        matches = [pair.matches for pair in evidence.pairs if i in (pair.first, pair.second)]
         other_model = next((model for model in models[1:] if photo.name in model), None)
         others = plural("{n} other photo", "{n} other photos", n=len(matches))
         if photo.name in excluded:

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.checks.consistency import CheckedPair, Floats, Ints
+from snowsplat.sfm.colmap.checks.consistency import CheckedPair, Ints
+from snowsplat.sfm.colmap.epipolar import Floats
 from snowsplat.util.components import components
 
 # Two parts contradict each other if both of these conditions hold:
@@ -72,7 +73,7 @@ def find_parts(pairs: Sequence[CheckedPair]) -> list[set[int]]:
         follows[i, j] = follows[j, i] = pair.follows
     graph = _Graph(demand, supported, torn, confirmed, follows)
     parts = [part for component in _components(demand > 0) for part in _split(graph, component)]
-    parts = sorted(_merged(graph, parts), key=lambda part: (-len(part), part[0]))
+    parts = sorted(_merge(graph, parts), key=lambda part: (-len(part), part[0]))
     kept: list[int] = []
     cut = []
     for part in parts:
@@ -228,7 +229,7 @@ def _cut_weights(weights: Floats, order: Ints) -> Floats:
     return np.cumsum(sorted_weights.sum(1) - 2 * before)[:-1]
 
 
-def _merged(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
+def _merge(graph: _Graph, parts: list[list[int]]) -> list[list[int]]:
     """Join parts that have supported demand between them and do not contradict each other. The two
     parts with the largest supported demand between them are joined first."""
     parts = [sorted(part) for part in parts]

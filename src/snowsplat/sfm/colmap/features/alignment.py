@@ -71,7 +71,7 @@ def align_features(
         lenses = {i: model.cameras[model.image(i).camera_id] for i in names}
         sizes = {i: detection_size(image_size, lens.is_spherical()) for i, lens in lenses.items()}
         patches = _Patches.cut(block, names, keypoints, images, sizes, threads)
-        positions, good = patches.aligned(block)
+        positions, good = patches.align(block)
         points = {i: model.image(i).points2D for i in names}
         (moved,) = np.nonzero(good)
         for i, row, position in zip(
@@ -133,7 +133,7 @@ class _Patches(NamedTuple):
             list(pool.map(cut_from, names))
         return result
 
-    def aligned(self, features: _Features) -> tuple[Floats, NDArray[np.bool_]]:
+    def align(self, features: _Features) -> tuple[Floats, NDArray[np.bool_]]:
         """The aligned positions (N, 2) in pixels of the photos, and (N,) which of them are good."""
         template = self._templates(features)
         (others,) = np.nonzero(template != np.arange(len(template)))

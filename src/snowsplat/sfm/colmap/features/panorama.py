@@ -32,10 +32,10 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
     lens = lens_of("EQUIRECTANGULAR", columns, rows, (float(columns), float(rows)))
     parts = []
     for view in lens_views(lens):
-        seen = _seen(grey, view)
+        seen = _grey_in_view(grey, view)
         used = _own_part(view)
         if allowed is not None:
-            used &= _seen(allowed, view) > 127
+            used &= _grey_in_view(allowed, view) > 127
         if used.any():
             parts.append(_in_panorama(detect_in_grey(seen, used.astype(np.uint8), count), view))
     if not parts:
@@ -52,7 +52,7 @@ def detect_in_panorama(photo: Path, mask: Path | None, image_size: int, count: i
     return Features(keypoints, descriptors[largest])
 
 
-def _seen(grey: NDArray[np.uint8], view: LensView) -> NDArray[np.uint8]:
+def _grey_in_view(grey: NDArray[np.uint8], view: LensView) -> NDArray[np.uint8]:
     """(h, w): a grey panorama (H, W) in a view."""
     return np.asarray(resample(grey[None], view, view.width, view.height)[0])
 

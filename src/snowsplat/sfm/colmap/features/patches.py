@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snowsplat.util.native_layout import ALIGNMENT_RADIUS
-from snowsplat.util.native_library import call_with_arrays
+from snowsplat.util.native_library import call_with_arrays, check_array
 
 Floats = NDArray[np.floating[Any]]
 
@@ -89,17 +89,10 @@ def align_patches(patches: NDArray[np.uint8], pairs: NDArray[np.int32]) -> Align
         ValueError: a wrong shape or dtype, or an index that is out of range.
         UserError: the native library is missing or outdated.
     """
-    for name, array, shape, dtype in (
-        ("patches", patches, (len(patches), SIDE, SIDE), np.uint8),
-        ("pairs", pairs, (len(pairs), 2), np.int32),
-    ):
-        if array.shape != shape or array.dtype != dtype:
-            raise ValueError(
-                f"align_patches: {name} must be {shape} {np.dtype(dtype)}, "
-                f"got {array.shape} {array.dtype}"
-            )
+    check_array("patches", patches, (len(patches), SIDE, SIDE), np.uint8)
+    check_array("pairs", pairs, (len(pairs), 2), np.int32)
     if pairs.size and not (pairs.min() >= 0 and pairs.max() < len(patches)):
-        raise ValueError(f"align_patches: pairs must be indices of {len(patches)} patches")
+        raise ValueError(f"pairs must be indices of {len(patches)} patches")
     aligned = Aligned(np.empty((len(pairs), 2, 3), np.float32), np.empty(len(pairs), np.float32))
     call_with_arrays(
         "align_patches",

@@ -16,7 +16,7 @@ from PIL import Image
 from snowsplat.data.photos.image_file import scaled_size
 from snowsplat.sfm.ingest.photos.photo_files import open_image
 from snowsplat.util.machine import memory_bytes
-from snowsplat.util.native_library import call_with_arrays
+from snowsplat.util.native_library import call_with_arrays, check_array
 
 # Memory for each pixel of the resized photo. The first octave has 4 pixels for each pixel of the
 # photo; three levels of blur are kept, float32. The other octaves together have a third of its
@@ -79,13 +79,10 @@ def detect_in_grey(
         MemoryError: not enough memory.
         UserError: the native library is missing or outdated.
     """
-    for name, array in (("grey", grey), ("allowed", grey if allowed is None else allowed)):
-        if array.ndim != 2 or array.shape != grey.shape or array.dtype != np.uint8:
-            raise ValueError(
-                f"detect_in_grey: {name} must be an image (H, W) uint8 of the same size, "
-                f"got {array.shape} {array.dtype}"
-            )
     height, width = grey.shape
+    check_array("grey", grey, (height, width), np.uint8)
+    if allowed is not None:
+        check_array("allowed", allowed, (height, width), np.uint8)
     keypoints, descriptors = np.empty((count, 6), np.float32), np.empty((count, 128), np.uint8)
     found = call_with_arrays(
         "detect_sift",

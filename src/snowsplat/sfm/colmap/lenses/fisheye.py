@@ -73,7 +73,7 @@ def lens_evidence(database: Path, photos: Sequence[Photo], scale: float) -> dict
             spread = np.linspace(0, len(half) - 1, min(_PAIRS, len(half)), dtype=int)
             true = [_true_matches(source, half[k], scale) for k in spread]
             matches = [pair for pair in true if pair is not None]
-            evidence = _compared(matches, photos[own[0][0]], _MAX_ERROR * scale)
+            evidence = _compare_lenses(matches, photos[own[0][0]], _MAX_ERROR * scale)
             if evidence is not None:
                 found[camera] = evidence
     return found
@@ -98,7 +98,9 @@ def _true_matches(
     return one[kept], two[kept]
 
 
-def _compared(matches: Sequence[_Matches], photo: Photo, max_error: float) -> LensEvidence | None:
+def _compare_lenses(
+    matches: Sequence[_Matches], photo: Photo, max_error: float
+) -> LensEvidence | None:
     options = _ransac(max_error)
 
     def agreeing(estimate: dict[str, int] | None) -> int:

@@ -13,7 +13,6 @@ way, a lens with one focal length is tried if the two of OPENCV differ: pixels a
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -109,7 +108,8 @@ def is_fisheye(model: str) -> bool:
 
 def camera_ids(photos: Sequence[Photo]) -> list[int]:
     """The camera id of each photo: 1, 2, … in the order of the groups."""
-    keys = [_key(photo) for photo in photos]
+    # Photos of a group normally have the same size. If not, they need separate cameras.
+    keys = [(photo.group, photo.width, photo.height, photo.panorama) for photo in photos]
     ids = {key: number for number, key in enumerate(sorted(set(keys)), start=1)}
     return [ids[key] for key in keys]
 
@@ -122,25 +122,24 @@ def cameras_of(photos: Sequence[Photo], lens: Lens) -> list[pycolmap.Camera]:
     """
     cameras = []
     known = exif_focals(photos) if lens.exif else {}
-    for number, key in enumerate(sorted({_key(photo) for photo in photos}), start=1):
-        _, width, height, panorama = key
-        if panorama:  # it has no parameter that could be estimated
-            camera = pycolmap.Camera(model=PANORAMA_MODEL, width=width, height=height)
-            camera.camera_id, camera.params = number, [width, height]
+    ids = camera_ids(photos)
+    for number, photo in sorted(dict(zip(ids, photos, strict=True)).items()):
+        size = photo.width, photo.height
+        if photo.panorama:  # it has no parameter that could be estimated
+            camera = pycolmap.Camera(model=PANORAMA_MODEL, width=size[0], height=size[1])
+            camera.camera_id, camera.params = number, size
             camera.has_prior_focal_length = True
             cameras.append(camera)
             continue
-        count = sum(_key(photo) == key for photo in photos)
         model, guess = lens.model, GUESSED_FOCAL
         if number in lens.fisheyes or is_fisheye(model):
             model = "SIMPLE_FISHEYE" if model in _EQUIDISTANT else "SIMPLE_RADIAL_FISHEYE"
             guess = _GUESSED_FISHEYE
-        elif model == "auto" and lens.held:
-            model = "SIMPLE_RADIAL"
         elif model == "auto":
-            model = "OPENCV" if count >= _MIN_PHOTOS_FOR_OPENCV else "SIMPLE_RADIAL"
-        focal = known.get(number, lens.focals.get(number, guess * max(width, height)))
-        camera = pycolmap.Camera.create_from_model_name(number, model, focal, width, height)
+            enough = ids.count(number) >= _MIN_PHOTOS_FOR_OPENCV and not lens.held
+            model = "OPENCV" if enough else "SIMPLE_RADIAL"
+        focal = known.get(number, lens.focals.get(number, guess * max(size)))
+        camera = pycolmap.Camera.create_from_model_name(number, model, focal, *size)
         camera.has_prior_focal_length = number in known or lens.any_fisheye
         cameras.append(camera)
     return cameras
@@ -162,14 +161,14 @@ def with_all_parameters(
             enough = cameras.count(number) >= _MIN_PHOTOS_FOR_OPENCV
             name = "OPENCV_FISHEYE" if enough else camera.model_name
         if is_fisheye(camera.model_name) and name != camera.model_name:
-            chosen.append(_converted(camera, name))
+            chosen.append(_convert(camera, name))
     if not chosen:
         return model
-    made = refine(copy.deepcopy(model), chosen, held)
+    made = refine(model, chosen, held)
     return model if lens.model == "auto" and _impossible(made) else made
 
 
-def _converted(camera: pycolmap.Camera, model: str) -> pycolmap.Camera:
+def _convert(camera: pycolmap.Camera, model: str) -> pycolmap.Camera:
     """A camera in another ``model``; of the coefficients, those that both models have first."""
     size, focal = (camera.width, camera.height), camera.mean_focal_length()
     made = pycolmap.Camera.create_from_model_name(camera.camera_id, model, focal, *size)
@@ -212,18 +211,13 @@ def pixels_per_radian(camera: pycolmap.Camera) -> float:
     return camera.mean_focal_length()
 
 
-def _key(photo: Photo) -> tuple[str, int, int, bool]:
-    # Photos of a group normally have the same size. If not, they need separate cameras.
-    return photo.group, photo.width, photo.height, photo.panorama
-
-
-def findings_of(camera: pycolmap.Camera, exif: float | None) -> list[Finding]:
-    """What is wrong with an estimated lens; ``exif``: the focal length in EXIF, in pixels."""
+def findings_of(camera: pycolmap.Camera) -> list[Finding]:
+    """What is wrong with an estimated lens."""
     if camera.is_spherical():
         return []
     fx, fy = camera.focal_length_x, camera.focal_length_y
     cx, cy = camera.principal_point_x, camera.principal_point_y
-    found = lens_findings(camera.width, camera.height, fx, fy, cx, cy, known_focal=exif)
+    found = lens_findings(camera.width, camera.height, fx, fy, cx, cy)
     if is_fisheye(camera.model_name):
         found = [finding for finding in found if finding.about != "field of view"]
         reason = _implausible_fisheye(camera)
@@ -328,8 +322,7 @@ class Settled:
     notes: list[str]  # what is in doubt about the lens, as text for users
 
 
-#: Gives a model other cameras, runs bundle adjustment, and returns it. The last argument: whether
-#: the focal length is held.
+#: `Mapping.with_cameras`.
 Refine = Callable[
     [pycolmap.Reconstruction, Sequence[pycolmap.Camera], bool], pycolmap.Reconstruction
 ]
@@ -356,7 +349,7 @@ def settle_lens(
         """With the most detailed lens that is possible; if there is none, with the last one."""
         for name in lens.detailed:
             cameras = cameras_of(photos, replace(lens, model=name, held=False))
-            made = refine(copy.deepcopy(model), cameras, held)
+            made = refine(model, cameras, held)
             if not _impossible(made):
                 break
         return made
@@ -384,10 +377,10 @@ def _with_square_pixels(
         if lens.model != "auto" or camera.model_name != "OPENCV":
             continue
         if abs(camera.focal_length_x / camera.focal_length_y - 1) > _SQUARE:
-            unequal[number] = _converted(camera, "RADIAL")
+            unequal[number] = _convert(camera, "RADIAL")
     if not unequal:
         return model
-    made = refine(copy.deepcopy(model), list(unequal.values()), False)
+    made = refine(model, list(unequal.values()), False)
     # The errors of the photos of other cameras hardly change, so they do not count.
     photos = [model.image(i).camera_id for i in model.reg_image_ids()]
     share = sum(number in unequal for number in photos) / len(photos)
@@ -400,7 +393,7 @@ def _doubts(model: pycolmap.Reconstruction, known: Mapping[int, float]) -> list[
     found = []
     for number in used_cameras(model):
         camera = model.cameras[number]
-        found += [finding.text for finding in findings_of(camera, None)]
+        found += [finding.text for finding in findings_of(camera)]
         exif, focal = known.get(number), camera.mean_focal_length()
         if exif and not 1 / (1 + _NEAR_EXIF) < focal / exif < 1 + _NEAR_EXIF:
             found.append(
@@ -414,7 +407,7 @@ def _impossible(model: pycolmap.Reconstruction) -> bool:
     return any(
         finding.impossible
         for number in used_cameras(model)
-        for finding in findings_of(model.cameras[number], None)
+        for finding in findings_of(model.cameras[number])
     )
 
 

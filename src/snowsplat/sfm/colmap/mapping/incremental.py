@@ -185,7 +185,14 @@ class _Growth:
                 if register(self._mapper_options, photo):
                     self.mapper.triangulate_image(self._triangulation, photo)
                     if self.adjust:
-                        self._adjust_around(photo)
+                        self.mapper.iterative_local_refinement(
+                            self.options.ba_local_max_refinements,
+                            self.options.ba_local_max_refinement_change,
+                            self._mapper_options,
+                            self.options.get_local_bundle_adjustment(),
+                            self._triangulation,
+                            photo,
+                        )
                     return True
         return False
 
@@ -199,16 +206,6 @@ class _Growth:
             return follows, max((pair.weight for pair in pairs), default=0.0), -photo
 
         return sorted(photos, key=rank, reverse=True)
-
-    def _adjust_around(self, photo: int) -> None:
-        self.mapper.iterative_local_refinement(
-            self.options.ba_local_max_refinements,
-            self.options.ba_local_max_refinement_change,
-            self._mapper_options,
-            self.options.get_local_bundle_adjustment(),
-            self._triangulation,
-            photo,
-        )
 
     def _adjust_all(self) -> None:
         self.mapper.iterative_global_refinement(

@@ -5,17 +5,16 @@ from __future__ import annotations
 import copy
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pycolmap
 
 from snowsplat.sfm.colmap.database import (
     closing_database,
     copy_for_mapping,
-    count_rows,
     keep_matches_of_long_tracks,
     remove_database,
 )
@@ -90,12 +89,17 @@ class Mapping:
         ``mapper``: "plain" is the incremental mapper with COLMAP's own order of registration.
         ``relaxed``: accept weaker matches than COLMAP does by default (incremental mapper only).
         """
-        if mapper == "global":
-            models = self._map_globally()
-        elif mapper == "plain":
-            models = self._map_in_plain_order(relaxed)
-        else:
+        if mapper == "incremental":
             models = self._map_incrementally(relaxed)
+        elif mapper == "plain":
+            models = self._map_by(pycolmap.incremental_mapping, self._options(relaxed))
+        else:
+            options = pycolmap.GlobalPipelineOptions()
+            for threaded in (options, options.mapper):
+                threaded.num_threads = self.threads
+                threaded.random_seed = SEED
+            options.mapper.max_normalized_reproj_error *= self.scale
+            models = self._map_by(pycolmap.global_mapping, options)
         return usable_models([self._refine(m, scales=_FIRST_LOSS_SCALES) for m in models])
 
     def extend(
@@ -127,21 +131,22 @@ class Mapping:
         return self._refine(model)
 
     def with_cameras(
-        self, model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera]
+        self, model: pycolmap.Reconstruction, cameras: Sequence[pycolmap.Camera], held: bool
     ) -> pycolmap.Reconstruction:
-        """Replace cameras of ``model`` by those with the same ids, and run bundle adjustment.
+        """A copy of ``model`` with other cameras, those with the same ids, after bundle adjustment.
 
-        Changes ``model`` and returns it.
+        ``held``: the focal lengths are not changed.
         """
+        model, mapping = copy.deepcopy(model), replace(self, held=held)
         for camera in cameras:
             if camera.camera_id in model.cameras:
                 old = model.cameras[camera.camera_id]
                 old.model, old.params = camera.model, list(camera.params)
         if cameras:  # with other cameras, correct observations have large errors at first
             model.update_point_3d_errors()
-            self._adjust(model, _FINAL_LOSS_SCALES[0])
+            mapping._adjust(model, _FINAL_LOSS_SCALES[0])
             model.update_point_3d_errors()
-        return self._refine(model)
+        return mapping._refine(model)
 
     def align_features(self, model: pycolmap.Reconstruction, image_size: int) -> None:
         """Align the features of each point, and run bundle adjustment. Changes ``model``.
@@ -164,7 +169,8 @@ class Mapping:
         options = pycolmap.IncrementalPipelineOptions()
         # With several threads, the result of COLMAP's mapper depends on their timing.
         options.num_threads = 1
-        photos = count_rows(self.database, "images")
+        with closing_database(self.database) as database:
+            photos = database.num_images()
         if photos >= _LARGE_MODEL:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = _GROWTH
             options.ba_global_max_refinements = 1
@@ -266,30 +272,13 @@ class Mapping:
         if len(first) < len(graph.names):
             mapper.grow(model, graph.names, adjust=False)
 
-    def _map_in_plain_order(self, relaxed: bool) -> list[pycolmap.Reconstruction]:
-        options = self._options(relaxed)
+    def _map_by(self, pipeline: Callable[..., Any], options: Any) -> list[pycolmap.Reconstruction]:
+        """The models that one of COLMAP's own pipelines makes."""
         options.min_model_size = MIN_PHOTOS
         self.report(0, 0, "registered photos")
-        with self._output() as output:
-            models = pycolmap.incremental_mapping(self.database, self.images, output, options)
-        return list(models.values())
-
-    def _map_globally(self) -> list[pycolmap.Reconstruction]:
-        options = pycolmap.GlobalPipelineOptions()
-        options.num_threads = self.threads
-        options.random_seed = SEED
-        options.min_model_size = MIN_PHOTOS
-        options.mapper.num_threads = self.threads
-        options.mapper.random_seed = SEED
-        options.mapper.max_normalized_reproj_error *= self.scale
-        self.report(0, 0, "registered photos")
-        with self._output() as output:
-            models = pycolmap.global_mapping(self.database, self.images, output, options)
-        return list(models.values())
-
-    def _output(self) -> AbstractContextManager[Path]:
-        """A temporary folder, into which COLMAP writes each model as soon as it is complete."""
-        return new_folder(self.database.with_suffix(".models"))
+        # COLMAP writes each model there as soon as it is complete.
+        with new_folder(self.database.with_suffix(".models")) as output:
+            return list(pipeline(self.database, self.images, output, options).values())
 
     def _refine(
         self,

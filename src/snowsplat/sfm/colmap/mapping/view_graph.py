@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,48 +15,17 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.database import closing_database, verified_pairs
+from snowsplat.sfm.colmap.database import VerifiedPair, closing_database, verified_pairs
 from snowsplat.sfm.colmap.pairs.choice import numbered_series, pairs_following
 from snowsplat.util.components import components
 
-# Poses are not compared with pairs that have fewer verified matches: unrelated photos can have
-# about this number of matches by chance.
-_MIN_MATCHES = 50
-_MIN_FOLLOWING_MATCHES = 15  # for photos that follow each other: their matches are rarely false
 # Two photos follow each other if their positions in a series of names (`numbered_series`) differ by
-# at most `_MAX_STEP`. Such photos were usually taken side by side, so their matches are rarely
-# false, and each match counts as `_FOLLOWING_WEIGHT` matches. In five datasets with correct poses,
-# the model confirms all 692 pairs of this kind.
+# at most this number.
 _MAX_STEP = 2
-_FOLLOWING_WEIGHT = 20.0
 _STRONG_PAIR = 100  # number of verified matches of a strong pair
 # Two photos of the subset that follow each other by name are at most this number of positions apart
 # in the series of all photos. Even photos of equal rooms can be a strong pair.
 _MAX_GAP = 4
-
-
-@dataclass(frozen=True)
-class VerifiedPair:
-    """Two photos with verified matches: image ids of the database, ``first`` < ``second``."""
-
-    first: int
-    second: int
-    matches: int  # number of verified matches
-    follows: bool = field(default=False, kw_only=True)  # the photos follow each other (`_MAX_STEP`)
-
-    @property
-    def weight(self) -> float:
-        """The number of matches; those of photos that follow each other count several times."""
-        return self.matches * (_FOLLOWING_WEIGHT if self.follows else 1.0)
-
-    @property
-    def counts(self) -> bool:
-        """Whether the pair has enough matches to be compared with poses."""
-        return self.matches >= (_MIN_FOLLOWING_MATCHES if self.follows else _MIN_MATCHES)
-
-    def other(self, photo: int) -> int:
-        """The photo of this pair that is not ``photo``."""
-        return self.first + self.second - photo
 
 
 @dataclass(frozen=True)
@@ -67,18 +36,15 @@ class ViewGraph:
     pairs_of: Mapping[int, list[VerifiedPair]]  # image id -> its pairs
 
     @staticmethod
-    def from_pairs(names: Mapping[int, str], pairs: Iterable[tuple[int, int, int]]) -> ViewGraph:
-        """``pairs``: image ids (first < second) and number of verified matches.
-
-        Pairs with a photo that is not in ``names`` are left out.
-        """
+    def from_pairs(names: Mapping[int, str], pairs: Iterable[VerifiedPair]) -> ViewGraph:
+        """Pairs with a photo that is not in ``names`` are left out."""
         follow = following_pairs(names)
         pairs_of: dict[int, list[VerifiedPair]] = {i: [] for i in names}
-        for first, second, matches in pairs:
-            if first in names and second in names:
-                pair = VerifiedPair(first, second, matches, follows=(first, second) in follow)
-                pairs_of[first].append(pair)
-                pairs_of[second].append(pair)
+        for found in pairs:
+            if found.first in names and found.second in names:
+                pair = replace(found, follows=(found.first, found.second) in follow)
+                pairs_of[pair.first].append(pair)
+                pairs_of[pair.second].append(pair)
         return ViewGraph(names, pairs_of)
 
     @staticmethod
@@ -86,8 +52,7 @@ class ViewGraph:
         """The graph of all photos and verified pairs in the database."""
         with closing_database(database) as source:
             names = database_names(source)
-        found = verified_pairs(database)
-        return ViewGraph.from_pairs(names, ((p.first + 1, p.second + 1, p.inliers) for p in found))
+        return ViewGraph.from_pairs(names, verified_pairs(database))
 
     @property
     def pairs(self) -> list[VerifiedPair]:
@@ -102,7 +67,7 @@ class ViewGraph:
         """
         chosen = set(photos)
         names = {i: name for i, name in self.names.items() if i in chosen}
-        return ViewGraph.from_pairs(names, ((p.first, p.second, p.matches) for p in self.pairs))
+        return ViewGraph.from_pairs(names, self.pairs)
 
     def matrix(self) -> tuple[list[int], NDArray[np.floating[Any]]]:
         """The image ids in ascending order, and the number of verified matches of each pair.

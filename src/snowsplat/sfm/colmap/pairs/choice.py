@@ -15,7 +15,7 @@ If several rules apply, all of them are used, so that all photos are connected b
 If a photo has many similar ones, most of their pairs connect the same points again. So a photo is
 first matched with about half of them: with the most similar ones, and with others at growing
 distances in the order of similarity, which connect it to other parts of the scene. The other half
-is the reserve, for photos of which few pairs have enough matches (`completed`).
+is the reserve, for photos of which few pairs have enough matches (`PairChoice.complete`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.sfm.colmap.database import Pair
+from snowsplat.sfm.colmap.database import VerifiedPair
 from snowsplat.sfm.colmap.options import Effort
 from snowsplat.sfm.colmap.pairs.retrieval import nearest
 from snowsplat.sfm.gps import east_north_up, middle_of, position_errors
@@ -73,7 +73,7 @@ class PairChoice:
         """The rules and the number of pairs, as text for users."""
         return f"{self.rules} ({len(self.pairs)} pairs)"
 
-    def completed(self, verified: Sequence[Pair], count: int) -> PairChoice:
+    def complete(self, verified: Sequence[VerifiedPair], count: int) -> PairChoice:
         """This choice, with those pairs of the reserve that are needed.
 
         These are all pairs of photos that are not well connected; and all pairs, if there are
@@ -83,7 +83,7 @@ class PairChoice:
             verified: the pairs with verified matches.
             count: number of photos.
         """
-        clear = [(p.first, p.second) for p in verified if p.inliers >= _CLEAR_MATCHES]
+        clear = [(p.first - 1, p.second - 1) for p in verified if p.matches >= _CLEAR_MATCHES]
         first, second = np.array(clear, np.int64).reshape(-1, 2).T
         partners = np.bincount(np.concatenate([first, second]), minlength=count)
         groups = np.unique(components((first, second), count)[partners > 0])
@@ -116,7 +116,11 @@ def choose_pairs(
     sequences = _sequences(photos)
     if sequences:
         for sequence in sequences:
-            pairs |= _pairs_along(sequence, effort.overlap)
+            # With the next frames, and with those at distances of 2, 4, 8 … times as many frames.
+            steps = list(range(1, effort.overlap + 1))
+            while steps[-1] * 2 < len(sequence):
+                steps.append(steps[-1] * 2)
+            pairs |= pairs_following(sequence, steps)
         rules.append("frames of a video with the following frames")
     overlap = round(_NUMBERED_SHARE * effort.overlap)
     names = {i: photo.name for i, photo in enumerate(photos) if photo.sequence is None}
@@ -129,7 +133,13 @@ def choose_pairs(
         pairs |= near
         rules.append("photos with the nearest photos by GPS")
     covered = located == count or sum(map(len, sequences)) == count
-    alike = _unlike_next_frames(photos, similarity(), effort.overlap)
+    # A frame is most similar to the frames directly before and after it, which are already paired
+    # with it. They are excluded here; otherwise no pair would close a loop.
+    alike = similarity().copy()
+    for sequence in sequences:
+        for position, i in enumerate(sequence):
+            around = sequence[max(0, position - effort.overlap) : position + effort.overlap + 1]
+            alike[i, around] = -np.inf
     rules.append("photos with similar photos")
     if covered:
         pairs |= nearest(alike, range(round(_LOOP_SHARE * effort.neighbours)))
@@ -179,28 +189,6 @@ def _sequences(photos: Sequence[Photo]) -> list[list[int]]:
         if photo.sequence is not None:
             by_name.setdefault(photo.sequence, []).append(i)
     return [sorted(frames, key=lambda i: photos[i].name) for frames in by_name.values()]
-
-
-def _pairs_along(sequence: Sequence[int], overlap: int) -> Pairs:
-    # Pair every frame with the next `overlap` frames, and with frames at distances of 2, 4, 8 …
-    # times `overlap`.
-    steps = list(range(1, overlap + 1))
-    while steps[-1] * 2 < len(sequence):
-        steps.append(steps[-1] * 2)
-    return pairs_following(sequence, steps)
-
-
-def _unlike_next_frames(
-    photos: Sequence[Photo], similarity: NDArray[np.floating[Any]], overlap: int
-) -> NDArray[np.floating[Any]]:
-    # A frame is most similar to the frames directly before and after it, which are already paired
-    # with it. They are excluded here; otherwise no pair would close a loop.
-    similarity = similarity.copy()
-    for sequence in _sequences(photos):
-        for position, i in enumerate(sequence):
-            near = sequence[max(0, position - overlap) : position + overlap + 1]
-            similarity[i, near] = -np.inf
-    return similarity
 
 
 def _near_pairs(photos: Sequence[Photo], neighbours: int) -> tuple[Pairs, int]:

@@ -92,7 +92,7 @@ def match(first: PhotoSide, second: PhotoSide, max_error: float) -> NDArray[np.u
         begin = np.where(np.arange(n) < some, others, 0).astype(np.int32)
         rest = Searched(0, begin, np.full(n, m, np.int32))
         whole = two_nearest(first.descriptors, second.descriptors, rest)
-        return mutual(_joined(part[0], whole[0]), _joined(part[1], whole[1]))
+        return mutual(_join(part[0], whole[0]), _join(part[1], whole[1]))
     row_order, column_order, searched = _along_lines(first, second, *lines)
     found = two_nearest(first.descriptors[row_order], second.descriptors[column_order], searched)
     alike = first.alike[row_order], second.alike[column_order]
@@ -101,7 +101,7 @@ def match(first: PhotoSide, second: PhotoSide, max_error: float) -> NDArray[np.u
     return matches[np.argsort(matches[:, 0])].astype(np.uint32)
 
 
-def _joined(part: Nearest, rest: Nearest) -> Nearest:
+def _join(part: Nearest, rest: Nearest) -> Nearest:
     """The nearest of two sets, of which ``part`` (K, …) has the smaller indices; ``rest`` (N, …)
     with N ≥ K."""
     made = Nearest(*(column.copy() for column in rest))
@@ -157,8 +157,8 @@ def _along_lines(
     pixels, or a few times this distance.
     """
     left, _, right = np.linalg.svd(matrix)
-    radius, centre = _half_diagonal(second.camera), _centre(second.camera)
-    epipole = _epipole(left[:, 2], second.camera)
+    radius, centre = _frame(second.camera)
+    epipole = _epipole(left[:, 2], radius, centre)
     distance = np.hypot(*(second.positions - epipole).T)
     near = distance < _NEAR * radius
     angle = _angles(second.positions, epipole, centre)
@@ -184,8 +184,9 @@ def _along_lines(
 
     reach = float(np.arcsin(min(1.0, band / max(float(distance.min()), _NEAR * radius))))
     # The lines of features near the epipole are inaccurate. An angle of 90° is also one of -90°.
-    own = _epipole(right[2], first.camera)
-    every = np.hypot(*(first.positions - own).T) < _NEAR * _half_diagonal(first.camera)
+    own_radius, own_centre = _frame(first.camera)
+    own = _epipole(right[2], own_radius, own_centre)
+    every = np.hypot(*(first.positions - own).T) < _NEAR * own_radius
     every |= np.abs(angle) > np.pi / 2 - reach
     row_order = np.argsort(np.where(every, np.int16(-1), levels(angle)), kind="stable")
     every, angle = every[row_order], angle[row_order]
@@ -198,19 +199,16 @@ def _along_lines(
     )
 
 
-def _half_diagonal(camera: pycolmap.Camera) -> float:
-    return 0.5 * float(np.hypot(camera.width, camera.height))
+def _frame(camera: pycolmap.Camera) -> tuple[float, _Floats]:
+    """Half the diagonal of a photo, and its centre (2,), in pixels."""
+    centre = 0.5 * np.array([camera.width, camera.height])
+    return float(np.hypot(*centre)), centre
 
 
-def _centre(camera: pycolmap.Camera) -> _Floats:
-    return 0.5 * np.array([camera.width, camera.height])
-
-
-def _epipole(homogeneous: _Floats, camera: pycolmap.Camera) -> _Floats:
+def _epipole(homogeneous: _Floats, radius: float, centre: _Floats) -> _Floats:
     """(2,) in pixels; one that is very far away is moved nearer."""
-    centre = _centre(camera)
     offset = homogeneous[:2] - homogeneous[2] * centre
-    farthest = _FARTHEST * float(np.linalg.norm(centre))
+    farthest = _FARTHEST * radius
     least = float(np.linalg.norm(offset)) / farthest
     depth = float(np.copysign(max(abs(homogeneous[2]), least, 1e-300), homogeneous[2]))
     return np.asarray(centre + offset / depth)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from snowsplat.util.native_library import call_with_arrays
+from snowsplat.util.native_library import call_with_arrays, check_array
 
 #: Number of values of a descriptor.
 LENGTH = 128
@@ -57,7 +57,7 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
 def mutual(rows: Nearest, columns: Nearest) -> NDArray[np.uint32]:
     """The matches (K, 2), as in `match_descriptors`, of the results of `two_nearest`."""
-    forth, back = _accepted(rows), _accepted(columns)
+    forth, back = _accept(rows), _accept(columns)
     (found,) = np.nonzero(forth >= 0)
     found = found[back[forth[found]] == found]
     return np.stack([found, forth[found]], 1).astype(np.uint32)
@@ -85,23 +85,17 @@ def two_nearest(
         ValueError: a wrong shape or dtype, or ranges beyond ``second``.
         UserError: the native library is missing or outdated.
     """
-    for name, descriptors in (("first", first), ("second", second)):
-        if descriptors.ndim != 2 or descriptors.shape[1] != LENGTH:
-            raise ValueError(
-                f"two_nearest: {name} must be (any, {LENGTH}), got {descriptors.shape}"
-            )
-        if descriptors.dtype != np.uint8:
-            raise ValueError(f"two_nearest: {name} must be uint8, got {descriptors.dtype}")
     n, m = len(first), len(second)
+    check_array("first", first, (n, LENGTH), np.uint8)
+    check_array("second", second, (m, LENGTH), np.uint8)
     if searched is None:
         searched = Searched(0, np.zeros(n, np.int32), np.full(n, m, np.int32))
     for name, ends in (("begin", searched.begin), ("end", searched.end)):
-        if ends.shape != (n,) or ends.dtype != np.int32:
-            raise ValueError(f"two_nearest: {name} must be ({n},) int32")
+        check_array(name, ends, (n,), np.int32)
         if n and not (ends.min() >= 0 and ends.max() <= m):
-            raise ValueError(f"two_nearest: {name} must be from 0 to {m}")
+            raise ValueError(f"{name} must be from 0 to {m}")
     if not 0 <= searched.common <= m:
-        raise ValueError(f"two_nearest: common must be from 0 to {m}, got {searched.common}")
+        raise ValueError(f"common must be from 0 to {m}, got {searched.common}")
     rows, columns = (Nearest(*(np.empty(k, np.int32) for _ in range(3))) for k in (n, m))
     call_with_arrays(
         "match_descriptors",
@@ -122,7 +116,7 @@ def two_nearest(
     return rows, columns
 
 
-def _accepted(nearest: Nearest) -> NDArray[np.int32]:
+def _accept(nearest: Nearest) -> NDArray[np.int32]:
     """(N,) the index of the nearest descriptor, or -1 where the angle or the ratio is too large."""
     angle, second = (_angle(product) for product in (nearest.best, nearest.second))
     return np.where(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from snowsplat.sfm.colmap.database import closing_database
+from snowsplat.sfm.colmap.epipolar import sampson_distances
 from snowsplat.sfm.colmap.features.extraction import SEED, WorkerProgress
 from snowsplat.sfm.colmap.pairs.guided_matching import PhotoSide, match
 from snowsplat.sfm.colmap.pairs.matching import LENGTH
@@ -85,9 +86,8 @@ def match_pairs(
         def submit(i: int, j: int) -> Future[NDArray[np.uint32]]:
             return pool.submit(match, read_features(i), read_features(j), max_error)
 
-        for done, block in _blocks(pairs, opened.exists_matches):
-            progress.report(done, len(pairs), "matched pairs")
-            _write_block(opened, block, submit, opened.write_matches)
+        report = functools.partial(progress.report, what="matched pairs")
+        _in_blocks(opened, pairs, opened.exists_matches, submit, opened.write_matches, report)
 
 
 def verify_pairs(
@@ -112,37 +112,31 @@ def verify_pairs(
             matches = opened.read_matches(i, j)
             return pool.submit(verify_matches, side(i), side(j), matches, max_error)
 
-        for done, block in _blocks(pairs, opened.exists_two_view_geometry):
-            progress.report(done, len(pairs), "verified pairs")
-            _write_block(opened, block, submit, opened.write_two_view_geometry)
-        progress.report(len(pairs), len(pairs), "verified pairs")
+        report = functools.partial(progress.report, what="verified pairs")
+        exists, write = opened.exists_two_view_geometry, opened.write_two_view_geometry
+        _in_blocks(opened, pairs, exists, submit, write, report)
+        report(len(pairs), len(pairs))
 
 
-_Pair = tuple[int, int]  # two image ids
-
-
-def _blocks(
-    pairs: Sequence[tuple[int, int]], exists: Callable[[int, int], bool]
-) -> Iterator[tuple[int, list[_Pair]]]:
-    """The number of finished pairs, and the next ones of those that do not exist yet."""
-    ids = [(i + 1, j + 1) for i, j in pairs]
-    remaining = [pair for pair in ids if not exists(*pair)]
-    for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
-        yield len(ids) - len(remaining) + start, remaining[start : start + _PAIRS_PER_BLOCK]
-
-
-def _write_block(
+def _in_blocks(
     database: pycolmap.Database,
-    block: Sequence[_Pair],
+    pairs: Sequence[tuple[int, int]],
+    exists: Callable[[int, int], bool],
     submit: Callable[[int, int], Future[Any]],
     write: Callable[[int, int, Any], None],
+    report: Callable[[int, int], None],
 ) -> None:
-    """Compute the results of some pairs in threads, and write them in one transaction."""
-    jobs = [submit(*pair) for pair in block]
-    transaction = pycolmap.DatabaseTransaction(database)
-    for pair, job in zip(block, jobs, strict=True):
-        write(*pair, job.result())
-    del transaction  # the destructor ends the transaction
+    """Compute the results of those ``pairs`` that do not exist yet in threads, and write each block
+    of them in one transaction. The functions take image ids."""
+    remaining = [(i + 1, j + 1) for i, j in pairs if not exists(i + 1, j + 1)]
+    for start in range(0, len(remaining), _PAIRS_PER_BLOCK):
+        report(len(pairs) - len(remaining) + start, len(pairs))
+        block = remaining[start : start + _PAIRS_PER_BLOCK]
+        jobs = [submit(*pair) for pair in block]
+        transaction = pycolmap.DatabaseTransaction(database)
+        for pair, job in zip(block, jobs, strict=True):
+            write(*pair, job.result())
+        del transaction  # the destructor ends the transaction
 
 
 def _cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
@@ -231,7 +225,7 @@ def _from_a_part(
     elif matrix is None and found.E is not None:
         rays = one.cam_from_img(points[matches[:, 0]]), other.cam_from_img(others[matches[:, 1]])
         focal = 0.5 * (one.mean_focal_length() + other.mean_focal_length())
-        errors = _errors(found.E, np.asarray(rays[0]), np.asarray(rays[1]))
+        errors = sampson_distances(found.E, np.asarray(rays[0]), np.asarray(rays[1]))
         agreeing = errors <= options.ransac.max_error / focal
         if agreeing.mean() > options.min_E_F_inlier_ratio:
             matches = matches[agreeing]
@@ -266,7 +260,7 @@ def _consensus(
     some = np.linspace(0, len(first) - 1, min(_SAMPLE, len(first))).astype(int)
     found = pycolmap.estimate_fundamental_matrix(first[some], second[some], options)
     if found is not None and found["num_inliers"] > _MOST * len(some):
-        return found["F"], _errors(found["F"], first, second) <= options.max_error
+        return found["F"], sampson_distances(found["F"], first, second) <= options.max_error
     estimates: list[Callable[[], dict[str, Any] | None]] = [
         lambda: pycolmap.estimate_fundamental_matrix(first, second, options),
         lambda: pycolmap.estimate_homography_matrix(first, second, options),
@@ -283,12 +277,3 @@ def _consensus(
         if best.mean() > _MOST:
             break
     return matrix, best
-
-
-def _errors(matrix: _Floats, first: _Floats, second: _Floats) -> _Floats:
-    """(M,) the Sampson distances of the matches ``first`` and ``second`` (M, 2) from the epipolar
-    lines of the ``matrix`` (3, 3), in the unit of the points."""
-    one, two = (np.column_stack([points, np.ones(len(points))]) for points in (first, second))
-    lines, others = one @ matrix.T, two @ matrix
-    squares = (lines[:, :2] ** 2).sum(1) + (others[:, :2] ** 2).sum(1)
-    return np.abs((two * lines).sum(1)) / np.sqrt(np.maximum(squares, 1e-300))

@@ -32,23 +32,6 @@ _POLL_SECONDS = 0.5
 _Watchers = tuple[Report, Figures, ShowPoses]
 
 
-class Crashed(Exception):
-    """The child ended without a result; ``code`` is its exit status, negative for a signal."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
-
-    @property
-    def reason(self) -> str:
-        """How the child ended, as text."""
-        if self.code == -getattr(signal, "SIGKILL", 9):
-            return "it was killed, probably because the memory was full"
-        if self.code < 0:
-            return f"it crashed ({signal.Signals(-self.code).name})"
-        return f"it ended with status {self.code}"
-
-
 def estimate_poses(
     dataset: Path,
     photos: list[Photo],
@@ -95,27 +78,37 @@ def estimate_poses(
         "photos": [dataclasses.asdict(photo) for photo in photos],
         "options": dataclasses.asdict(options),
     }
-    threads, watchers = thread_count(options.threads), (report, figures, show_poses)
-    try:
-        return _run({**job, "reduced": False}, log, threads, watchers)
-    except Crashed as crash:
-        first = crash
+    watchers, crashes = (report, figures, show_poses), list[int]()
+    for threads in (thread_count(options.threads), 1):
+        result = _run({**job, "reduced": bool(crashes)}, log, threads, watchers)
+        if isinstance(result, SfmResult):
+            notes = [
+                f"first attempt: {_reason(code)}; repeated with smaller photos and one thread"
+                for code in crashes
+            ]
+            return dataclasses.replace(result, attempts=[*notes, *result.attempts])
+        crashes.append(result)
         _check_disk(distorted)
-    try:
-        result = _run({**job, "reduced": True}, log, 1, watchers)
-    except Crashed as crash:
-        _check_disk(distorted)
-        advice = message("report it")
-        if crash.code < 0:
-            advice = message("use fewer or smaller photos, or a lower effort")
-        raise UserError(
-            "pose estimation: failed twice: {reason}; {advice} (last line of the log: {last_line})",
-            reason=crash.reason,
-            advice=advice,
-            last_line=_last_line(log),
-        ) from None
-    note = f"first attempt: {first.reason}; repeated with smaller photos and one thread"
-    return dataclasses.replace(result, attempts=[note, *result.attempts])
+    advice = message("report it")
+    if crashes[-1] < 0:
+        advice = message("use fewer or smaller photos, or a lower effort")
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    raise UserError(
+        "pose estimation: failed twice: {reason}; {advice} (last line of the log: {last_line})",
+        reason=_reason(crashes[-1]),
+        advice=advice,
+        last_line=next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none"),
+    )
+
+
+def _reason(code: int) -> str:
+    """How the child ended without a result, as text; ``code`` is its exit status, negative for a
+    signal."""
+    if code == -getattr(signal, "SIGKILL", 9):
+        return "it was killed, probably because the memory was full"
+    if code < 0:
+        return f"it crashed ({signal.Signals(-code).name})"
+    return f"it ended with status {code}"
 
 
 def _check_disk(folder: Path) -> None:
@@ -130,12 +123,8 @@ def _check_disk(folder: Path) -> None:
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
-def _last_line(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
-    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "none")
-
-
-def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> SfmResult:
+def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> SfmResult | int:
+    """The result of a child, or its exit status if it has ended without a result."""
     with (
         open(log, "ab") as log_file,
         subprocess.Popen(
@@ -156,7 +145,7 @@ def _run(job: dict[str, Any], log: Path, threads: int, watchers: _Watchers) -> S
     if "user_error" in answer:
         raise UserError(as_message(answer["user_error"]))
     if "result" not in answer:
-        raise Crashed(code)
+        return code
     result = answer["result"]
     reasons = {name: as_message(why) for name, why in result["unregistered"].items()}
     return SfmResult(**result | {"unregistered": reasons})

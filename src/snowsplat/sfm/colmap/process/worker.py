@@ -54,8 +54,8 @@ def main() -> None:
         answers.write(json.dumps(line) + "\n")
         answers.flush()
 
-    def report(*counts: Any, **_: Any) -> None:
-        send(progress=counts, cpu=time.process_time(), **figures)
+    def report(done: int, total: int, what: str = "", left: float | None = None) -> None:
+        send(progress=(done, total, what), cpu=time.process_time(), **figures)
 
     try:
         progress = WorkerProgress(

@@ -315,7 +315,7 @@ def _with_enclosed(found: NDArray[np.bool_], copies: NDArray[np.uint8]) -> NDArr
 def describe_bars(parts: FixedParts, cropped: bool, where: str) -> str:
     """Where the bars are, and what was done about them; ``where``: e.g. "all 14 photos"."""
     names = ("left", "top", "right", "bottom")
-    sides = _listed([name for name, width in zip(names, parts.bars, strict=True) if width])
+    sides = _list_of([name for name, width in zip(names, parts.bars, strict=True) if width])
     bars = "a bar" if sum(map(bool, parts.bars)) == 1 else "bars"
     return f"{bars} at the {sides}: {'cut off' if cropped else 'masked'} in {where}"
 
@@ -349,8 +349,8 @@ def _places(overlays: NDArray[np.bool_]) -> str:
             columns = slice(column * width // 3, (column + 1) * width // 3)
             if overlays[rows, columns].sum() >= _PART_OF_ALL * overlays.sum():
                 names.append(name)
-    return _listed(names)
+    return _list_of(names)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_of(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + (" and " if len(names) > 1 else "") + names[-1]

@@ -60,7 +60,7 @@ def find_image_circle(copies: NDArray[np.uint8]) -> ImageCircle | None:
     edge = _edge(level > _LIT)
     if len(edge) < _MIN_SEEN * _DIRECTIONS:
         return None
-    circle = _fitted(edge)
+    circle = _fit_circle(edge)
     distance = _distances(level.shape, circle.x, circle.y) / circle.radius
     off_centre = np.hypot(circle.x - width / 2, circle.y - height / 2)
     residuals = np.hypot(edge[:, 0] - circle.x, edge[:, 1] - circle.y) / circle.radius - 1
@@ -99,7 +99,7 @@ def _edge(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.stack([x[rows, last[rows]], y[rows, last[rows]]], 1)
 
 
-def _fitted(points: NDArray[np.float64]) -> ImageCircle:
+def _fit_circle(points: NDArray[np.float64]) -> ImageCircle:
     """The circle through points (K, 2): least squares, then again with the nearest 85% of them."""
     kept = points
     for _ in range(3):

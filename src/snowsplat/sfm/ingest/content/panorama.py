@@ -35,6 +35,8 @@ _STEREO = re.compile(rb"<GSpherical:StereoMode>\s*(?:top-bottom|left-right)", re
 # Version 2: a box sv3d that has a box proj with a box of the projection, and beside it a box st3d.
 _LONGEST_BOX = 1024  # bytes between the names of these boxes
 _LONGEST_HEADER = 64 << 20  # bytes; longer ones are not searched
+# A track of video in an mp4 file: its width and height, 2 bytes each.
+_TRACKS = re.compile(rb"stsd.{12}(?:avc[13]|hvc1|hev1|av01).{24}(.{4})", re.DOTALL)
 
 _WIDTH = 256  # pixels of the copy that is tested
 _RATIO_ERROR = 0.01  # relative difference of the aspect ratio from 2
@@ -117,10 +119,6 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDAr
     return np.asarray(np.abs(first - second).mean(axis=0))
 
 
-# A track of video in an mp4 file: its width and height, 2 bytes each.
-_TRACKS = re.compile(rb"stsd.{12}(?:avc[13]|hvc1|hev1|av01).{24}(.{4})", re.DOTALL)
-
-
 def spherical_video(path: Path) -> str | None:
     """Whether the header of an mp4 file says that its frames show all directions.
 
@@ -129,18 +127,19 @@ def spherical_video(path: Path) -> str | None:
 
     Raises: OSError: the file cannot be read.
     """
-    header = _header(path)
+    header = b""
+    for kind, start, end in top_boxes(path):
+        if kind == b"moov" and end - start <= _LONGEST_HEADER:
+            with open(path, "rb") as file:
+                file.seek(start)
+                header = file.read(end - start)
+            break
     at = header.find(b"sv3d")
-    if at >= 0:
-        return _version_2(header, at)
-    if _SPHERICAL.search(header):
-        return _TWO_EYES if _STEREO.search(header) else ""
-    sizes = _TRACKS.findall(header)
-    return "has the pictures of two lenses" if len(sizes) > len(set(sizes)) else None
-
-
-def _version_2(header: bytes, at: int) -> str | None:
-    """What the box sv3d says, whose name is at ``at`` in the header of an mp4 file."""
+    if at < 0:
+        if _SPHERICAL.search(header):
+            return _TWO_EYES if _STEREO.search(header) else ""
+        sizes = _TRACKS.findall(header)
+        return "has the pictures of two lenses" if len(sizes) > len(set(sizes)) else None
     near = header[at : at + _LONGEST_BOX]
     stereo = header[max(0, at - _LONGEST_BOX) : at + _LONGEST_BOX].partition(b"st3d")[2]
     if len(stereo) > 4 and stereo[4]:
@@ -153,13 +152,3 @@ def _version_2(header: bytes, at: int) -> str | None:
     # Version and flags, then the parts cut off at the top, bottom, left and right.
     bounds = [int.from_bytes(box[i : i + 4], "big") for i in range(4, 20, 4)]
     return "shows only a part of all directions" if any(bounds) else ""
-
-
-def _header(path: Path) -> bytes:
-    """The box moov of an mp4 file; empty if there is none."""
-    for kind, start, end in top_boxes(path):
-        if kind == b"moov" and end - start <= _LONGEST_HEADER:
-            with open(path, "rb") as file:
-                file.seek(start)
-                return file.read(end - start)
-    return b""

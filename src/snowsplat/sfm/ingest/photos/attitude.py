@@ -63,7 +63,7 @@ def read_attitude(
     gimbal = _gimbal(xmp)
     if gimbal is not None:
         up, north = (_upright(direction, orientation) for direction in gimbal)
-        return Attitude(_rounded(up), _rounded(north), gimbal=True)
+        return Attitude(_round(up), _round(north), gimbal=True)
     gravity = _apple_up(details)
     gravity = _mapillary_up(exif) if gravity is None else _upright(gravity, orientation)
     gravity = None if gravity is None else _standing(gravity)
@@ -72,7 +72,7 @@ def read_attitude(
         return None
     # North in the frame of a level camera that looks at this azimuth.
     facing = None if heading is None else np.array([-math.sin(heading), 0.0, math.cos(heading)])
-    return Attitude(_rounded(gravity), _rounded(facing), gimbal=False)
+    return Attitude(_round(gravity), _round(facing), gimbal=False)
 
 
 def _gimbal(xmp: bytes) -> tuple[np.ndarray, np.ndarray] | None:
@@ -179,7 +179,7 @@ def _upright(direction: np.ndarray, orientation: int) -> np.ndarray:
     return np.array([x, y, direction[2]])
 
 
-def _rounded(direction: np.ndarray | None) -> Direction | None:
+def _round(direction: np.ndarray | None) -> Direction | None:
     """A tuple for JSON. Six decimals are a ten-thousandth of a degree."""
     if direction is None:
         return None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -35,9 +34,10 @@ from snowsplat.sfm.ingest.photos.photo_files import (
     read_header,
     save,
 )
-from snowsplat.sfm.ingest.search.names import free_names
+from snowsplat.sfm.ingest.search.names import free_name
 from snowsplat.sfm.ingest.search.sources import Source
-from snowsplat.sfm.progress import Report
+from snowsplat.sfm.options import GatherOptions
+from snowsplat.sfm.progress import Report, in_threads
 from snowsplat.util.files import shown
 from snowsplat.util.messages import Message, message
 from snowsplat.util.natural_order import natural_key
@@ -54,64 +54,46 @@ class Planned:
 
 
 def plan_photos(
-    sources: Sequence[Source],
-    longest: int | None,
-    left_out: list[LeftOut],
-    panoramas: bool = False,
-    as_stored: bool = False,
+    sources: Sequence[Source], options: GatherOptions, left_out: list[LeftOut]
 ) -> list[Planned]:
     """Choose the name of each photo in ``input/``. Photos are sorted by this name.
 
     If two photos would have the same name, the one whose name need not change keeps it. Photos that
-    cannot be used are appended to ``left_out``.
-
-    Args:
-        panoramas: all photos are 360° panoramas, even if their metadata do not say so.
-        as_stored: the pixels are used as stored; see `Header.as_stored`.
+    cannot be used are appended to ``left_out``. If there are more photos than `options.photos`,
+    they are spread evenly, and the last one is used.
     """
     read = []
     for source in sources:
         try:
             header = read_header(source.path)
-            if as_stored:
+            if options.as_stored:
                 header = header.as_stored()
-            if panoramas:
-                header = _as_panorama(header)
+            if options.panoramas and header.panorama is None:
+                if not is_twice_as_wide(*header.size(None)):
+                    raise Unusable(NOT_TWICE_AS_WIDE)
+                header = replace(header, panorama=Panorama())
         except Unusable as error:
             left_out.append(not_used(source.path, error.message))
-        else:
-            if header.animated > 1:
-                reason = message(
-                    "is an animation of {n} pictures, of which one is used; save the others as "
-                    "photos or a video",
-                    n=header.animated,
-                )
-                left_out.append(not_used(source.path, reason))
-            name = header.file_name(source.name, longest)
-            read += [(_page_name(name, page), source, header, page) for page in header.pages]
+            continue
+        if header.animated > 1:
+            reason = message(
+                "is an animation of {n} pictures, of which one is used; save the others as photos "
+                "or a video",
+                n=header.animated,
+            )
+            left_out.append(not_used(source.path, reason))
+        name = header.file_name(source.name, options.size)
+        path = PurePosixPath(name)
+        for page in header.pages:
+            of_page = path.with_name(f"{path.stem}_page{page + 1:03d}{path.suffix}")
+            read.append((str(of_page) if page else name, source, header, page))
     read.sort(key=lambda entry: (entry[0] != entry[1].name, entry[0]))
-    names = free_names([entry[0] for entry in read])
-    planned = [Planned(s, h, name, p) for name, (_, s, h, p) in zip(names, read, strict=True)]
-    return sorted(planned, key=lambda plan: natural_key(plan.name))
-
-
-def _page_name(name: str, page: int) -> str:
-    path = PurePosixPath(name)
-    return str(path.with_name(f"{path.stem}_page{page + 1:03d}{path.suffix}")) if page else name
-
-
-def _as_panorama(header: Header) -> Header:
-    """The header of a panorama. Raises Unusable if the photo cannot be one."""
-    if header.panorama is None and not is_twice_as_wide(*header.size(None)):
-        raise Unusable(NOT_TWICE_AS_WIDE)
-    return replace(header, panorama=header.panorama or Panorama())
-
-
-def spread_evenly(planned: Sequence[Planned], count: int) -> list[Planned]:
-    """At most ``count`` of the photos, at equal distances in their order, and the last one."""
-    if count >= len(planned):
-        return list(planned)
-    last = len(planned) - 1
+    taken = set[str]()
+    planned = [Planned(source, header, free_name(n, taken), p) for n, source, header, p in read]
+    planned.sort(key=lambda plan: natural_key(plan.name))
+    count, last = options.photos, len(planned) - 1
+    if count is None or count > last:
+        return planned
     return [planned[round(i * last / max(1, count - 1))] for i in range(count)]
 
 
@@ -139,20 +121,14 @@ def write_photos(
         except Unusable as error:
             return error.message
 
-    photos, looks = [], []
-    pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="snowsplat-photos")
-    try:
-        for done, (plan, outcome) in enumerate(
-            zip(planned, pool.map(work, planned), strict=True), 1
-        ):
-            if isinstance(outcome, Message):
-                left_out.append(not_used(plan.source.path, outcome))
-            else:
-                photos.append(outcome[0])
-                looks += [look for look in outcome[1:] if look is not None]
-            report(done, len(planned), "photos")
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    photos, looks = list[Photo](), list[MaskLook]()
+    made = in_threads(work, planned, min(4, os.cpu_count() or 1), report)
+    for plan, outcome in zip(planned, made, strict=True):
+        if isinstance(outcome, Message):
+            left_out.append(not_used(plan.source.path, outcome))
+        else:
+            photos.append(outcome[0])
+            looks += [look for look in outcome[1:] if look is not None]
     return photos, looks
 
 
@@ -172,11 +148,19 @@ def _write_photo(
     if alpha:
         opaque = np.asarray(image.getchannel("A")) > 0
         used = opaque if used is None else used & opaque
-    _check_content(image, used)
+    if used is not None and not used.any():
+        raise Unusable("is completely masked out")
+    reason = why_unusable(grey_copy(image.convert("RGB") if alpha else image, CONTENT_SIDE))
+    if reason:
+        raise Unusable(reason)
     width, height = header.size(longest)
-    if panorama is not None and panorama.cropped:
-        image, used = _with_missing_rows(image, used, panorama)
-        width, height = image.size
+    if panorama is not None and panorama.cropped:  # black rows where the photo has none
+        above, below = panorama.rows(height)
+        used = np.ones((height, width), bool) if used is None else used
+        used = np.pad(used, ((above, below), (0, 0)))
+        whole = Image.new(image.mode, (width, above + height + below))
+        whole.paste(image, (0, above))
+        image, height = whole, whole.height
     if not in_place:
         target.parent.mkdir(parents=True, exist_ok=True)
         if ready:
@@ -196,7 +180,6 @@ def _write_photo(
         width=width,
         height=height,
         group=" ".join(filter(None, [f"{folder}/", exif.camera, f"{width}x{height}", kind])),
-        sequence=None,
         focal=None if exif.focal is None or around else exif.focal * scale,
         location=exif.location,
         mask=used is not None,
@@ -207,25 +190,3 @@ def _write_photo(
         turned=header.turned,
     )
     return photo, None if used is None or source.mask is None else look_of(used)
-
-
-def _with_missing_rows(
-    image: Image.Image, used: np.ndarray | None, panorama: Panorama
-) -> tuple[Image.Image, np.ndarray]:
-    """The whole panorama with black rows where the photo has none, and the used pixels (H, W)."""
-    above, below = panorama.rows(image.height)
-    if used is None:
-        used = np.ones((image.height, image.width), bool)
-    whole = Image.new(image.mode, (image.width, above + image.height + below))
-    whole.paste(image, (0, above))
-    return whole, np.pad(used, ((above, below), (0, 0)))
-
-
-def _check_content(image: Image.Image, used: np.ndarray | None) -> None:
-    """Raises Unusable if the photo has no content, or if no pixel is ``used`` (H, W) bool."""
-    if used is not None and not used.any():
-        raise Unusable("is completely masked out")
-    grey = grey_copy(image.convert("RGB") if image.mode == "RGBA" else image, CONTENT_SIDE)
-    reason = why_unusable(grey)
-    if reason:
-        raise Unusable(reason)

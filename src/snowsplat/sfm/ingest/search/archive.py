@@ -55,8 +55,8 @@ def files_in(path: Path) -> list[str]:
 
     Raises: UserError: as `unpack`, as far as the list of files shows it.
     """
-    with _opened(path) as archive:
-        return [name for name, _ in _checked(archive, path)]
+    with _open_zip(path) as archive:
+        return [name for name, _ in _check_entries(archive, path)]
 
 
 def unpack(path: Path) -> Path:
@@ -68,8 +68,8 @@ def unpack(path: Path) -> Path:
     Raises: UserError: the file is damaged, empty or has a password; a file in it has a path outside
     of the folder; it needs more disk space than there is; or the folder cannot be written.
     """
-    with _opened(path) as archive:
-        entries = _checked(archive, path)
+    with _open_zip(path) as archive:
+        entries = _check_entries(archive, path)
         if not entries:
             raise UserError(
                 "{path}: has no files; copy it again, or use another file", path=shown(path)
@@ -88,7 +88,7 @@ def unpack(path: Path) -> Path:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+def _open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
     """A zip file. Raises UserError if it cannot be read, here or in the block."""
     try:
         if _directory_bytes(path) > _LONGEST_DIRECTORY:
@@ -125,7 +125,7 @@ def _directory_bytes(path: Path) -> int:
     return int(length)
 
 
-def _checked(archive: zipfile.ZipFile, path: Path) -> list[tuple[str, zipfile.ZipInfo]]:
+def _check_entries(archive: zipfile.ZipFile, path: Path) -> list[tuple[str, zipfile.ZipInfo]]:
     """The files that are not hidden, with a name relative to the new folder."""
     entries: dict[str, tuple[str, zipfile.ZipInfo]] = {}
     for info in archive.infolist():

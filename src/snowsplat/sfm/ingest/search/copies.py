@@ -11,7 +11,7 @@ import hashlib
 import itertools
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -22,6 +22,7 @@ from PIL import Image, ImageOps
 from snowsplat.data.files.listing import fold_name
 from snowsplat.data.maps.mask_pixels import has_shape, looks_like_mask
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, open_image, read_header
+from snowsplat.util.components import components
 
 # What programs add to the name of a copy: "IMG (1)", "IMG - Copy (2)", "IMG copy", "IMG-edited".
 _COPY = re.compile(
@@ -58,9 +59,7 @@ def find_copies(root: Path, names: Sequence[str]) -> dict[str, str]:
 
     ``names``: files relative to ``root``, with "/".
     """
-    same = _Groups(names)
-    for pair in _equal_files(root, names):
-        same.join(*pair)
+    same = list(_equal_files(root, names))
     by_stem: dict[str, list[str]] = {}
     for name in names:
         by_stem.setdefault(_stem_and_kind(name)[0], []).append(name)
@@ -72,39 +71,25 @@ def find_copies(root: Path, names: Sequence[str]) -> dict[str, str]:
                 pairs.setdefault(kinds, []).append((one, other))
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="copies") as pool:
 
-        def compared(some: Sequence[tuple[str, str]]) -> dict[tuple[str, str], bool]:
+        def compare(some: Sequence[tuple[str, str]]) -> dict[tuple[str, str], bool]:
             return dict(zip(some, pool.map(lambda p: _show_same(root, *p), some), strict=True))
 
         for of_kind in pairs.values():
             chosen = np.unique(np.linspace(0, len(of_kind) - 1, min(len(of_kind), _SAMPLE)))
-            is_same = compared([of_kind[round(i)] for i in chosen])
+            is_same = compare([of_kind[round(i)] for i in chosen])
             if all(is_same.values()) and len(is_same) == _SAMPLE:
                 is_same = dict.fromkeys(of_kind, True)
             elif any(is_same.values()):
-                is_same |= compared([pair for pair in of_kind if pair not in is_same])
-            for pair in (pair for pair, value in is_same.items() if value):
-                same.join(*pair)
-    used = {
-        name: best for group in same.groups() for best in [_best(root, group)] for name in group
-    }
+                is_same |= compare([pair for pair in of_kind if pair not in is_same])
+            same += [pair for pair, value in is_same.items() if value]
+    index = {name: i for i, name in enumerate(names)}
+    links = np.array([(index[one], index[other]) for one, other in same], np.int64).reshape(-1, 2)
+    groups: dict[int, list[str]] = {}
+    for name, label in zip(names, components(links.T, len(names)).tolist(), strict=True):
+        groups.setdefault(label, []).append(name)
+    best = {label: _best(root, group) for label, group in groups.items() if len(group) > 1}
+    used = {name: best[label] for label in best for name in groups[label]}
     return {name: used[name] for name in names if used.get(name, name) != name}
-
-
-class _Groups:
-    """Sets of names that are joined pair by pair."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._of = {name: [name] for name in names}
-
-    def join(self, one: str, other: str) -> None:
-        a, b = self._of[one], self._of[other]
-        if a is not b:
-            a += b
-            self._of.update(dict.fromkeys(b, a))
-
-    def groups(self) -> list[list[str]]:
-        """Those of more than one name."""
-        return [g for g in {id(g): g for g in self._of.values()}.values() if len(g) > 1]
 
 
 def _stem_and_kind(name: str) -> tuple[str, _Kind]:

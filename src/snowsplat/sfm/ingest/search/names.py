@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
 
 from snowsplat.util.files import shown
@@ -11,18 +10,12 @@ _LONGEST_NAME = 200  # bytes of a name in input/
 _KEPT_END = 12  # characters at the end of a longer name
 
 
-def free_names(names: Sequence[str]) -> Iterator[str]:
-    """The names, made unique and not too long: a name that equals an earlier one except for case
-    gets a suffix.
-
-    "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on.
-    """
-    taken: set[str] = set()
-    for name in names:
-        yield free_name(name, taken)
+def folded_stem(name: str) -> str:
+    """The name of a file without its suffix, and without a difference of case."""
+    return str(PurePosixPath(name).with_suffix("")).casefold()
 
 
-def _shortened(part: str) -> str:
+def _shorten(part: str) -> str:
     """A name of at most 200 bytes, so that ".NAME.png.tmp" fits into the 255 of a file system."""
     if len(part.encode()) <= _LONGEST_NAME:
         return part
@@ -33,8 +26,11 @@ def _shortened(part: str) -> str:
 
 
 def free_name(name: str, taken: set[str]) -> str:
-    """``name``, or a variant of it that is not in ``taken``; the result is added to ``taken``."""
-    name = "/".join(_shortened(part) for part in shown(name).split("/"))
+    """``name``, or a variant of it that is not in ``taken`` except for case, and not too long.
+
+    "a.jpg" becomes "a_2.jpg", "a_3.jpg" and so on. The result is added to ``taken``.
+    """
+    name = "/".join(_shorten(part) for part in shown(name).split("/"))
     path = PurePosixPath(name)
     candidate, n = name, 1
     while candidate.casefold() in taken:

@@ -20,7 +20,7 @@ from snowsplat.sfm.ingest.photo import not_used
 from snowsplat.sfm.ingest.photos.photo_files import Unusable, open_image
 from snowsplat.sfm.ingest.search.archive import files_in, is_zip, other_archive, unpack
 from snowsplat.sfm.ingest.search.copies import find_copies
-from snowsplat.sfm.ingest.search.names import free_name
+from snowsplat.sfm.ingest.search.names import folded_stem, free_name
 from snowsplat.sfm.ingest.search.photo_or_film import photos_or_films
 from snowsplat.sfm.ingest.video.clip import ONLY_SOUND, why_no_video
 from snowsplat.util.errors import UserError, cause_of
@@ -153,7 +153,7 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
         if not path.exists():
             raise UserError("{path}: no such file or folder", path=shown(path))
         if is_zip(path):
-            path = _unpacked(path)
+            path = _unpack_photos(path)
         if not path.is_dir():
             kind = kind_of_file(path)
             if kind == "photo":
@@ -169,25 +169,25 @@ def find_sources(inputs: Sequence[Path]) -> Sources:
                 f"again; to use them: snowsplat make {shown(path)}"
             )
         elif (capture := photo_folder(path)) is not None:
-            program, photos = capture
+            program, folder = capture
             notes.append(
                 f"{shown(path)}: a capture of {program} without camera poses; the photos "
-                f"in {shown(photos.relative_to(path).as_posix())} are used"
+                f"in {shown(folder.relative_to(path).as_posix())} are used"
             )
         elif (unread := advice(path)) is not None:
             notes.append(f"{shown(path)}: {unread}")
         photos_in = _photos_of_dataset(path)
         found = _search(photos_in)
-        chosen = photos_or_films(photos_in, found.photos, found.videos)
+        photos, videos, others = photos_or_films(photos_in, found.photos, found.videos)
         prefix = "" if len(inputs) == 1 else free_name(path.resolve().name, folders)
-        left_out += found.left_out + chosen.left_out
-        for relative in chosen.photos:
+        left_out += found.left_out + others
+        for relative in photos:
             name = str(PurePosixPath(prefix) / shown(relative))
             add(Source(photos_in / relative, "photo", name, found.masks.of.get(relative)))
         unused += found.masks.unused
-        for relative in chosen.videos:
+        for relative in videos:
             stem = str(PurePosixPath(prefix) / PurePosixPath(relative).with_suffix(""))
-            video = prefix if len(chosen.videos) == 1 else free_name(stem, folders)
+            video = prefix if len(videos) == 1 else free_name(stem, folders)
             add(Source(photos_in / relative, "video", video))
     if not files:
         raise _nothing_in(inputs)
@@ -210,13 +210,21 @@ def _search(root: Path) -> _Folder:
 
     def enter(folder: Path, names: list[str]) -> Iterator[str]:
         for name in names:
-            reason = _why_not_searched(name, names)
-            if is_output(folder / name) or folder_kind(name) == "masks":
+            kind, original = folder_kind(name), original_of(name, names, divided=False)
+            if is_output(folder / name) or kind == "masks":
                 continue
-            if reason is None:
-                yield name
+            if kind == "maps":
+                reason = message("is a folder of maps, not of photos")
+            elif kind == "thumbnails":
+                reason = message("is a folder of small copies")
+            elif original is not None:
+                reason = message(
+                    "is a folder of changed copies of those in {folder}", folder=original
+                )
             else:
-                found.left_out.append(not_used(folder / name, reason))
+                yield name
+                continue
+            found.left_out.append(not_used(folder / name, reason))
 
     broken: list[str] = []
     files = files_below(root, enter, broken)
@@ -252,11 +260,11 @@ def _unread_photos(files: Iterable[str], read: Sequence[str]) -> Message | None:
     Cameras save a raw photo and a JPEG of it. Therefore a photo that is also among those that are
     ``read`` does not count.
     """
-    also = {_stem(name) for name in read}
+    also = {folded_stem(name) for name in read}
     counts = Counter(
         _format_name(name)
         for name in files
-        if PurePosixPath(name).suffix.lower() in _UNREAD_SUFFIXES and _stem(name) not in also
+        if PurePosixPath(name).suffix.lower() in _UNREAD_SUFFIXES and folded_stem(name) not in also
     )
     if not counts:
         return None
@@ -275,10 +283,6 @@ def _unread_photos(files: Iterable[str], read: Sequence[str]) -> Message | None:
     )
 
 
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix("")).casefold()
-
-
 def _broken_links(broken: Sequence[str]) -> Message | None:
     """The reason why photos and videos are not used that are broken links; None if none is."""
     links = [name for name in broken if _is_photo_name(name) or _is_video_name(name)]
@@ -288,18 +292,6 @@ def _broken_links(broken: Sequence[str]) -> Message | None:
         "has links to files that are missing: {links}; copy the files here",
         links=first_names(links, 1),
     )
-
-
-def _why_not_searched(name: str, siblings: Sequence[str]) -> Message | None:
-    """Why a folder is not searched; None if it is."""
-    kind, original = folder_kind(name), original_of(name, siblings, divided=False)
-    if kind == "maps":
-        return message("is a folder of maps, not of photos")
-    if kind == "thumbnails":
-        return message("is a folder of small copies")
-    if original is None:
-        return None
-    return message("is a folder of changed copies of those in {folder}", folder=original)
 
 
 def _masks_and_outputs(folder: Path, names: list[str]) -> list[str]:
@@ -371,7 +363,7 @@ def _photos_of_dataset(root: Path) -> Path:
     return root
 
 
-def _unpacked(path: Path) -> Path:
+def _unpack_photos(path: Path) -> Path:
     """The folder of a zip file of photos or videos. Raises UserError if it has none."""
     names = [PurePosixPath(name) for name in files_in(path)]
     if any(name.name in ("means_l.webp", "lod-meta.json") for name in names):
@@ -399,11 +391,10 @@ def kind_of_file(path: Path) -> Literal["photo", "video"]:
         ) from None
     suffix = path.suffix.lower()
     if suffix in _UNREAD_SUFFIXES:  # many are TIFF files with a small preview
-        form = _format_name(path.name)
         raise UserError(
             "{path}: is a {form} photo, which cannot be read; save it as JPEG or PNG first",
             path=shown(path),
-            form=form,
+            form=_format_name(path.name),
         )
     if _is_photo(head):
         return "photo"

@@ -40,7 +40,7 @@ def field_order(clip: Clip) -> FieldOrder | None:
     """
     kinds: Counter[str] = Counter()
     for place in range(_PLACES):
-        examined = _filtered(_frames_at(clip, place / _PLACES), "idet")
+        examined = _filter_frames(_frames_at(clip, place / _PLACES), "idet")
         kinds.update(frame.metadata["lavfi.idet.single.current_frame"] for frame in examined)
     early, late, whole = kinds["tff"], kinds["bff"], kinds["progressive"]
     if max(early, late) < max(_FEWEST, whole + min(early, late)):
@@ -69,10 +69,10 @@ def whole_frames(frames: Iterable[VideoFrame], order: FieldOrder) -> Iterator[Vi
     Raises:
         av.FFmpegError: the filter does not support the pixel format.
     """
-    return _filtered(frames, "bwdif", f"mode=send_frame:parity={order}:deint=all")
+    return _filter_frames(frames, "bwdif", f"mode=send_frame:parity={order}:deint=all")
 
 
-def _filtered(
+def _filter_frames(
     frames: Iterable[VideoFrame], name: str, options: str | None = None
 ) -> Iterator[VideoFrame]:
     """What a filter of FFmpeg makes of ``frames``, whose size and format may change."""
@@ -81,10 +81,10 @@ def _filtered(
     for frame in frames:
         new = frame.width, frame.height, frame.format.name, frame.colorspace, frame.color_range
         if new != kind:
-            yield from _pulled(graph, None)
+            yield from _pull_frames(graph, None)
             graph, kind = _graph_for(frame, name, options), new
-        yield from _pulled(graph, frame)
-    yield from _pulled(graph, None)
+        yield from _pull_frames(graph, frame)
+    yield from _pull_frames(graph, None)
 
 
 def _graph_for(frame: VideoFrame, name: str, options: str | None) -> Graph:
@@ -105,7 +105,7 @@ def _graph_for(frame: VideoFrame, name: str, options: str | None) -> Graph:
     return graph
 
 
-def _pulled(graph: Graph | None, frame: VideoFrame | None) -> Iterator[VideoFrame]:
+def _pull_frames(graph: Graph | None, frame: VideoFrame | None) -> Iterator[VideoFrame]:
     """What the filter returns for a frame; None: the frames that it has kept."""
     import av
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
+from typing import TypeVar
 
 _BISECTIONS = 40  # with this number, the step is accurate to 1e-12 of the motion of the video
 
@@ -23,7 +24,10 @@ class Candidate:
     number: int  # counts from 1, in the order of time
 
 
-def choose(candidates: Sequence[Candidate], max_count: int) -> list[Candidate]:
+_Any = TypeVar("_Any", bound=Candidate)
+
+
+def choose(candidates: Sequence[_Any], max_count: int) -> list[_Any]:
     """At most ``max_count`` candidates, with about the same motion between them.
 
     This motion is called the step. After a chosen candidate, the next one is the sharpest of those

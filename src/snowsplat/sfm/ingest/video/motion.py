@@ -103,18 +103,18 @@ class FrameMotion:
 def _blocks(grey: np.ndarray, fixed: np.ndarray | None) -> np.ndarray:
     """(H, W) to (N, 32, 32) float32: all complete blocks, centred in the image. ``fixed``: as for
     `FrameMotion`."""
-    blocks = _divided(grey.astype(np.float32))
+    blocks = _divide(grey.astype(np.float32))
     if fixed is None:
         return blocks
     size = grey.shape[1], grey.shape[0]
     resized = Image.fromarray(fixed.astype(np.uint8) * 255).resize(size, Image.Resampling.BOX)
-    free = _divided(np.asarray(resized)) == 0
+    free = _divide(np.asarray(resized)) == 0
     count = np.maximum(free.sum(axis=(1, 2), keepdims=True), 1)
     mean = np.where(free, blocks, 0).sum(axis=(1, 2), keepdims=True) / count
     return np.where(free, blocks, mean)
 
 
-def _divided(image: np.ndarray) -> np.ndarray:
+def _divide(image: np.ndarray) -> np.ndarray:
     rows, columns = image.shape[0] // _BLOCK, image.shape[1] // _BLOCK
     top = (image.shape[0] - rows * _BLOCK) // 2
     left = (image.shape[1] - columns * _BLOCK) // 2

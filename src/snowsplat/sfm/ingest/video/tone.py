@@ -50,11 +50,11 @@ def rgb_image(frame: VideoFrame) -> np.ndarray:
     light = _LIGHT_OF_PQ if transfer == _PQ else _LIGHT_OF_HLG
     out = np.empty(deep.shape, np.uint8)
     for top in range(0, len(deep), 256):
-        out[top : top + 256] = _tone_mapped(light[deep[top : top + 256] >> 4])
+        out[top : top + 256] = _map_tones(light[deep[top : top + 256] >> 4])
     return out
 
 
-def _tone_mapped(light: np.ndarray) -> np.ndarray:
+def _map_tones(light: np.ndarray) -> np.ndarray:
     """From (…, 3) float32 linear BT.2020 in units of white to (…, 3) uint8 sRGB."""
     colours = np.clip(light @ _TO_709.T, 0, None)
     # Pixels whose brightest channel is above the knee are compressed, so that it is below 1. The

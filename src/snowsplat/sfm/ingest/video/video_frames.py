@@ -81,6 +81,13 @@ class Frame:
     height: int
 
 
+@dataclass(frozen=True)
+class _Written(Candidate):
+    """A frame that may be kept, and its file."""
+
+    frame: Frame
+
+
 @dataclass
 class Frames:
     """The result of extracting frames from a video."""
@@ -129,7 +136,7 @@ def extract_frames(
     # The rows at the poles of a panorama would be bars.
     parts = find_fixed_parts(np.stack(copies)) if copies and not frames.panoramas else None
     crop = parts.crop if parts else None
-    fixed = None if parts is None else _cropped(parts.fixed, crop)
+    fixed = None if parts is None else _crop(parts.fixed, crop)
     candidates = _Candidates(clip, folder, max_frames, size, crop, fixed)
     motion = FrameMotion(fixed)
     try:
@@ -139,7 +146,7 @@ def extract_frames(
             for frame in decoded if order is None else whole_frames(decoded, order):
                 timed = frame.time is not None
                 seconds = frame.time - clip.start if timed else frames.read / rate
-                grey = _cropped(_grey(frame), crop)
+                grey = _crop(_grey(frame), crop)
                 candidates.offer(frame, grey, max(seconds, 0.0), motion.add(grey))
                 frames.read += 1
                 if frames.read % _REPORTED == 0:
@@ -161,30 +168,27 @@ def extract_frames(
     return frames
 
 
+@dataclass
 class _Candidates:
     """Divides a video into windows, and writes the sharpest frame of each as a candidate."""
 
-    def __init__(
-        self,
-        clip: Clip,
-        folder: Path,
-        max_frames: int,
-        size: int | None,
-        crop: Crop | None,
-        fixed: np.ndarray | None,
-    ) -> None:
-        self.skipped: list[tuple[float, Message]] = []  # time (s) and reason
-        self._clip, self._folder, self._max_frames, self._size = clip, folder, max_frames, size
-        self._crop, self._fixed = crop, fixed
-        self._count = max(max_frames, _MIN_COUNT)
+    clip: Clip
+    folder: Path
+    max_frames: int
+    size: int | None
+    crop: Crop | None
+    fixed: np.ndarray | None
+    skipped: list[tuple[float, Message]] = field(default_factory=list)  # time (s) and reason
+    _candidates: list[_Written] = field(default_factory=list)
+    _written: int = 0
+    _best: _Sharpest | None = None  # of the current window
+    _window_start: tuple[float, float] = 0.0, 0.0  # time (s) and motion at which the window began
+    _last: np.ndarray | None = None  # small copy of the last candidate
+
+    def __post_init__(self) -> None:
+        self._count = max(self.max_frames, _MIN_COUNT)
         # The longest window. Times are rounded to 1 ms.
-        self._max_seconds = clip.seconds / max_frames - 1e-3
-        self._candidates: list[Candidate] = []
-        self._frames: dict[int, Frame] = {}  # by the number of the candidate
-        self._written = 0
-        self._best: _Sharpest | None = None  # of the current window
-        self._window_start = (0.0, 0.0)  # time (s) and motion at which the window began
-        self._last: np.ndarray | None = None  # small copy of the last candidate
+        self._max_seconds = self.clip.seconds / self.max_frames - 1e-3
 
     def offer(self, frame: VideoFrame, grey: np.ndarray, seconds: float, moved: float) -> None:
         """Take the next frame.
@@ -212,19 +216,17 @@ class _Candidates:
     def finish(self) -> list[Frame]:
         """Delete the candidates that are not chosen, and rename the others."""
         self._close_window()
-        self._thin(self._max_frames)
+        self._thin(self.max_frames)
         kept = []
         for number, candidate in enumerate(self._candidates, 1):
-            frame = self._frames.pop(candidate.number)
-            kept.append(replace(frame, name=f"frame_{number:05d}.jpg"))
-            (self._folder / frame.name).rename(self._folder / kept[-1].name)
+            kept.append(replace(candidate.frame, name=f"frame_{number:05d}.jpg"))
+            (self.folder / candidate.frame.name).rename(self.folder / kept[-1].name)
         return kept
 
     def delete(self) -> None:
         """Delete the candidates that `finish` has not renamed."""
-        for frame in self._frames.values():
-            (self._folder / frame.name).unlink(missing_ok=True)
-        self._frames.clear()
+        for candidate in self._candidates:
+            (self.folder / candidate.frame.name).unlink(missing_ok=True)
 
     def _close_window(self) -> None:
         """Write the sharpest frame of the window as a candidate, unless it must be skipped."""
@@ -235,12 +237,12 @@ class _Candidates:
         reason = why_unusable(small)
         last = self._last
         if reason is None and last is not None and last.shape == small.shape:
-            reason = None if has_moved(last, small, self._fixed) else SAME_VIEW
+            reason = None if has_moved(last, small, self.fixed) else SAME_VIEW
         if reason is None:
             self._written += 1
-            path = self._folder / f"candidate_{self._written:06d}.jpg"
-            self._frames[self._written] = _write(best, self._clip, path, self._size, self._crop)
-            self._candidates.append(Candidate(best.moved, best.sharpness, self._written))
+            path = self.folder / f"candidate_{self._written:06d}.jpg"
+            frame = _write(best, self.clip, path, self.size, self.crop)
+            self._candidates.append(_Written(best.moved, best.sharpness, self._written, frame))
             self._last = small
             if len(self._candidates) > _MOST_CANDIDATES * self._count:
                 self._thin(2 * self._count)
@@ -248,10 +250,10 @@ class _Candidates:
             self.skipped.append((best.seconds, reason))
 
     def _thin(self, max_frames: int) -> None:
-        self._candidates = choose(self._candidates, max_frames)
-        kept = {candidate.number for candidate in self._candidates}
-        for number in self._frames.keys() - kept:
-            (self._folder / self._frames.pop(number).name).unlink()
+        before, self._candidates = self._candidates, choose(self._candidates, max_frames)
+        for candidate in before:
+            if candidate not in self._candidates:
+                (self.folder / candidate.frame.name).unlink()
 
 
 @dataclass(frozen=True)
@@ -298,7 +300,7 @@ def _spread_copies(clip: Clip, key_frames: bool) -> list[np.ndarray]:
     return copies
 
 
-def _cropped(pixels: np.ndarray, crop: Crop | None) -> np.ndarray:
+def _crop(pixels: np.ndarray, crop: Crop | None) -> np.ndarray:
     """The part of an image (H, W, …) between the bars."""
     if crop is None:
         return pixels
@@ -308,7 +310,7 @@ def _cropped(pixels: np.ndarray, crop: Crop | None) -> np.ndarray:
 
 def _write(best: _Sharpest, clip: Clip, path: Path, size: int | None, crop: Crop | None) -> Frame:
     frame = best.frame
-    image = Image.fromarray(_cropped(rgb_image(frame), crop))
+    image = Image.fromarray(_crop(rgb_image(frame), crop))
     width, height = round(image.width * clip.aspect), image.height
     turns = round(frame.rotation / 90) % 4
     if turns:  # counter-clockwise, as in Pillow
