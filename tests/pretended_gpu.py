@@ -149,7 +149,8 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
         with _Functions(), _Operations():
             run(self)
 
-    monkeypatch.setattr(torch.cuda, "_lazy_init", lambda: None)
+    if not torch.cuda.is_available():  # PyTorch calls it once in a process
+        monkeypatch.setattr(torch.cuda, "_lazy_init", lambda: None)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device=None: (1 << 30, 1 << 30))
     monkeypatch.setattr(torch.cuda, "Event", _Event)
     monkeypatch.setattr(threading.Thread, "run", run_in_mode)
