@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 #: Number of steps between two applications.
 INTERVAL = 200
-#: On the CPU, this number of Gaussians is processed at a time, for its cache.
-_ROWS = 1 << 14
+#: Gaussians that are processed at a time, on a CPU (for its cache) and on a GPU (for its memory).
+_ROWS, _ROWS_OF_GPU = 1 << 14, 1 << 20
 
 
 class SkyPart(Part):
@@ -82,6 +82,6 @@ class SkyPart(Part):
             self._find(run)
         if self.sky is not None and run.schedule.multiples(run.step, INTERVAL):
             means = run.gaussians.means
-            rows = _ROWS if means.device.type == "cpu" else max(1, len(means))
+            rows = _ROWS if means.device.type == "cpu" else _ROWS_OF_GPU
             before = [self.sky.is_before(part) for part in means.split(rows)]
             run.gaussians.opacity_logits.masked_fill_(torch.cat(before), REMOVED)
