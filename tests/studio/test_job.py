@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -75,7 +76,7 @@ def test_a_killed_job_leaves_no_lock(library, holder):
     wait_for(lambda: scene.state() == {"outcome": "stopped"})
 
 
-def test_a_job_of_another_computer_is_not_stopped(library, holder):
+def test_a_job_of_another_computer_is_not_stopped(library, holder, monkeypatch):
     scene = library.new("a", [])
     job.start(scene)
     process = begun(scene)
@@ -84,6 +85,16 @@ def test_a_job_of_another_computer_is_not_stopped(library, holder):
     scene.lock().write_text(json.dumps({"host": "elsewhere", "process": os.getpid()}))
     with pytest.raises(UserError, match="is being made on elsewhere; stop it there"):
         job.stop(scene)
+    # Of another user, who names a process of this one; or all of them.
+    killed = []
+    for named, own in ((process, False), (-1, True), (0, True)):
+        scene.lock().write_text(json.dumps({"host": socket.gethostname(), "process": named}))
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "kill", lambda number, how: how and killed.append(number))
+            patch.setattr(job, "is_own", lambda _, own=own: own)
+            with pytest.raises(UserError, match="stop it there"):
+                job.stop(scene)
+    assert not killed
     os.kill(process, signal.SIGKILL)
     started.wait()
 

@@ -5,17 +5,21 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from snowsplat.util import run_lock
 from snowsplat.util.errors import UserError
-from snowsplat.util.run_lock import LOCK, InUse, is_locked, locked, one_run
+from snowsplat.util.files import write_text
+from snowsplat.util.run_lock import LOCK, InUse, LostLock, is_locked, locked, one_run
 
 _HOLD = """
 import sys, time
@@ -74,7 +78,10 @@ def test_a_lock_in_a_folder_to_look_at(tmp_path, monkeypatch):
     lock.touch()  # a process was killed
     with monkeypatch.context() as patch:
         patch.setattr(os, "open", refuse)
+        patch.setattr(Path, "unlink", lambda path, **_: refuse(path, os.O_RDWR))
         assert not is_locked(lock)
+        with pytest.raises(UserError, match="is no lock, or that of another user; remove it"):
+            one_run(tmp_path).__enter__()
     assert lock.exists()
     assert not is_locked(lock)
 
@@ -86,8 +93,20 @@ def test_a_lock_that_its_folder_was_moved_with(tmp_path):
             pass
         with one_run(tmp_path / "out"):  # another folder
             (tmp_path / "out" / "result").touch()
+            with pytest.raises(LostLock):
+                write_text(tmp_path / "out" / "result", "of the first")
     with one_run(tmp_path / "moved"):
         pass
+
+
+def test_a_lock_that_was_removed_is_taken_again(tmp_path):
+    with one_run(tmp_path):
+        for _ in range(2):
+            (tmp_path / LOCK).unlink()
+            write_text(tmp_path / "result", "text")
+            with pytest.raises(InUse), one_run(tmp_path, wait=0):
+                pass
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
 
 
 @pytest.mark.parametrize("renewed", [True, False])
@@ -122,6 +141,128 @@ def test_a_file_system_that_does_not_pass_locks_on(tmp_path, monkeypatch, renewe
 def test_a_link_is_not_followed(tmp_path):
     (tmp_path / "precious").write_text("text", encoding="utf-8")
     (tmp_path / LOCK).symlink_to("precious")
-    with pytest.raises(OSError), one_run(tmp_path):  # noqa: PT011
+    with pytest.raises(UserError, match="is no lock"), one_run(tmp_path):
         pass
     assert (tmp_path / "precious").read_text(encoding="utf-8") == "text"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs pipes with names")
+@pytest.mark.parametrize("make", [os.mkdir, getattr(os, "mkfifo", os.mkdir)])
+def test_what_is_no_lock_is_named(tmp_path, make):
+    make(tmp_path / LOCK)
+    with pytest.raises(UserError, match=r"lock: is no lock, .* remove it"), one_run(tmp_path):
+        pass
+
+
+# Takes the lock as on a file system without locks, and writes a file when it is told to.
+_SLEEPER = """
+import sys
+from pathlib import Path
+from snowsplat.util import run_lock
+from snowsplat.util.errors import UserError
+from snowsplat.util.files import write_text
+def unsupported(handle):
+    raise OSError("no locks")
+if sys.argv[2] == "without locks":
+    run_lock._lock = unsupported
+out = Path(sys.argv[1])
+with run_lock.one_run(out):
+    write_text(out / "first", "written")
+    print("held", flush=True)
+    sys.stdin.readline()
+    for _ in range(2):
+        try:
+            write_text(out / "first", "spoilt")
+        except UserError as error:
+            print(error, flush=True)
+    write_text(out.parent / "elsewhere", "written")
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs a process that sleeps")
+@pytest.mark.parametrize("how", ["without locks", "removed"])
+def test_a_holder_that_slept_while_another_took_the_lock(tmp_path, monkeypatch, how):
+    """It writes nothing more into the folder, and the lock of the other one remains."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", _SLEEPER, str(out), how]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as sleeper:
+        assert sleeper.stdin is not None
+        assert sleeper.stdout is not None
+        assert sleeper.stdout.readline() == "held\n"
+        sleeper.send_signal(signal.SIGSTOP)
+        if how == "removed":
+            (out / LOCK).unlink()
+        else:
+            monkeypatch.setattr(run_lock, "_SILENT_SECONDS", 0.0)
+            monkeypatch.setattr(run_lock, "_lock", _without_locks)
+        with one_run(out):
+            write_text(out / "first", "of the other")
+            sleeper.send_signal(signal.SIGCONT)
+            lines = sleeper.communicate("\n", timeout=60)[0].splitlines()
+            who = f"its lock was lost while this process slept, now to process {os.getpid()} "
+            assert len(lines) == 2
+            assert all(who in line and "writes nothing more" in line for line in lines)
+            assert sleeper.returncode == 0
+            assert (out / LOCK).exists()
+            assert [path.name for path in out.iterdir() if path.name != LOCK] == ["first"]
+            assert (out / "first").read_text() == "of the other"
+    assert (tmp_path / "elsewhere").exists()
+    assert not (out / LOCK).exists()
+
+
+def _without_locks(handle: int) -> bool:
+    raise OSError("no locks")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes have no such numbers there")
+def test_a_stranger_cannot_hold_the_lock_of_a_dead_process(tmp_path):
+    """Whoever can read its file can lock it."""
+    lock = tmp_path / LOCK
+    with subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path)], stdout=-1) as dead:
+        assert dead.stdout is not None
+        dead.stdout.readline()
+        dead.kill()
+    handle = os.open(lock, os.O_RDONLY)
+    try:
+        assert run_lock._lock(handle)  # of a stranger
+        assert not is_locked(lock)
+    finally:
+        os.close(handle)
+    lock.touch()
+    handle = os.open(lock, os.O_RDONLY)
+    try:
+        assert run_lock._lock(handle)
+        # It may be that of a container, whose processes have other numbers.
+        other = {"host": socket.gethostname(), "process": dead.pid, "space": "pid:[1]"}
+        lock.write_text(json.dumps(other))
+        assert is_locked(lock)
+    finally:
+        os.close(handle)
+    with one_run(tmp_path):
+        assert json.loads(lock.read_text("utf-8"))["process"] == os.getpid()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="needs two users")
+@pytest.mark.parametrize("in_use", [True, False])
+def test_a_lock_of_another_user_in_an_own_folder(in_use):
+    """As after `sudo snowsplat train`, which was killed, or which still runs."""
+    with tempfile.TemporaryDirectory() as name:  # other users can enter the folder above
+        folder = Path(name)
+        (folder / LOCK).touch(mode=0o644)  # of the administrator
+        os.chown(folder, 4321, 4321)
+        handle = os.open(folder / LOCK, os.O_RDONLY)
+        try:
+            if in_use:
+                assert run_lock._lock(handle)
+            os.seteuid(4321)
+            if in_use:
+                with pytest.raises(UserError, match="that of another user"), one_run(folder, 0):
+                    pass
+            else:
+                with one_run(folder):
+                    assert (folder / LOCK).stat().st_uid == 4321
+        finally:
+            os.seteuid(0)
+            os.close(handle)

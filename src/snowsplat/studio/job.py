@@ -14,6 +14,7 @@ from typing import Any
 
 from snowsplat.project.studio_scene import StudioScene
 from snowsplat.util.errors import UserError
+from snowsplat.util.files import is_own
 from snowsplat.util.messages import as_message, message
 from snowsplat.util.run_lock import LOCK, holder, is_locked
 
@@ -69,7 +70,8 @@ def stop(scene: StudioScene, task: str = "make") -> None:
     if not is_locked(lock):
         return
     other = holder(lock)
-    if other.host == socket.gethostname():
+    # Another user who can write to the folder could name any process of this one.
+    if other.host == socket.gethostname() and other.process > 1 and is_own(lock):
         os.kill(other.process, signal.SIGTERM)
     else:
         where = other.host or message("another computer")

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import json
 import os
-import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from snowsplat.studio.local_page import read_local
-from snowsplat.util.files import atomic_path
+from snowsplat.util.files import atomic_path, is_own
 from snowsplat.util.run_lock import InUse, locked
 from snowsplat.util.safe_json import from_json, parse_json, read_json
 
@@ -66,12 +65,8 @@ def _address_in(folder: Path) -> Address | None:
     """What the last studio of a library has written; None if it has ended as usual."""
     file = folder / _ADDRESS
     try:
-        about = os.lstat(file)
-        # Another user could lead the browser elsewhere.
-        ours = not hasattr(os, "getuid") or about.st_uid == os.getuid()
-        if not (ours and stat.S_ISREG(about.st_mode)):
-            return None
-        return from_json(Address, read_json(file))
+        # That of another user could lead the browser elsewhere.
+        return from_json(Address, read_json(file)) if is_own(file) else None
     except (OSError, ValueError):
         return None
 

@@ -5,8 +5,9 @@ import json
 import os
 import re
 import shutil
+import stat
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,9 @@ except ImportError:  # Windows
 
 #: How the pointer begins that Git LFS puts in the place of a file.
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
+#: Called with the absolute path of a file before it is written and before it gets its name; they
+#: raise `UserError` if it must not be, such as `run_lock.LostLock`.
+CHECKS: list[Callable[[Path], None]] = []
 _TEMPORARY = re.compile(r"\.(.+?)(\.[a-z0-9_]{8})?\.tmp")
 
 
@@ -38,10 +42,12 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
     the process is killed, the temporary file stays; the next write of ``path`` reuses it.
     ``private``: other users cannot read the file, also if they can write to the folder.
 
-    Raises: OSError: the folder is missing or not writable, or the disk is full. The error names
-    ``path``.
+    Raises:
+        OSError: the folder is missing or not writable, or the disk is full. It names ``path``.
+        UserError: one of `CHECKS` does not permit it.
     """
     path = Path(path)
+    _check(path)
     try:
         handle, temporary = _temporary(path, private)
         try:
@@ -50,6 +56,7 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
                 os.fsync(file.fileno())
             if not private:  # as mkstemp and _lock create them
                 os.chmod(temporary, _default_mode())
+            _check(path)
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -66,6 +73,11 @@ def atomic_path(path: Path | str, *, private: bool = False) -> Iterator[Path]:
             raise better from error
         raise
     _sync_folder(path.parent)
+
+
+def _check(path: Path) -> None:
+    for check in list(CHECKS):
+        check(path.absolute())
 
 
 def _temporary(path: Path, private: bool) -> tuple[int | None, Path]:
@@ -128,6 +140,12 @@ def new_folder(path: Path) -> Iterator[Path]:
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file, not a link, belongs to this user. Raises OSError: it is missing."""
+    about = os.lstat(path)
+    return stat.S_ISREG(about.st_mode) and about.st_uid == getattr(os, "getuid", lambda: 0)()
 
 
 def make_parent(path: Path) -> None:

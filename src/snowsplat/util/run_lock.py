@@ -4,14 +4,19 @@ The lock is that of the operating system on an open file, so a killed process le
 names its holder for messages. Some network file systems do not pass locks on to other computers.
 Therefore the holder also renews the time of the file, and a run that gets a lock whose file names
 another computer waits until it is sure that nobody renews it.
+
+A holder that slept, such as a laptop, may find that another run has taken its lock meanwhile. So
+`atomic_path` asks before each write below the folder of a lock; see `files.CHECKS`.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shlex
 import socket
+import stat
 import sys
 import threading
 import time
@@ -20,6 +25,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from snowsplat.util import files
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import Message, message
 from snowsplat.util.safe_json import from_json, parse_json, printable
@@ -39,10 +45,16 @@ _SILENT_SECONDS = 12.0
 _MAX_BYTES = 4096  # of the text in the file
 _MAX_COMMAND = 200  # characters
 _FAR = 1 << 30  # the locked byte: on Windows, nobody can read it
+# Child processes and links do not get it; and opening a pipe does not wait.
+_FLAGS = sum(getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"))
 
 
 class InUse(UserError):
     """Another run holds the lock."""
+
+
+class LostLock(UserError):
+    """Another run has taken the lock, or its file was removed: this process writes nothing more."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,7 @@ class Holder:
     process: int = 0
     since: str = ""  # local time
     command: str = ""
+    space: str = ""  # the name space of its number, which a container has of its own
 
     @classmethod
     def this_process(cls) -> Holder:
@@ -60,7 +73,20 @@ class Holder:
         command = shlex.join([program, *sys.argv[1:]])
         short = command if len(command) <= _MAX_COMMAND else command[: _MAX_COMMAND - 1] + "…"
         now = time.strftime("%Y-%m-%d %H:%M:%S")
-        return cls(socket.gethostname(), os.getpid(), now, printable(short))
+        return cls(socket.gethostname(), os.getpid(), now, printable(short), _process_space())
+
+    def is_dead(self) -> bool:
+        """Whether it was a process of this computer that has certainly ended."""
+        here = self.host == socket.gethostname() and self.space == _process_space()
+        if sys.platform == "win32" or not here or self.process <= 0:
+            return False
+        try:
+            os.kill(self.process, 0)
+        except (ProcessLookupError, OverflowError):
+            return True
+        except OSError:  # it is that of another user
+            pass
+        return False
 
     def __str__(self) -> str:
         return str(self.description())
@@ -78,6 +104,12 @@ class Holder:
         )
 
 
+def _process_space() -> str:
+    with suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
+    return ""
+
+
 @contextmanager
 def one_run(folder: Path, wait: float = _WAIT_SECONDS) -> Iterator[None]:
     """Hold the lock of an output folder during the block.
@@ -86,7 +118,7 @@ def one_run(folder: Path, wait: float = _WAIT_SECONDS) -> Iterator[None]:
 
     Raises:
         InUse: another run writes to the folder; the message says which one.
-        UserError: ``folder`` is a file.
+        UserError: ``folder`` is a file; or the file of the lock is none, or that of another user.
         OSError: the folder cannot be created or is not writable.
     """
     while True:
@@ -95,7 +127,7 @@ def one_run(folder: Path, wait: float = _WAIT_SECONDS) -> Iterator[None]:
         missing = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            handle = _acquired(folder / LOCK, str(folder), wait)
+            acquired = _acquired(folder / LOCK, str(folder), wait)
             break
         except FileNotFoundError:  # another run has just removed the empty folder
             continue
@@ -103,7 +135,7 @@ def one_run(folder: Path, wait: float = _WAIT_SECONDS) -> Iterator[None]:
             error.filename = str(folder)
             raise
     try:
-        with _held(folder / LOCK, handle):
+        with _held(folder / LOCK, *acquired):
             yield
     finally:
         with suppress(OSError):  # it contains results
@@ -121,9 +153,10 @@ def locked(file: Path, what: str, wait: float = _WAIT_SECONDS) -> Iterator[None]
 
     Raises:
         InUse: another process holds it.
+        UserError: the file is no lock, or that of another user.
         OSError: the folder of the file is missing or not writable.
     """
-    with _held(file, _acquired(file, what, wait)):
+    with _held(file, *_acquired(file, what, wait)):
         yield
 
 
@@ -137,27 +170,33 @@ def is_locked(file: Path) -> bool:
             return False
     except InUse:
         return True
-    except OSError:
-        return _is_held(file)
+    except (OSError, UserError):
+        return _is_free(file) is False
 
 
-def _is_held(file: Path) -> bool:
+def _is_free(file: Path) -> bool | None:
+    """Whether nobody holds the lock of a file that this process cannot write; None: unknown, as it
+    was removed, is no file, cannot be read, or there are no locks."""
     try:
-        handle = os.open(file, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+        handle = os.open(file, os.O_RDONLY | _FLAGS)
         try:
-            return not _lock(handle)
+            return _lock(handle) if stat.S_ISREG(os.fstat(handle).st_mode) else None
         finally:
             os.close(handle)
-    except OSError:  # it has just been removed, cannot be read, or there are no locks
-        return False
+    except OSError:
+        return None
 
 
-def _acquired(file: Path, what: str, wait: float) -> int:
-    """The handle of the locked file, which names this process as the holder."""
+def _acquired(file: Path, what: str, wait: float) -> tuple[int, bytes]:
+    """The handle of the locked file, and its text, which names this process as the holder."""
     end = time.monotonic() + wait
     while (found := _try(file)) is None:
         if time.monotonic() >= end:
-            raise _in_use(what, file)
+            # The lock may be that of another user, who can read the file of a killed process. A
+            # child that lives on without it cannot write: it has no longer the lock.
+            if not holder(file).is_dead():
+                raise _in_use(what, file)
+            file.unlink(missing_ok=True)
         time.sleep(0.05)
     handle, has_locks = found
     try:
@@ -166,11 +205,12 @@ def _acquired(file: Path, what: str, wait: float) -> int:
         if before.host and not sure and _is_renewed(file):
             raise _in_use(what, file)
         os.ftruncate(handle, 0)
-        os.write(handle, json.dumps(asdict(Holder.this_process())).encode())
+        text = json.dumps(asdict(Holder.this_process())).encode()
+        os.write(handle, text)
     except BaseException:
         os.close(handle)
         raise
-    return handle
+    return handle, text
 
 
 def _in_use(what: str, file: Path) -> InUse:
@@ -184,8 +224,16 @@ def _in_use(what: str, file: Path) -> InUse:
 def _try(file: Path) -> tuple[int, bool] | None:
     """Open and lock the file; None if another process or thread has the lock. Returns its handle,
     and whether the file system has locks."""
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
-    handle = os.open(file, flags, 0o666)
+    try:
+        handle = os.open(file, os.O_RDWR | os.O_CREAT | _FLAGS, 0o666)
+    except OSError as error:
+        if error.errno == errno.EROFS or not os.path.lexists(file):
+            raise
+        _remove_foreign(file)
+        return None
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise _foreign(file)
     try:
         is_ours, has_locks = _lock(handle), True
     except OSError:
@@ -195,6 +243,27 @@ def _try(file: Path) -> tuple[int, bool] | None:
         return handle, has_locks
     os.close(handle)
     return None
+
+
+def _remove_foreign(file: Path) -> None:
+    """Remove the lock that a killed process of another user has left in a folder of this one.
+
+    Raises: UserError: it cannot be removed, is no lock, or may be in use.
+    """
+    other = holder(file).host not in ("", socket.gethostname())
+    if not _is_free(file) or (other and _is_renewed(file)):
+        raise _foreign(file)
+    try:
+        file.unlink(missing_ok=True)
+    except OSError:
+        raise _foreign(file) from None
+
+
+def _foreign(file: Path) -> UserError:
+    return UserError(
+        "{file}: is no lock, or that of another user; remove it if nobody else uses the folder",
+        file=file,
+    )
 
 
 def _lock(handle: int) -> bool:
@@ -224,49 +293,100 @@ def _is_at(file: Path, handle: int) -> bool:
 def holder(file: Path) -> Holder:
     """The process that holds a lock, or that was killed while it held it, as its file says."""
     try:
-        with open(file, "rb") as opened:
-            return from_json(Holder, parse_json(opened.read(_MAX_BYTES)))
+        return from_json(Holder, parse_json(_read(file)[0]))
     except (OSError, ValueError):
         return Holder()
 
 
+def _read(file: Path) -> tuple[bytes, os.stat_result]:
+    """The text of a lock, and which file it is. Opening asks the server of a network file system.
+
+    Raises: OSError: it is no file, or cannot be read.
+    """
+    handle = os.open(file, os.O_RDONLY | _FLAGS)
+    try:
+        about = os.fstat(handle)
+        if not stat.S_ISREG(about.st_mode):
+            raise OSError(f"{file}: is no file")
+        return os.read(handle, _MAX_BYTES), about
+    finally:
+        os.close(handle)
+
+
 def _is_renewed(file: Path) -> bool:
-    """Whether the holder renews the file. Opening it asks the server of a network file system."""
+    """Whether the holder renews the file."""
     begin = time.monotonic()
-    first = _renewed_at(file)
+    first = _read(file)[1].st_mtime_ns
     while time.monotonic() - begin < _SILENT_SECONDS:
         time.sleep(0.5)
-        if _renewed_at(file) != first:
+        if _read(file)[1].st_mtime_ns != first:
             return True
     return False
 
 
-def _renewed_at(file: Path) -> int:
-    with open(file, "rb") as opened:
-        return os.fstat(opened.fileno()).st_mtime_ns
-
-
 @contextmanager
-def _held(file: Path, handle: int) -> Iterator[None]:
+def _held(file: Path, handle: int, text: bytes) -> Iterator[None]:
     """Renew the lock during the block; then remove its file, and release it."""
-    done = threading.Event()
-    renewing = threading.Thread(target=_renew, args=(file, handle, done), daemon=True)
+    file, done, writing = file.absolute(), threading.Event(), threading.Lock()
+    handles = [handle]
+
+    def is_ours() -> bool:
+        try:
+            now, about = _read(file)
+        except FileNotFoundError:
+            return False
+        return now == text and os.path.samestat(about, os.fstat(handles[-1]))
+
+    def takes_again() -> bool:
+        """The folder was moved, or the file was removed: whether nobody else has taken it since."""
+        try:
+            handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_EXCL | _FLAGS, 0o666)
+        except FileNotFoundError:  # the folder is missing
+            return True
+        except FileExistsError:
+            return False
+        handles.append(handle)
+        os.write(handle, text)
+        with suppress(OSError):  # there are no locks
+            return _lock(handle)
+        return True
+
+    def check(path: Path) -> None:
+        if not path.is_relative_to(file.parent):
+            return
+        with writing:
+            lost = not is_ours() and not takes_again()
+        if lost:
+            raise LostLock(
+                "{folder}: its lock was lost while this process slept, now to {holder}; this "
+                "process stops and writes nothing more",
+                folder=file.parent,
+                holder=holder(file).description(),
+            )
+
+    def renew() -> None:
+        while not done.wait(_RENEW_SECONDS):
+            with suppress(OSError):
+                if is_ours():
+                    os.utime(handles[-1] if os.utime in os.supports_fd else file)
+
+    renewing = threading.Thread(target=renew, daemon=True)
     renewing.start()
+    files.CHECKS.append(check)
     try:
         yield
     finally:
+        files.CHECKS.remove(check)
         done.set()
         renewing.join()
-        ours = _is_at(file, handle)  # the folder may have been moved
+        try:
+            ours = is_ours()
+        except OSError:
+            ours = False
         if sys.platform != "win32" and ours:
             file.unlink(missing_ok=True)
-        os.close(handle)
+        for handle in handles:
+            os.close(handle)
         if sys.platform == "win32" and ours:  # open files cannot be removed there
             with suppress(OSError):  # the next holder has opened it
                 file.unlink()
-
-
-def _renew(file: Path, handle: int, done: threading.Event) -> None:
-    while not done.wait(_RENEW_SECONDS):
-        with suppress(OSError):
-            os.utime(handle if os.utime in os.supports_fd else file)
