@@ -64,7 +64,8 @@ class Cost:
 #: parameters and moments. `DECODERS` threads decode photos at a time, at 18 bytes per pixel.
 CPU = Cost(fixed=66_000_000, pixel=170, gaussian=1150, decoding=18 * DECODERS)
 #: Computed from the sizes of the tensors that are allocated; measured on a GPU, 0.85 to 0.9 times
-#: as much. Photos are decoded in the memory of the CPU.
+#: as much, before `rasterizer` kept states of pixels: about 64 bytes more per Gaussian, which is
+#: still within it. Photos are decoded in the memory of the CPU.
 GPU = Cost(fixed=50_000_000, pixel=70, gaussian=240, decoding=0)
 
 
