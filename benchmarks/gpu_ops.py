@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import torch
 from gpu_step import Step, sums_in_order
@@ -18,6 +19,7 @@ from torch import Tensor
 from workloads import Workload
 
 from snowsplat import ops
+from snowsplat.ops.cuda import sorting
 from snowsplat.scene.camera import Camera
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.scene.render import view_of
@@ -64,8 +66,14 @@ def every_op(
                         step.trainer.graphs = None
                     for _ in range(3):  # too small, sufficient, as CUDA graphs
                         assert math.isfinite(step.run())
-    say("ops: a sort of several blocks")
-    ops.neighbours(torch.rand(2100, 3).to(device), 1)
+    say("ops: lists of tiles in several segments")
+    for in_order in (False, True):
+        with sums_in_order(in_order):
+            _ops_of(random_scene(1200, 20, 18), device, torch.float32)
+    say("ops: sorts as for many keys, of several blocks, too")
+    with mock.patch.multiple(sorting, FEW=0, MOST_ADDED=0):
+        _ops_of(random_scene(*sizes[2]), device, torch.float32)
+        ops.neighbours(torch.rand(2100, 3).to(device), 1)
     if wide:
         say(f"ops: {WIDE} pixels in a row, more tiles than 16 bits count")
         _ops_of(random_scene(100, WIDE, 1), device, torch.float32)
