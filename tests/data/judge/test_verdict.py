@@ -235,13 +235,14 @@ def test_impossible_lens(matched: Dataset) -> None:
 
 @pytest.mark.slow
 def test_poses_of_some_photos(matched: Dataset) -> None:
-    """Most pairs agree. Far from the origin, the others have lost digits: no training."""
+    """Most pairs agree: the photos are named that agree with none. Far from the origin, they have
+    lost digits: no training."""
     rig = rig_of(matched)
     positions = rig.positions.copy()
     positions[[0, 4], 2] += 0.5
     some = with_rig(matched, rig.moved(rig.rotation, positions))
     (finding,) = judge(some)
-    assert finding.text.startswith("the matches of ")
+    assert finding.text.startswith("the poses of 04.png contradict their matches with all other")
     assert not finding.impossible
     (finding,) = judge(dataclasses.replace(some, origin=(1e6, 0.0, 0.0)))
     assert finding.impossible

@@ -118,3 +118,18 @@ def test_bytes_before_the_pixels_of_a_jpeg(tmp_path, monkeypatch):
     image.save(path, comment=bytes(3000))
     with pytest.raises(UserError, match=r"decoded \(too many bytes before its pixels\)"):
         read_header(path)
+
+
+def test_a_jpeg_beyond_the_limit_is_decoded_at_half_its_size(tmp_path, monkeypatch):
+    """As phones take with 200 million pixels; other formats cannot be decoded so."""
+    monkeypatch.setattr(image_file, "MOST_PIXELS", 3000)
+    monkeypatch.setattr(image_file, "_MOST_JPEG_PIXELS", 12_000)
+    for name in ("a.jpg", "a.png"):
+        Image.new("RGB", (96, 64), (200, 30, 30)).save(tmp_path / name)
+    with image_file.open_image(tmp_path / "a.jpg", ("JPEG",)) as image:
+        assert image.size == (48, 32)
+        assert image.convert("RGB").getpixel((3, 3))[0] > 150
+    Image.new("RGB", (120, 120)).save(tmp_path / "b.jpg")
+    for name in ("a.png", "b.jpg"):
+        with pytest.raises(ValueError, match="million pixels"):
+            image_file.open_image(tmp_path / name, ("JPEG", "PNG"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -68,6 +69,26 @@ def test_the_worst_photos_are_named(dataset):
     alone.train = alone.train[:1]
     lonely = scene_verdict(evaluation(0.95, 0.1, 0.97, 0.96), SHARP, alone)
     assert "of what it shows is in at most two training photos" in str(lonely.reasons[0].text)
+
+
+@pytest.mark.parametrize(
+    ("photos", "points", "held_out", "trained_on", "advice"),
+    [
+        (12, True, evaluation(0.6, 0.6, 0.6), SHARP, "take more photos"),
+        (301, True, evaluation(0.6, 0.6, 0.6), SHARP, "there are enough photos"),
+        (301, True, evaluation(0.95, 0.1, 0.97), SHARP, "there are enough photos"),
+        (301, False, evaluation(0.6, 0.6, 0.6), SHARP, "take more photos"),
+        (12, True, evaluation(0.3), evaluation(0.3), "train longer; if"),
+        (12, False, evaluation(0.3), evaluation(0.3), "add a point cloud"),
+    ],
+)
+def test_the_advice_follows_from_the_evidence(
+    dataset, photos, points, held_out, trained_on, advice
+):
+    views = (dataset.train * photos)[:photos]
+    some = dataclasses.replace(dataset, train=views, points=dataset.points if points else None)
+    verdict = scene_verdict(held_out, trained_on, some)
+    assert advice in "".join(str(reason.advice) for reason in verdict.reasons)
 
 
 def test_a_photo_without_contrast_is_not_wrong(dataset):

@@ -67,6 +67,7 @@ class MatchEvidence:
 
     def __init__(self, sample: PhotoSample) -> None:
         self._sample = sample
+        self.widened = False
         self._features = [_features(photo) for photo in sample.photos]
         #: The pairs with enough matches, within the groups of the sample.
         self.pairs = self._match_pairs(same_group=True)
@@ -75,6 +76,7 @@ class MatchEvidence:
         """Add pairs of different groups. If the names are shuffled, views of one group do not see
         the same things, but others do.
         """
+        self.widened = True
         self.pairs += self._match_pairs(same_group=False)
 
     def _match_pairs(self, *, same_group: bool) -> list[Pair]:

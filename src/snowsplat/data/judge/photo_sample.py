@@ -19,6 +19,8 @@ SIDE = 320
 # Views spread over the dataset in the order of names. Each brings two neighbours: the next one by
 # name, and the nearest one by pose. If the poses are right, these see the same things.
 _ANCHORS = 8
+# Views with the pose of another one that are added, and views before and after each of them.
+_REPEATED, _AROUND = 4, 2
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,13 @@ def _choose_views(rig: Rig) -> dict[int, int]:
         distance[distance == 0] = np.inf
         for neighbour in (min(anchor + 1, count - 1), distance.argmin()):
             group.setdefault(int(neighbour), number)
+    # Trackers that were lost repeat a pose. Each such view is compared with those around it.
+    poses = np.concatenate([rig.rotation.reshape(count, 9), rig.translation], 1)
+    _, which, often = np.unique(poses, axis=0, return_inverse=True, return_counts=True)
+    repeated = np.flatnonzero(often[which.reshape(-1)] > 1)
+    for number, view in enumerate(repeated[:_REPEATED], len(anchors)):
+        for near in range(max(0, view - _AROUND), min(count, view + _AROUND + 1)):
+            group.setdefault(near, number)
     return dict(sorted(group.items()))
 
 

@@ -30,6 +30,7 @@ from snowsplat.data.judge.repairs import Repair, point_repairs, pose_repairs, zo
 from snowsplat.data.judge.rig import Rig
 from snowsplat.data.judge.track_evidence import TrackFit, track_fit
 from snowsplat.scene.origin import HERE
+from snowsplat.util.names import first_names
 from snowsplat.util.natural_order import natural_key
 
 # Colours: the share of views that agree. 0.15 by chance, 0.9 to 1 for right poses.
@@ -148,7 +149,42 @@ def _poses(views: list[View], rig: Rig, points: Points | None, *, far: bool) -> 
         found = _by_both(rig, colours, agreement, matches, fit)
     if any(finding.impossible for finding in found) or (found and tracks is None):
         return found
+    if fit is not None and (fit.shares < _MATCHES_CONTRADICT).any() and not matches.widened:
+        matches.widen()
+        fit = matches.fit(rig)
+    if fit is not None and not far and (lost := _lost(rig, matches, fit)):
+        names = first_names([views[sample.views[i]].name for i in lost], 5)
+        text = f"the poses of {names} contradict their matches with all other photos"
+        return [*found, Finding("poses", f"{text}; remove these photos, or correct their poses")]
     return _inexact(fit, tracks, far=far)
+
+
+def _lost(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[int]:
+    """The views of the sample none of whose pairs agrees, if the pairs of the others do. Two views
+    of one pose say nothing."""
+    pairs = [
+        ({pair.a, pair.b}, share)
+        for pair, share in zip(matches.pairs, fit.shares, strict=True)
+        if not np.array_equal(rig.translation[pair.a], rig.translation[pair.b])
+    ]
+    lost: set[int] = set()
+    while True:
+        pairs = [(both, share) for both, share in pairs if both.isdisjoint(lost)]
+        shares: dict[int, list[float]] = {}
+        for both, share in pairs:
+            for view in both:
+                shares.setdefault(view, []).append(share)
+        contradicted = {
+            view: float(np.median(each))
+            for view, each in shares.items()
+            if len(each) >= _FEWEST_PAIRS and max(each) < _MATCHES_AGREE
+        }
+        if not contradicted:
+            break
+        lost.add(min(contradicted, key=contradicted.__getitem__))
+    rest = [share for _, share in pairs]
+    proven = len(rest) >= _PAIRS_FOR_PROOF and np.median(rest) >= _MATCHES_PROVE
+    return sorted(lost) if proven else []
 
 
 def _inexact(fit: Fit | None, tracks: TrackFit | None, *, far: bool) -> list[Finding]:
@@ -228,7 +264,8 @@ def _focal(rig: Rig, matches: MatchEvidence, fit: Fit) -> list[Finding]:
     for repair in zooms(rig):
         if (tried := matches.fit(repair.rig)).median < best_fit.median:
             best, best_fit = repair, tried
-    ratios = fit.medians / best_fit.medians
+    with np.errstate(invalid="ignore"):  # infinite: behind a camera
+        ratios = fit.medians / best_fit.medians
     clear = np.median(ratios) >= _SHARPER and np.mean(ratios > 1) >= _MATCHES_PROVE
     if best is None or not clear or best_fit.share < _MATCHES_PROVE:
         return []

@@ -16,8 +16,11 @@ from snowsplat.util.messages import Message, message
 #: Formats that depend on how Pillow was built.
 OPTIONAL_FORMATS = ("AVIF",) if features.check("avif") else ()
 #: The largest number of pixels of an image: Pillow's own limit. The largest camera backs have 151
-#: million. The size is known before the image is decoded.
+#: million. The size is known before the image is decoded. A JPEG of up to four times as many, as
+#: phones take with 200 million, is decoded at half its size.
 MOST_PIXELS = 178_956_970
+_MOST_JPEG_PIXELS = 4 * MOST_PIXELS
+Image.MAX_IMAGE_PIXELS = _MOST_JPEG_PIXELS // 2  # Pillow refuses twice as many
 #: The largest width or height: that of the JPEG format.
 LONGEST_SIDE = 65_535
 #: The reason in the error for a larger image.
@@ -58,7 +61,7 @@ def open_image(
         page: which page of a file with several, from 0.
 
     Raises:
-        ValueError: larger than `MOST_PIXELS` or `LONGEST_SIDE`, or malicious.
+        ValueError: larger than `MOST_PIXELS` (a JPEG: four times) or `LONGEST_SIDE`, or malicious.
         Exception: anything that Pillow raises for a damaged file.
     """
     with open(path, "rb") as file:
@@ -70,6 +73,8 @@ def open_image(
         _check_size(image)
         if not header_only and image.format in ("JPEG", "MPO"):
             _check_scans(image, path)
+        if image.width * image.height > MOST_PIXELS:
+            image.draft(None, (image.width // 2, image.height // 2))
     except BaseException:
         image.close()
         raise
@@ -115,7 +120,8 @@ def _check_header(file: BinaryIO) -> None:
 
 def _check_size(image: Image.Image) -> None:
     width, height = image.size
-    if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
+    most = _MOST_JPEG_PIXELS if image.format in ("JPEG", "MPO") else MOST_PIXELS
+    if width * height > most or max(width, height) > LONGEST_SIDE:
         raise Problem(TOO_LARGE)
     # Pillow's decoders in Python take a second per million pixels, and one of them does not check
     # the offsets in the file.

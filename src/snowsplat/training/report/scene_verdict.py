@@ -15,7 +15,7 @@ from snowsplat.data.dataset import Dataset, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
 from snowsplat.evaluation.verdict import Reason, Verdict
 from snowsplat.training.starts.point_colors import point_pixels
-from snowsplat.util.messages import message, plural
+from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.names import first_names
 
 #: The explained share of the typical held-out photo. At 0.9, the error is a third of the contrast
@@ -45,6 +45,12 @@ _MORE = message(
 _CHECK = message(
     "train longer; if that does not help, check the camera poses in the report of the dataset"
 )
+_START = message("add a point cloud to the dataset, from which the scene starts, or train longer")
+_CHANGED = message(
+    "check the camera poses, and what moved or changed between the photos: there are enough photos"
+)
+#: With as many training photos, more of them are of use only where few show the scene.
+_MANY_PHOTOS = 100
 
 
 def scene_verdict(
@@ -65,7 +71,7 @@ def scene_verdict(
     """
     typical = _typical(held_out)
     reasons = [
-        *_new_views(held_out, trained_on),
+        *_new_views(held_out, trained_on, dataset),
         *_worst(held_out, dataset),
         *_sharpness(held_out),
         *of_parts,
@@ -78,7 +84,7 @@ def scene_verdict(
     return Verdict.of(reasons)
 
 
-def _new_views(held_out: Evaluation, trained_on: Evaluation) -> list[Reason]:
+def _new_views(held_out: Evaluation, trained_on: Evaluation, dataset: Dataset) -> list[Reason]:
     """Whether held-out photos are explained and, if not, why."""
     share, own = _typical(held_out), _typical(trained_on)
     if own < _USABLE:
@@ -88,7 +94,7 @@ def _new_views(held_out: Evaluation, trained_on: Evaluation) -> list[Reason]:
             share=own,
             psnr=_psnr(trained_on),
         )
-        return [Reason("poor", text, _CHECK)]
+        return [Reason("poor", text, _START if dataset.points is None else _CHECK)]
     values = {
         "share": share,
         "psnr": _psnr(held_out),
@@ -114,7 +120,17 @@ def _new_views(held_out: Evaluation, trained_on: Evaluation) -> list[Reason]:
         text=text,
         factor=factor,
     )
-    return [Reason("poor", text, _MORE)]
+    worst = min(held_out.views, key=_share).name
+    return [Reason("poor", text, _advice(worst, dataset))]
+
+
+def _advice(name: str, dataset: Dataset) -> Message:
+    """What helps a held-out photo that differs more than the photos that were trained on."""
+    view = next((view for view in dataset.test if view.name == name), None)
+    enough = len(dataset.train) >= _MANY_PHOTOS and dataset.points is not None
+    if enough and view is not None and _seen_by_few(view, dataset) < _SELDOM:
+        return _CHANGED
+    return _MORE
 
 
 def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
@@ -136,7 +152,7 @@ def _worst(held_out: Evaluation, dataset: Dataset) -> list[Reason]:
             share=seldom,
             name=message("it") if len(wrong) == 1 else wrong[0].name,
         )
-    return [Reason("usable", text, _MORE)]
+    return [Reason("usable", text, _advice(wrong[0].name, dataset))]
 
 
 def _seen_by_few(view: View, dataset: Dataset) -> float:

@@ -309,7 +309,7 @@ def _is_video_name(file: str) -> bool:
 
 def _maps_beside(root: Path, photos: Sequence[str]) -> dict[str, Message]:
     """Photos that are maps or copies by their names, and what they are: IMG_depth.png beside
-    IMG.jpg; depth_01.png beside frame_01.jpg, if it has one channel or is smaller than half."""
+    IMG.jpg; depth_01.png beside frame_01.jpg, if it has one channel or half the size."""
     stems = {str(PurePosixPath(photo).with_suffix("")) for photo in photos}
     maps = {photo: m for photo in photos if (m := _NUMBERED_MAP.fullmatch(photo))}
     numbered = {photo: m for photo in photos if (m := _NUMBERED.fullmatch(photo))}
@@ -336,14 +336,14 @@ def _maps_beside(root: Path, photos: Sequence[str]) -> dict[str, Message]:
 
 
 def _is_lesser(path: Path, photo: Path) -> bool:
-    """Whether an image has one channel, or is smaller than half of a photo."""
+    """Whether an image has one channel, or is at most half as large as a photo."""
     try:
         with (
             open_image(path, header_only=True) as image,
             open_image(photo, header_only=True) as other,
         ):
             grey = len(image.getbands()) == 1 and image.mode != "P" and len(other.getbands()) > 1
-            return grey or 2 * max(image.size) < max(other.size)
+            return grey or 2 * max(image.size) <= max(other.size)
     except (Unusable, OSError, ValueError):
         return False
 
