@@ -1,5 +1,6 @@
 """The page in a real browser: by clicks, from an empty page to a downloaded file."""
 
+import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..sfm.colmap import scenes
 
 # The worker, with shorter trainings: `make` would take at least 15 seconds for one.
 _HURRIED = """
+import shutil
 import sys
 from snowsplat.pipeline import make
 from snowsplat.studio.__main__ import main
@@ -95,3 +97,19 @@ def test_from_photos_to_a_file(studio, forked, tmp_path, monkeypatch):
         assert not page.errors
     assert all(name.startswith(studio.server.url) for name in asked)
     assert studio.ask(f"scenes/{quote(scene.name)}")[1]["state"]["result"]["psnr"] > 15
+
+
+def test_what_the_photos_are_in_chinese(studio, forked, tmp_path):
+    photos = scenes.write_photos(tmp_path / "photos", 4)
+    shutil.copy(next(photos.iterdir()), photos / "zz.png")
+    (photos / "broken.jpg").write_bytes(b"no photo")
+    with Browser(1280, 800) as browser:
+        page = browser.open(studio.server.url, language="zh-CN")
+        page.wait_for("!!document.querySelector('.drop')")
+        drop(page, photos)
+        page.wait_for("!!document.querySelector('form.card:not([hidden]) .main')", 120)
+        facts = page.evaluate("document.querySelector('.facts').textContent")
+        assert "zz.png: 与 " in facts
+        assert "是同一张图片" in facts
+        assert "broken.jpg: 无法解码（不是已知格式的图像）" in facts
+        assert not page.errors
