@@ -3,7 +3,6 @@
 import signal
 import socket
 import sys
-import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from ..ports import unused_port
+from ..waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +52,7 @@ def test_watch_until_ctrl_c(start, trained):
 def test_watch_opens_the_page_of_a_training_that_goes_on_without_it(start, dataset, tmp_path):
     out = tmp_path / "out"
     training = start("train", dataset, "-o", out, "--iterations", 100_000)
-    end = time.monotonic() + 120
-    while not (out / ".snowsplat.watch" / "socket").exists():
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    wait_until((out / ".snowsplat.watch" / "socket").exists, 120)
     process = start("watch", out)
     assert "after the present step" in process.stdout.readline()
     assert process.stdout.readline() == "closing the page does not end the training\n"

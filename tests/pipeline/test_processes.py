@@ -73,9 +73,7 @@ def test_a_killed_process_ends_all_and_another_number_of_processes_resumes(
             time.sleep(0.02)
         children = children_of(parent.pid)
         os.kill(children[killed], signal.SIGKILL)
-        begin = time.monotonic()
         _, errors = parent.communicate(timeout=60)
-        assert time.monotonic() - begin < 30  # on a busy machine; usually 3 s
     finally:
         parent.kill()
     assert parent.returncode == 2

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import zipfile
 
 import numpy as np
@@ -28,17 +27,12 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.progress import Progress
 from snowsplat.util.errors import UserError
 
-
-def wait_for(true, seconds=30.0):
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+from ..waiting import wait_until
 
 
 def begun(scene: StudioScene) -> int:
     """The process of the job, when it has the lock."""
-    wait_for(lambda: "process" in scene.state())
+    wait_until(lambda: "process" in scene.state())
     return scene.state()["process"]
 
 
@@ -57,7 +51,7 @@ def test_two_jobs_in_one_folder_are_refused(library, holder):
     assert subprocess.run(second, check=False).returncode == 2
     assert scene.state()["process"] == process
     job.stop(scene)
-    wait_for(lambda: not job.is_running(scene))
+    wait_until(lambda: not job.is_running(scene))
     os.waitpid(process, 0)
     assert scene.state() == {"outcome": "stopped"}
     job.stop(scene)  # nothing to do
@@ -67,13 +61,13 @@ def test_a_killed_job_leaves_no_lock(library, holder):
     scene = library.new("a", [])
     job.start(scene)
     os.kill(begun(scene), signal.SIGKILL)
-    wait_for(lambda: not job.is_running(scene))
+    wait_until(lambda: not job.is_running(scene))
     assert "outcome" not in scene.state()
     (scene.folder / "state.json").unlink()
     job.start(scene)
     begun(scene)
     job.stop(scene)
-    wait_for(lambda: scene.state() == {"outcome": "stopped"})
+    wait_until(lambda: scene.state() == {"outcome": "stopped"})
 
 
 def test_a_job_of_another_computer_is_not_stopped(library, holder, monkeypatch):
@@ -108,7 +102,7 @@ def test_errors_of_the_worker_are_one_line(library, forked, tmp_path):
     with pytest.raises(UserError, match="the scene is not finished"):
         job.work(scene, "export", kind="spz")
     job.start(scene)
-    wait_for(lambda: not job.is_running(scene), 60)
+    wait_until(lambda: not job.is_running(scene), 60)
     state = scene.state()
     assert state["outcome"] == "failed"
     assert "empty" in state["error"]["en"]

@@ -122,10 +122,8 @@ def test_a_body_that_stops_is_given_up(server, monkeypatch):
         for _ in range(4):  # a slow one is waited for
             time.sleep(0.2)
             client.sendall(bytes(10))
-        began = time.monotonic()
         with contextlib.suppress(ConnectionError):
             assert client.recv(100) == b""
-        assert time.monotonic() - began < 5.0
 
 
 def test_a_fault_of_the_app_is_one_answer(server, caplog):

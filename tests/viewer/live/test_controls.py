@@ -25,6 +25,7 @@ from snowsplat.viewer.http.listen import listen
 from ...browser import Browser, Page
 from ...fork_server import popen
 from ...ports import unused_port
+from ...waiting import wait_until
 
 pytestmark = pytest.mark.browser
 
@@ -150,13 +151,6 @@ def differ(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a - b).mean())
 
 
-def wait(true: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.1)
-
-
 def drag(page: Page, moved: Callable[[], bool]) -> None:
     """Drag the scene until ``moved`` is true: on a busy machine, Chromium may lose a drag."""
     for _ in range(3):
@@ -185,8 +179,8 @@ def test_the_page_shows_a_running_training_run(training, page):
     lines = "".join(training.lines)
     assert f"watch it in a browser: {training.url}\n" in lines
     first = step_of(page)
-    wait(lambda: scene(page).std() > 10)  # a picture, not one colour
-    wait(lambda: step_of(page) > first + 10)
+    wait_until(lambda: scene(page).std() > 10)  # a picture, not one colour
+    wait_until(lambda: step_of(page) > first + 10)
     page.wait_for("document.querySelectorAll('figure:not([hidden]) polyline').length === 2")
     assert "Gaussians, loss 0." in page.evaluate(STATUS)
     assert page.errors == []
@@ -206,7 +200,7 @@ def test_two_pages_have_separate_cameras(page, other):
     assert differ(settled(page), here) < 1
     paused = step_of(page)
     press(other, "pause")  # the training is shared
-    wait(lambda: step_of(page) > paused)
+    wait_until(lambda: step_of(page) > paused)
 
 
 def test_a_page_that_closes_during_a_transfer(training, page, other):
@@ -220,7 +214,7 @@ def test_a_page_that_closes_during_a_transfer(training, page, other):
         assert training.process.poll() is None
         pause(page)
     resume(page)
-    wait(lambda: step_of(page) > first + 10)
+    wait_until(lambda: step_of(page) > first + 10)
     assert training.process.poll() is None
 
 
@@ -232,12 +226,12 @@ def test_pause_step_and_resume(page):
     time.sleep(1.5)
     assert step_of(page) == paused
     press(page, "step")
-    wait(lambda: step_of(page) == paused + 1)
+    wait_until(lambda: step_of(page) == paused + 1)
     # While paused, the camera can still be moved.
     drag(page, lambda: differ(scene(page), still) > 2)
     assert differ(settled(page), still) > 2
     press(page, "pause")
-    wait(lambda: step_of(page) > paused + 10)
+    wait_until(lambda: step_of(page) > paused + 10)
 
 
 def test_display_modes(page):
@@ -245,33 +239,33 @@ def test_display_modes(page):
     seen = [settled(page)]
     for name in ("depth", "alpha", "normals", "points", "ellipsoids", "cost"):
         put(page, "mode", name)
-        wait(lambda: differ(scene(page), seen[-1]) > 1)
+        wait_until(lambda: differ(scene(page), seen[-1]) > 1)
         seen.append(settled(page))
         assert page.evaluate("document.getElementById('legend').innerText")
     put(page, "mode", "color")
     # On a busy machine, the first image may be one of those with a low resolution, which the
     # server sends before the sharp one.
     others = min(differ(seen[0], mode) for mode in seen[1:])
-    wait(lambda: differ(scene(page), seen[0]) < others / 3)
+    wait_until(lambda: differ(scene(page), seen[0]) < others / 3)
     put(page, "size", 20)
     put(page, "degree", 0)
-    wait(lambda: differ(scene(page), seen[0]) > 1)
+    wait_until(lambda: differ(scene(page), seen[0]) > 1)
     put(page, "size", 100)
     put(page, "degree", 3)
-    wait(lambda: differ(scene(page), seen[0]) < others / 3)
+    wait_until(lambda: differ(scene(page), seen[0]) < others / 3)
     page.evaluate("document.querySelectorAll('.range input')[0].step = 'any'")
     slider = "document.querySelectorAll('.range input')[0]"
     page.evaluate(f"{slider}.value = {slider}.max, {slider}.dispatchEvent(new Event('input'))")
-    wait(lambda: differ(scene(page), seen[0]) > 1)
+    wait_until(lambda: differ(scene(page), seen[0]) > 1)
     low, high = sent(page, "display")["crop"]
     assert low[0] == high[0]  # the ends do not pass each other
     press(page, "cropped")
-    wait(lambda: differ(scene(page), seen[0]) < others / 3)
+    wait_until(lambda: differ(scene(page), seen[0]) < others / 3)
 
 
 def test_the_view_at_a_photo(page):
     resume(page)
-    wait(lambda: step_of(page) > 300)  # similar to the photo
+    wait_until(lambda: step_of(page) > 300)  # similar to the photo
     pause(page)
     put(page, "mode", "error")
     page.wait_for("document.getElementById('legend').innerText.startsWith('Only at')")
@@ -280,15 +274,15 @@ def test_the_view_at_a_photo(page):
     assert first is not None
     error = settled(page)
     put(page, "mode", "color")
-    wait(lambda: differ(scene(page), error) > 1)
+    wait_until(lambda: differ(scene(page), error) > 1)
     render = settled(page)
     press(page, "photo")
-    wait(lambda: differ(scene(page), render) > 0.2)
+    wait_until(lambda: differ(scene(page), render) > 0.2)
     photo = settled(page)
     assert differ(photo, render) < 30  # it is the same pose
     press(page, "next")
     assert photo_of(page) not in (None, first)
-    wait(lambda: differ(scene(page), photo) > 1)
+    wait_until(lambda: differ(scene(page), photo) > 1)
     drag(page, lambda: page.evaluate(NOWHERE))
     assert page.evaluate("document.getElementById('compare').hidden")
     press(page, "render")
@@ -304,7 +298,7 @@ def test_a_click_on_a_camera(page):
         "[...document.getElementById('cameras').getContext('2d').getImageData(0, 0, 400, 400).data]"
         ".filter((v, i) => i % 4 == 3 && v > 9).length"
     )
-    wait(lambda: page.evaluate(drawn) > 4)
+    wait_until(lambda: page.evaluate(drawn) > 4)
     settled(page)
     view = sent(page, "view")
     photos = page.evaluate(
@@ -320,8 +314,8 @@ def test_a_click_on_a_camera(page):
     focal = height / 2 / math.tan(view["fov"] / 2)
     x, y = focal * (offset @ right) / depth, focal * (offset @ down) / depth
     page.click(width / 2 + x, height / 2 + y)
-    wait(lambda: photo_of(page) is not None)
-    wait(lambda: sent(page, "view")["photo"] is not None)
+    wait_until(lambda: photo_of(page) is not None)
+    wait_until(lambda: sent(page, "view")["photo"] is not None)
     shown = sent(page, "view")
     assert np.linalg.norm(np.array(shown["position"]) - position) < 1e-5
     press(page, "frustums")
@@ -486,7 +480,7 @@ def test_it_reconnects_by_itself(page):
     pause(page)
     before = settled(page)
     put(page, "mode", "depth")
-    wait(lambda: differ(scene(page), before) > 1)
+    wait_until(lambda: differ(scene(page), before) > 1)
     depth = settled(page)
     count = "window.sent.filter(m => m.type === 'display').length"
     settings = page.evaluate(count)

@@ -6,7 +6,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.viewer.live import viewer as live
 from snowsplat.viewer.live.viewer import NetworkViewer
 
+from ...waiting import wait_until
 from ..clients import (
     HOSTILE,
     Visitor,
@@ -47,13 +48,6 @@ def viewer(dataset) -> Iterator[NetworkViewer]:
     viewer.session.training = True  # the server's time is limited
     yield viewer
     viewer.close()
-
-
-def wait(true: Callable[[], bool], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def megabytes() -> float:
@@ -99,7 +93,7 @@ def test_invalid_messages_are_ignored(viewer, dataset, capfd, caplog):
         visitor.socket.send(b"\x00\x01")
         visitor.view(position=[0.0, 1.0, -3.0])
         seen = viewer.session._visitors
-        wait(lambda: [v for v in seen.values() if v.pose and v.pose.position[1] == 1.0])
+        wait_until(lambda: [v for v in seen.values() if v.pose and v.pose.position[1] == 1.0])
     threads = [
         threading.Thread(target=hostile, args=(kind, viewer.url, 1.0)) for kind in sorted(HOSTILE)
     ]
@@ -107,11 +101,11 @@ def test_invalid_messages_are_ignored(viewer, dataset, capfd, caplog):
         thread.start()
     for thread in threads:
         thread.join(60)
-    wait(lambda: not viewer.session.visitors)
+    wait_until(lambda: not viewer.session.visitors)
     assert not viewer._browsers
     with Visitor(viewer.url) as visitor:
         visitor.view()
-        wait(lambda: viewer.serve(Gaussians.from_points(dataset.points), 0, training=False))
+        wait_until(lambda: viewer.serve(Gaussians.from_points(dataset.points), 0, training=False))
         assert visitor.pictures(20.0, most=1) == 1
     assert capfd.readouterr() == ("", "")
     gc.collect()  # asyncio then reports exceptions that were never retrieved
@@ -131,7 +125,7 @@ def test_a_client_that_does_not_read_is_not_read_from(viewer):
     """States that are not received replace one another; its messages are not read."""
     with upgrade(viewer.url) as client:
         client.sendall(frame(view()))
-        wait(lambda: len(viewer._browsers) == 1 and next(iter(viewer._browsers)).visitor.pose)
+        wait_until(lambda: len(viewer._browsers) == 1 and next(iter(viewer._browsers)).visitor.pose)
         (browser,) = viewer._browsers
         before = 0.0
         for i in range(60):  # 60 MB if all were kept
@@ -167,13 +161,13 @@ def test_a_browser_cannot_claim_images_that_were_not_sent(viewer, dataset):
     gaussians = Gaussians.from_points(dataset.points)
     with upgrade(viewer.url) as client:
         client.sendall(frame(view()))
-        wait(lambda: viewer.serve(gaussians, 0, training=False))
+        wait_until(lambda: viewer.serve(gaussians, 0, training=False))
         (seen,) = viewer.session._visitors.values()
         for number in (10**9, 1, 0, -5, 10**9):
             client.sendall(frame(f'{{"type": "shown", "number": {number}}}'))
-        wait(lambda: seen.on_the_way == 0)
+        wait_until(lambda: seen.on_the_way == 0)
         client.sendall(frame(view()))
-        wait(lambda: viewer.serve(gaussians, 0, training=False))
+        wait_until(lambda: viewer.serve(gaussians, 0, training=False))
         time.sleep(0.2)
         assert seen.on_the_way == 1
 
@@ -190,7 +184,7 @@ def test_a_photo_that_cannot_be_read_is_named(tmp_path):
             assert told["index"] == 1
             assert dataset.train[1].name in told["error"]
             visitor.view(photo=0)
-            wait(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
+            wait_until(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
             for count, thumbnails in ((1, {0}), (10**9, {0, 2})):
                 visitor.send("thumbnails", count=count)
                 visitor.pictures(0.5)

@@ -1,7 +1,6 @@
 """The next image, the training's share of the time, pause and step."""
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +10,8 @@ import torch
 from snowsplat.scene.camera import Camera
 from snowsplat.viewer.live.display import DisplaySettings, Pose
 from snowsplat.viewer.live.session import IDLE_SHARE, STILL, PhotoView, Session
+
+from ...waiting import wait_until
 
 
 class Clock:
@@ -183,10 +184,10 @@ def test_pause_step_and_resume(session):
 def test_wait_returns_after_a_change():
     session = Session()
     session.pause()
-    threading.Timer(0.05, session.resume).start()
-    started = time.monotonic()
-    session.wait(10)
-    assert time.monotonic() - started < 5
+    waiting = threading.Thread(target=session.wait, args=(600,), daemon=True)
+    waiting.start()
+    # Again and again, since the first change may come before the other thread waits.
+    wait_until(lambda: session.pause() or session.resume() or not waiting.is_alive())
     assert session.may_step()
 
 

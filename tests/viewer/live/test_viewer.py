@@ -21,16 +21,10 @@ from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer, Scene
 
 from ...training.test_unit import scaled
+from ...waiting import wait_until
 from ..clients import Visitor, frame, upgrade, view
 
 pytestmark = pytest.mark.slow
-
-
-def wait(true: Callable[[], bool], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_a_newer_scene_replaces_the_one_shown(tmp_path):
@@ -56,12 +50,12 @@ def test_a_newer_scene_replaces_the_one_shown(tmp_path):
     thread.start()
     try:
         with Visitor(viewer.url) as visitor:
-            wait(lambda: 1 in shown)
+            wait_until(lambda: 1 in shown)
             visitor.view()
             assert visitor.pictures(20.0, most=1) == 1
             assert visitor.wait_for("about")["lines"] == ["30"]
             saved.append(Scene(gaussians, 2, ["50"]))
-            wait(lambda: shown.count(2) >= 2)
+            wait_until(lambda: shown.count(2) >= 2)
             visitor.view(position=[0.0, 0.5, -3.0])
             assert visitor.pictures(20.0, most=1) == 1
     finally:
@@ -93,7 +87,7 @@ def test_a_browser_that_receives_slowly_gets_the_newest_images(tmp_path):
             assert images(lambda x: silent.sendall(frame(view(position=[x, 0.0, -3.0]))), 12) == 3
             (seen,) = viewer.session._visitors.values()
             assert seen.on_the_way == 3
-        wait(lambda: not viewer.session.visitors)
+        wait_until(lambda: not viewer.session.visitors)
         with Visitor(viewer.url) as visitor:
 
             def move(x: float) -> None:
@@ -103,7 +97,7 @@ def test_a_browser_that_receives_slowly_gets_the_newest_images(tmp_path):
             assert images(move, 12) >= 9
             (seen,) = viewer.session._visitors.values()
             visitor.pictures(0.5)
-            wait(lambda: seen.on_the_way == 0)
+            wait_until(lambda: seen.on_the_way == 0)
     finally:
         viewer.close()
 
@@ -123,7 +117,7 @@ def test_the_page_does_not_depend_on_the_unit_of_the_scene(tmp_path):
                 box = [[-9.0 * factor] * 3, [0.0, 9.0 * factor, 9.0 * factor]]
                 visitor.display(crop=box)
                 (seen,) = viewer.session._visitors.values()
-                wait(lambda seen=seen: seen.pose and seen.display.crop)
+                wait_until(lambda seen=seen: seen.pose and seen.display.crop)
                 visitor.send("key")
                 visitor.wait_for("key")
                 (tmp_path / "cameras.json").write_text(json.dumps(visitor.keys))
@@ -150,15 +144,15 @@ def test_an_image_has_the_number_of_its_view(tmp_path):
         with Visitor(viewer.url) as visitor:
             for number in (5, 6):
                 visitor.view(number=number, position=[0.0, 0.1 * number, -3.0])
-                wait(lambda: viewer.serve(gaussians, 0, training=False))
+                wait_until(lambda: viewer.serve(gaussians, 0, training=False))
                 assert visitor.pictures(20.0, most=1) == 1
                 assert visitor.view_shown == number
                 assert max(visitor.newest.size) <= 320
             visitor.view(number=7, photo=1)
-            wait(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
+            wait_until(lambda: [v for v in viewer.session._visitors.values() if v.photo_view])
             visitor.display(wipe=1.0)
             visitor.pictures(0.3)
-            wait(lambda: viewer.serve(gaussians, 0, training=False))
+            wait_until(lambda: viewer.serve(gaussians, 0, training=False))
             visitor.pictures(0.5)
             shown = np.asarray(visitor.newest.resize((48, 36)), np.float64)
             photo = np.asarray(Image.open(dataset.train[1].image.path), np.float64)

@@ -5,7 +5,6 @@ import os
 import resource
 import signal
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from snowsplat.sfm.progress import silent
 from snowsplat.util.errors import UserError
 
 from ....fork_server import popen
+from ....waiting import wait_until
 from .. import scenes
 from ..forks import children_in_forks
 
@@ -73,12 +73,6 @@ def is_alive(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
-
-
-def wait_until(condition, seconds=20):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timed out"
 
 
 def kill_child(number=signal.SIGKILL):
