@@ -106,7 +106,11 @@ function startForm(
     return form;
 }
 
-const isText = (/** @type {any} */ value) => typeof value !== "object" || "zh" in value;
+/**
+ * @param {import("./types.js").Fact} value
+ * @returns {value is import("./types.js").Told | number | boolean}
+ */
+const isText = value => typeof value !== "object" || "zh" in value;
 
 function factsOf(/** @type {import("./types.js").Survey["facts"]} */ facts) {
     const words = (/** @type {import("./types.js").Fact} */ value) => {
