@@ -48,7 +48,7 @@ FOREIGN_FLAGS = listed("""
     --app_opt --ckpt --data_factor --dest --diff-filter --downscale-factor --find-links --format
     --gpus --max-num-iterations --max_steps --network --no-index --no-normalize-world-space
     --output-dir --pipeline --ply-color-mode --pose_opt --resize --rm --save_ply --strategy
-    --torch-backend
+    --torch-backend --user
     """)
 #: Names of the listings of the paper, and of other programs.
 FOREIGN_NAMES = listed("""
