@@ -50,6 +50,8 @@ def test_good_photos():
     [
         ({"step": 0.25}, {}, "usable", "typically 25% of the distance to the scene away"),
         ({"step": 0.6}, {}, "poor", "typically 60% of the distance"),
+        ({"count": 36, "step": 4e-4}, {"registered": [""] * 36}, "usable", "at most 18 places"),
+        ({"count": 90, "step": 4e-4}, {"registered": [""] * 90}, "good", "at most 45 places"),
         ({"step": np.inf}, {}, "poor", "have no other photo that shows the same"),
         ({"confirmed": 0.4}, {}, "poor", "60% of the points are in only one other photo"),
         ({"count": 11}, {}, "usable", "11 photos are few"),

@@ -27,6 +27,8 @@ _FEW = 30
 #: by 6 degrees. At a fifth, 11 degrees, surfaces are hidden in one of two photos and seen in the
 #: other. At a half, 27 degrees, features are rarely recognised.
 _SMALL_STEP, _LARGE_STEP, _HUGE_STEP = 0.1, 0.2, 0.5
+#: At a smaller step, points move by less than a pixel in photos of 1000 pixels: one place.
+_SAME_PLACE = 1e-3
 #: If less than this share of the points of a typical photo is confirmed by two other photos, most
 #: of the scene is known from two photos only.
 _CONFIRMED = 0.5
@@ -77,6 +79,18 @@ def capture_verdict(
         reasons.append(Reason("poor", too_few, many))
     elif photos < _FEW and not (one_way and step <= _SMALL_STEP):
         reasons.append(Reason("usable", message("{count} photos are few", count=photos), many))
+    if repeats := int((coverage.step < _SAME_PLACE).sum()):
+        places = photos - repeats // 2  # each such place has at least two photos
+        text = message(
+            "{repeats} of {photos} photos are taken from the place of another one, as brackets of "
+            "exposures are: there are at most {places} places, and held-out photos may have been "
+            "trained on at another exposure",
+            repeats=repeats,
+            photos=photos,
+            places=places,
+        )
+        few = places < _FEW
+        reasons.append(Reason("usable", text, many) if few else Reason("good", text))
     reasons += _ends(coverage, confirmed)
     error = sfm["reprojection_error"]
     if error is not None and error > _MAX_ERROR:

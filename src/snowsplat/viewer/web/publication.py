@@ -92,8 +92,11 @@ def is_site(folder: Path) -> bool:
 
 
 def site_files(folder: Path) -> tuple[dict[str, Served], dict[str, str]]:
-    """The files of a site for `static_app`, and the HTTP headers for them."""
-    files = served(folder, sorted(file for file in folder.rglob("*") if file.is_file()))
+    """The files of a site for `static_app`, and the HTTP headers for them. Links that leave the
+    folder are not followed."""
+    root = folder.resolve()
+    inside = (file for file in folder.rglob("*") if file.resolve().is_relative_to(root))
+    files = served(folder, sorted(file for file in inside if file.is_file()))
     # The page contains the rest of its policy.
     return {"": files[PAGE], **files}, {"Content-Security-Policy": "frame-ancestors 'none'"}
 
