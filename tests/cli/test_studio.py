@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from pathlib import Path
 
 import pytest
 
@@ -55,20 +56,23 @@ def test_a_second_studio_opens_the_first(start, refused, tmp_path):
     assert second.wait(10) == 0
     assert "end that one with Ctrl-C" in refused("studio", scenes, "--port", "1024")
     if hasattr(os, "getuid"):  # it has the token
-        assert (scenes / ".studio.json").stat().st_mode & 0o77 == 0
+        address = scenes / ".studio.json"
+        opener = Path(json.loads(address.read_text())["opener"])
+        for file in (address, opener, opener.parent):
+            assert file.stat().st_mode & 0o77 == 0
+        assert url in opener.read_text()
     first.send_signal(signal.SIGINT)
     assert first.wait(10) == 0
     assert list(scenes.iterdir()) == []
+    assert not opener.parent.exists()
 
 
-def test_a_studio_that_was_killed_goes_on_at_its_address(start, tmp_path):
+def test_each_start_has_a_new_token(start, tmp_path):
     first = start("studio", tmp_path, "--no-browser")
     url = address_in(first)
     first.kill()
     first.wait()
     again = start("studio", tmp_path, "--no-browser")
-    assert address_in(again) == url
+    assert address_in(again).split("/")[3] != url.split("/")[3]
     again.send_signal(signal.SIGINT)
     assert again.wait(10) == 0
-    other = start("studio", tmp_path, "--no-browser")
-    assert address_in(other).split("/")[3] != url.split("/")[3]  # another token

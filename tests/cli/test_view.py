@@ -13,7 +13,7 @@ import pytest
 
 from snowsplat.cli import page_flags
 from snowsplat.cli.main import main
-from snowsplat.cli.pages import for_other_computers
+from snowsplat.cli.pages import for_other_computers, opener_of
 from snowsplat.formats import read_gaussians, write_gaussians
 
 from ..browser import Browser
@@ -96,7 +96,13 @@ def served(run, monkeypatch):
 
 def test_opens_a_browser_if_there_is_a_display(served, out):
     result, opened, _ = served(out, environment=["DISPLAY"])
-    assert opened == [address(result.out.splitlines()[1])]
+    url = address(result.out.splitlines()[1])
+    # All users of the computer see the command line of a browser.
+    opener = opener_of(url)
+    assert opened == [opener.as_uri()]
+    assert url.split("/")[3] not in opened[0]
+    assert f'content="0; url={url}"' in opener.read_text()
+    assert {path.stat().st_mode & 0o77 for path in (opener, opener.parent)} == {0}
     assert served(out, "--no-browser", environment=["DISPLAY"])[1] == []
     assert served(out)[1] == []
 

@@ -89,10 +89,10 @@ class Studio:
     def ask(
         self, path: str, method: str = "GET", body: Any = None, **headers: str
     ) -> tuple[int, Any]:
-        """Status and answer; an object is sent and received as JSON."""
+        """Status and answer; an object is sent and received as JSON. A path may have a token."""
         data = json.dumps(body) if isinstance(body, dict) else body
         connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
-        base = urlsplit(self.server.url).path
+        base = "" if path.startswith("/") else urlsplit(self.server.url).path
         connection.request(method, base + path, data, headers)
         response = connection.getresponse()
         answer = response.read()

@@ -72,17 +72,11 @@ class PageServer(Settings):
     allow_host: tuple[str, ...] = same(PageAddress, "allow_host", ())
     no_browser: bool = switch("Print the URL, but do not open a browser.")
 
-    def open(
-        self, app: ASGIApp, headers: Mapping[str, str], port: int | None = None, token: str = ""
-    ) -> WebServer:
-        """The server, not yet started, at this port or another one.
-
-        Raises: UserError: the address cannot be used.
-        """
+    def open(self, app: ASGIApp, headers: Mapping[str, str]) -> WebServer:
+        """The server. Raises: UserError: the address cannot be used."""
         from snowsplat.viewer.http.server import WebServer
 
-        where = self.host, self.port if port is None else port, self.allow_host
-        return WebServer(app, *where, headers, token or None)
+        return WebServer(app, self.host, self.port, self.allow_host, headers)
 
     def serve(self, server: WebServer) -> None:
         """Show a page, see `show`, and wait for Ctrl-C."""

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import atexit
 import getpass
+import html
 import os
+import shutil
 import socket
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from snowsplat.util.messages import message
 from snowsplat.viewer.hosts import LOCAL_HOST
+
+_OPENING_SECONDS = 5.0  # in which a browser gets its address
 
 
 def for_other_computers(url: str, others: Sequence[str]) -> list[str]:
@@ -45,20 +53,45 @@ def _forwarding(port: int | None) -> str:
     return f"ssh -L {port}:{LOCAL_HOST}:{port} {user}@{socket.gethostname()}"
 
 
-def show(how: str, url: str, others: Sequence[str], browser: bool) -> None:
-    """Print the addresses of a page, and open it if there is a ``browser`` and a screen."""
+def show(
+    how: str, url: str, others: Sequence[str], browser: bool, opener: Path | None = None
+) -> None:
+    """Print the addresses of a page, and open it if there is a ``browser`` and a screen.
+
+    ``opener``: the `opener_of` another process that shows the page; None: this process shows it.
+    """
     print(message("{how}: {url}", how=how, url=url), flush=True)
     for line in for_other_computers(url, others):
         print(line, flush=True)
     if browser and has_screen():
-        open_browser(url)
+        import webbrowser
+
+        # In the background: some browsers block the program that opens them.
+        place = (opener or opener_of(url)).as_uri()
+        opening = threading.Thread(target=webbrowser.open, args=(place,), daemon=True)
+        opening.start()
+        if opener:  # this process ends at once
+            opening.join(_OPENING_SECONDS)
 
 
-def open_browser(url: str) -> None:
-    """In the background: some browsers block the program that opens them."""
-    import webbrowser
+@cache
+def opener_of(url: str) -> Path:
+    """A file that leads a browser to ``url``, until this process ends. Only its user can read it.
 
-    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+    All users see the words of a command, such as that of the browser, and ``url`` has a secret.
+
+    Raises: OSError: it cannot be written.
+    """
+    # Browsers in packages of snap read no other folders of temporary files than their own.
+    visible = Path.home() if Path("/snap").is_dir() else None
+    folder = Path(tempfile.mkdtemp(prefix="snowsplat-", dir=visible))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    file, link = folder / "open.html", html.escape(url)
+    with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as page:
+        page.write(
+            f'<meta http-equiv="refresh" content="0; url={link}"><a href="{link}">snowsplat</a>'
+        )
+    return file
 
 
 def wait() -> None:

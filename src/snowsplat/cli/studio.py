@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 
 from snowsplat.cli.command import Command
 from snowsplat.cli.page_flags import PageServer
-from snowsplat.cli.pages import show
+from snowsplat.cli.pages import opener_of, show
 from snowsplat.util.errors import UserError
 from snowsplat.util.messages import message
 from snowsplat.util.settings import argument, group
 from snowsplat.viewer.hosts import ANY_HOST, LOCAL_HOST, KnownHosts, is_loopback
 
 if TYPE_CHECKING:
-    from starlette.types import ASGIApp
-
     from snowsplat.studio.library import Library
     from snowsplat.studio.one_studio import Address
     from snowsplat.viewer.http.server import WebServer
@@ -55,13 +53,13 @@ class Studio(Command):
 
         library = Library(self.folder or default_folder())
         try:
-            with only_studio(library.folder) as killed, suppress(KeyboardInterrupt):
-                self._serve(library, killed)
+            with only_studio(library.folder), suppress(KeyboardInterrupt):
+                self._serve(library)
         except Running as running:
             self._open(library, running.address)
 
-    def _serve(self, library: Library, killed: Address | None) -> None:
-        from snowsplat.studio.app import studio_app
+    def _serve(self, library: Library) -> None:
+        from snowsplat.studio.app import POLICY, studio_app
         from snowsplat.studio.library_requests import own_address
         from snowsplat.studio.one_studio import Address, write_address
 
@@ -73,25 +71,14 @@ class Studio(Command):
             open_here = here is not None and not is_loopback(here)
             return ([server.url_at(str(here))] if open_here else []) + server.others
 
-        with self._opened(studio_app(library, addresses), killed) as server:
+        policy = {"Content-Security-Policy": POLICY}
+        with self.server.open(studio_app(library, addresses), policy) as server:
             servers.append(server)
             with suppress(OSError):  # a full disk: then a second studio is refused
-                address = Address(
-                    server.url, self.server.host, server.port, server.token, server.others
-                )
-                write_address(library.folder, address)
+                where = server.url, self.server.host, server.port, server.token, server.others
+                write_address(library.folder, Address(*where, str(opener_of(server.url))))
             print(message("scenes are kept in {folder}", folder=library.folder))
             self.server.serve(server)
-
-    def _opened(self, app: ASGIApp, killed: Address | None) -> WebServer:
-        """At the address of a studio that was killed, if possible: its pages go on."""
-        from snowsplat.studio.app import POLICY
-
-        policy, where = {"Content-Security-Policy": POLICY}, self.server
-        if killed is not None and killed.host == where.host and where.port in (0, killed.port):
-            with suppress(UserError):  # another program has the port now
-                return where.open(app, policy, killed.port, killed.token)
-        return where.open(app, policy)
 
     def _open(self, library: Library, address: Address) -> None:
         """Raises: UserError: it has other settings than were asked for."""
@@ -112,4 +99,5 @@ class Studio(Command):
             address.url,
             address.others,
             not self.server.no_browser,
+            Path(address.opener),
         )

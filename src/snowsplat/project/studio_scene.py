@@ -203,8 +203,17 @@ class StudioScene:
         A training in a terminal may have gone on since the site was written, or the process that
         has edited the scene was killed before it wrote the site.
         """
-        result = self.state().get("result") or {}
-        return result.get("shown") == [self.version(), self.job.title]
+        return self._shown() == [self.version(), self.job.title]
+
+    def shown_version(self) -> str:
+        """The version of the scene that the site shows; "" if none is known."""
+        shown = self._shown()
+        return str(shown[0]) if shown else ""
+
+    def _shown(self) -> list[Any]:
+        result = self.state().get("result")
+        shown = result.get("shown") if isinstance(result, dict) else None
+        return shown if isinstance(shown, list) else []
 
     def remove(self) -> Path | None:
         """Remove the scene, but not its photos; returns their folder, or None if it has none.

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin
 
 import segno
 from starlette.requests import Request
@@ -19,6 +20,7 @@ from snowsplat.studio.scene_requests import summary
 from snowsplat.util.errors import UserError, cause_of
 from snowsplat.util.safe_json import printable
 from snowsplat.util.theme import THEME
+from snowsplat.viewer.http.guard import LOOK
 
 _PAGES = Path(__file__).parent / "pages"
 _FOLDERS = 500  # that are listed
@@ -30,7 +32,9 @@ async def page(studio: Studio, request: Request) -> Any:
 
 async def about(studio: Studio, request: Request) -> Any:
     path = request.query_params.get("path", "")
-    urls = [f"{url}{path}" for url in studio.addresses()]
+    # Phones may look at this scene, no more.
+    look = request.scope[LOOK](path)
+    urls = [urljoin(url, f"../{look}/{path}") for url in studio.addresses()]
     codes = [segno.make(url, error="m").svg_data_uri(scale=4, border=2) for url in urls]
     return {
         "folder": str(studio.library.folder),

@@ -32,6 +32,7 @@ class Address:
         url: of its page, for a browser on this computer.
         host, port, token: as those of `WebServer`.
         others: URLs for other computers.
+        opener: a file that leads a browser to it; see `snowsplat.cli.pages.opener_of`.
     """
 
     url: str
@@ -39,6 +40,7 @@ class Address:
     port: int
     token: str
     others: list[str]
+    opener: str
 
     def answers(self, folder: Path) -> bool:
         """Whether it is there, and has this library."""
@@ -62,7 +64,7 @@ class Running(InUse):
 
 
 def _address_in(folder: Path) -> Address | None:
-    """What the last studio of a library has written; None if it has ended as usual."""
+    """What the studio of a library has written; None: nothing, or it is not that of this user."""
     file = folder / _ADDRESS
     try:
         # That of another user could lead the browser elsewhere.
@@ -78,8 +80,8 @@ def write_address(folder: Path, address: Address) -> None:
 
 
 @contextmanager
-def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None]:
-    """Hold the library during the block, which gets the address of a studio that was killed.
+def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[None]:
+    """Hold the library during the block.
 
     A folder that cannot be written, such as that of another user to look at, needs no lock.
     ``wait``: seconds for a process that is just ending.
@@ -89,7 +91,7 @@ def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None
         InUse: another one has it, and does not answer, or only to others.
     """
     if not os.access(folder, os.W_OK):
-        yield None
+        yield
         return
     with ExitStack() as stack:
         for seconds in (0.0, wait):
@@ -103,7 +105,7 @@ def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[Address | None
                 if seconds == wait:
                     raise
         try:
-            yield _address_in(folder)
+            yield
         finally:
             with suppress(OSError):
                 (folder / _ADDRESS).unlink(missing_ok=True)

@@ -45,7 +45,9 @@ async def photo(studio: Studio, request: Request, scene: StudioScene) -> Any:
 
 
 async def map_of(studio: Studio, request: Request, scene: StudioScene) -> Any:
-    return File(scene.map)
+    policy = "sandbox; default-src 'none'; style-src 'unsafe-inline'"
+    kept = {"Content-Disposition": "attachment"}  # <img> shows it; nobody opens it as a page
+    return File(scene.map, **{"Content-Security-Policy": policy}, **kept)
 
 
 ROUTES: SceneRoutes = (

@@ -1,7 +1,7 @@
-"""Passes the page of a running training on: its files, and the connection with its images.
+"""Passes the connection of the page of a running training on, with its images.
 
-The job serves this page at a port of its own, on the loopback interface. Browsers of the studio
-may be elsewhere, so that they reach the studio only.
+The job listens at a port of its own, on the loopback interface. Browsers of the studio may be
+elsewhere, so that they reach the studio only. The files of the page are those of the studio.
 """
 
 from __future__ import annotations
@@ -9,28 +9,11 @@ from __future__ import annotations
 import asyncio
 from contextlib import suppress
 
-from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
-from snowsplat.studio.local_page import read_local
-
 _SECONDS = 20.0  # to answer; a training step may block the process
-
-
-async def relay_file(url: str, name: str) -> Response:
-    """The file ``name`` of the page at ``url``; 404 if there is none, or no page."""
-
-    def load() -> Response:
-        headers, content = read_local(url + name, _SECONDS)
-        kept = {key: headers[key] for key in ("Content-Type", "Content-Security-Policy")}
-        return Response(content, headers=kept)
-
-    try:
-        return await asyncio.to_thread(load)
-    except (OSError, ValueError):  # also urllib.error.URLError, and a malformed name
-        return Response(status_code=404)
 
 
 async def relay_socket(browser: WebSocket, url: str) -> None:

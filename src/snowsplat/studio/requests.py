@@ -46,15 +46,34 @@ SceneAnswer = Callable[[Studio, Request, StudioScene], Awaitable[Any]]
 SceneRoutes = tuple[tuple[str, str, SceneAnswer], ...]
 
 
+# Whatever a stranger has written into a folder has no origin, no script and no style.
+_SANDBOX = "sandbox; default-src 'none'"
+# The other kinds, such as HTML, SVG and scripts, could act for the page of the studio.
+_DATA = (".jpg", ".json", ".mp4", ".png", ".webp")
+
+
 class File:
-    """A response with a file, and further headers."""
+    """A response with a file of this package, and further headers."""
 
     def __init__(self, path: Path, **headers: str) -> None:
         self._path, self._headers = path, headers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        file = FileOnDisk(self._path, content_type(self._path)) if is_file(self._path) else None
+        file = FileOnDisk(self._path, self._type()) if is_file(self._path) else None
         await send_file(file, scope, receive, send, self._headers)
+
+    def _type(self) -> str:
+        return content_type(self._path)
+
+
+class Data(File):
+    """A response with a file of the library: browsers show it as a picture, or keep it."""
+
+    def __init__(self, path: Path, **headers: str) -> None:
+        super().__init__(path, **{"Content-Security-Policy": _SANDBOX, **headers})
+
+    def _type(self) -> str:
+        return super()._type() if self._path.suffix in _DATA else "application/octet-stream"
 
 
 def answering(answer: Callable[[Request], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import asdict
+from html import escape
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
@@ -18,8 +19,9 @@ from snowsplat.project.studio_scene import StudioScene
 from snowsplat.studio import job
 from snowsplat.studio.hand_on import FORMATS, export_file, film_command, is_exported
 from snowsplat.studio.library import UnknownScene, safe_name
-from snowsplat.studio.relay import relay_file, relay_socket
+from snowsplat.studio.relay import relay_socket
 from snowsplat.studio.requests import (
+    Data,
     File,
     SceneRoutes,
     Studio,
@@ -31,12 +33,15 @@ from snowsplat.studio.requests import (
 from snowsplat.studio.scene_requests import edited_at
 from snowsplat.util.errors import UserError
 from snowsplat.util.safe_json import from_json, is_file
+from snowsplat.viewer.hosts import LOCAL_HOST
+from snowsplat.viewer.http.guard import LOOK
+from snowsplat.viewer.live.page_files import FILES, INDEX, POLICY
+from snowsplat.viewer.web.viewer_page import asset_file, content_policy, page_anew
 
-# The site has the rest of its policy in its page.
-_SITE_POLICY = "frame-ancestors 'self'"
+# A report has no origin, so it cannot reach the studio; and its address has no secret of it.
 _REPORT_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src 'self' data:; frame-ancestors 'self'"
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
 )
 
 # The page of a scene gets tools: a film, and editing. They come before the script of the page,
@@ -60,7 +65,7 @@ async def export(studio: Studio, request: Request, scene: StudioScene) -> Any:
 async def exported(studio: Studio, request: Request, scene: StudioScene) -> Any:
     file = export_file(scene, kind_of(request))
     name = f"attachment; filename*=UTF-8''{quote(file.name)}"
-    return File(file, **{"Content-Disposition": name})
+    return Data(file, **{"Content-Disposition": name})
 
 
 async def film(studio: Studio, request: Request, scene: StudioScene) -> Any:
@@ -108,7 +113,7 @@ async def film_path(studio: Studio, request: Request, scene: StudioScene) -> Any
 
 async def film_file(studio: Studio, request: Request, scene: StudioScene) -> Any:
     name = f"inline; filename*=UTF-8''{quote(safe_name(scene.job.title))}.mp4"
-    return File(scene.film, **{"Content-Disposition": name})
+    return Data(scene.film, **{"Content-Disposition": name})
 
 
 async def edit(studio: Studio, request: Request, scene: StudioScene) -> Any:
@@ -145,33 +150,46 @@ async def whole(studio: Studio, request: Request, scene: StudioScene) -> Any:
 async def with_tools(request: Request, scene: StudioScene, site: Path, kind: str) -> Any:
     path = request.path_params["path"] or "index.html"
     file = file_inside(site, path)
-    if path == "index.html" and is_file(file):
-        page = await asyncio.to_thread(file.read_text, "utf-8")
-        edited = str(bool(edited_at(scene))).lower()
+    if path in ("index.css", "index.js"):
+        return File(asset_file(path))
+    if path != "index.html" or not is_file(file):
+        return Data(file)
+    try:
+        page = page_anew(await asyncio.to_thread(file.read_text, "utf-8"))
+    except ValueError:
+        raise UnknownScene("the page of the scene is damaged") from None
+    policy = content_policy(page, "'self'") + "; frame-ancestors 'self'"
+    if request.scope[LOOK] is not None:
         # A page that is not yet that of the scene cannot change it.
-        version = (scene.state().get("result") or {}).get("shown", ["-"])[0]
-        head = _TOOLS.format(page=kind, edited=edited, version=version)
-        text = page.replace("</head>", f"{head}</head>", 1)
-        return HTMLResponse(text, headers={"Content-Security-Policy": _SITE_POLICY})
-    return File(file, **{"Content-Security-Policy": _SITE_POLICY})
+        shown = scene.shown_version() or "-"
+        edited = str(bool(edited_at(scene))).lower()
+        head = _TOOLS.format(page=kind, edited=edited, version=escape(shown))
+        page = page.replace("</head>", f"{head}</head>", 1)
+    return HTMLResponse(page, headers={"Content-Security-Policy": policy})
 
 
 async def made(studio: Studio, request: Request, scene: StudioScene) -> Any:
     file = file_inside(scene.made, request.path_params["path"])
+    if request.scope[LOOK] is not None or file.suffix != ".html":
+        raise UnknownScene("there is no such file")
     return File(file, **{"Content-Security-Policy": _REPORT_POLICY})
 
 
 async def live(studio: Studio, request: Request, scene: StudioScene) -> Any:
-    page = scene.state().get("page")
-    if page is None:
-        raise UnknownScene("no training runs")
-    return await relay_file(page, quote(request.path_params["path"]))
+    file = FILES.get(request.path_params["path"] or INDEX)
+    if file is None:
+        raise UnknownScene("there is no such file")
+    return File(file, **{"Content-Security-Policy": POLICY})
 
 
 async def live_images(studio: Studio, socket: WebSocket) -> None:
     try:
-        page = studio.library.find(socket.path_params["name"]).state().get("page")
+        scene = studio.library.find(socket.path_params["name"])
+        # The folder of a stranger could name any page.
+        page = scene.state().get("page") if await asyncio.to_thread(job.is_running, scene) else None
     except UnknownScene:
+        page = None
+    if urlsplit(str(page)).hostname != LOCAL_HOST:
         page = None
     if page is None:
         await socket.accept()  # a refusal would be an error in the console

@@ -6,6 +6,7 @@ import asyncio
 import os
 from dataclasses import asdict
 from typing import Any
+from urllib.parse import quote
 
 from starlette.requests import Request
 
@@ -27,10 +28,14 @@ from snowsplat.studio.uploads import Upload, uploads, write_part
 from snowsplat.util.errors import UserError
 from snowsplat.util.run_lock import is_locked
 from snowsplat.util.safe_json import is_file
+from snowsplat.viewer.http.guard import LOOK
 
 
 async def details_of(studio: Studio, request: Request, scene: StudioScene) -> Any:
-    return await asyncio.to_thread(details, scene)
+    # Reports are pages that others may have written: their address reads only reports.
+    reports = f"scenes/{scene.name}/made/"
+    told = await asyncio.to_thread(details, scene)
+    return {**told, "made": f"../{request.scope[LOOK](reports)}/{quote(reports)}"}
 
 
 async def remove(studio: Studio, request: Request, scene: StudioScene) -> Any:

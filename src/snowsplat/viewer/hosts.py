@@ -18,10 +18,12 @@ from snowsplat.util.errors import SettingError
 LOCAL_HOST = "127.0.0.1"
 #: Hosts that stand for all addresses of this machine.
 ANY_HOST = ("", "0.0.0.0", "::")
-#: The answer to a request for the page without its token.
+#: The answer to a request without the token of this start; browsers show it as it is.
 NO_TOKEN = (
-    "This address is incomplete. Open the complete URL that snowsplat has printed in its terminal: "
-    "its path is a secret token.\n"
+    "This address is incomplete, or that of an earlier start: open the whole URL that snowsplat "
+    "has printed in its terminal; its path is a secret token.\n"
+    "此地址不完整，或属于之前的一次启动：请打开 snowsplat 在终端中显示的完整网址，"
+    "其路径是秘密令牌。\n"
 )
 
 _REPORTED = 8  # unknown names that are reported; strangers can send any number of them

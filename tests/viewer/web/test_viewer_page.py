@@ -10,8 +10,17 @@ import pytest
 
 from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.web import panel, viewer_page
-from snowsplat.viewer.web.viewer_page import asset, content_policy, page, settings, whole_page
+from snowsplat.viewer.web import viewer_page
+from snowsplat.viewer.web.viewer_page import (
+    asset,
+    content_policy,
+    page,
+    page_anew,
+    panel_script,
+    panel_style,
+    whole_page,
+)
+from snowsplat.viewer.web.viewer_settings import settings
 
 HOSTILE = "</script><script>alert(1)</script><!-- <script>"
 
@@ -42,6 +51,16 @@ def test_inserted_values_do_not_become_markup():
         assert html.unescape(title) == HOSTILE
 
 
+def test_a_page_anew_has_only_the_values():
+    text = page("scene", {"panel": {"title": HOSTILE}})
+    text = text.replace("</head>", "<meta name=referrer><script>evil()</script></head>")
+    made = page_anew(text)
+    assert made == page(HOSTILE, {"panel": {"title": HOSTILE}})
+    for damaged in ("", page("scene", {}), page("scene", {"panel": 1}), made.replace("panel", "{")):
+        with pytest.raises(ValueError, match=r".+"):
+            page_anew(damaged)
+
+
 def test_the_page_is_unchanged_except_for_inserted_values():
     theirs, ours = asset("index.html").splitlines(), page("scene", {}).splitlines()
     assert [line.strip() for line in theirs if line not in ours] == [
@@ -54,8 +73,8 @@ def test_the_page_is_unchanged_except_for_inserted_values():
         "createViewer({ container: document.body, settings, ...options });",
     ]
     text = page("scene", {})
-    assert panel.script() in text
-    assert panel.style() in text
+    assert panel_script() in text
+    assert panel_style() in text
 
 
 def test_the_policy_has_a_hash_of_each_script():

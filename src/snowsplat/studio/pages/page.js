@@ -48,9 +48,8 @@ export class Refused extends Error {
     }
 }
 
-/** Why a request failed, for people. `away` is the text if there was no answer. */
-export const reasonOf = (/** @type {unknown} */ error, away = "no_answer") =>
-    error instanceof Refused ? error.message : say(away);
+/** Why a request failed, for people. */
+export const reasonOf = (/** @type {unknown} */ error) => (error instanceof Refused ? error.message : say("offline"));
 
 /**
  * The JSON answer of the server.
@@ -63,6 +62,8 @@ export async function ask(path, method = "GET", body = undefined) {
     const raw = body === undefined || body instanceof Blob;
     const response = await fetch(path, { method, body: raw ? body : JSON.stringify(body) });
     const answer = await response.json().catch(() => ({}));
+    // A studio that was started again has another token, and answers this one without JSON.
+    if (response.status === 404 && !answer.error) throw new Error("this is no answer of the studio");
     if (!response.ok) throw new Refused(told(answer.error ?? `${response.status}`), response.status, answer);
     return answer;
 }

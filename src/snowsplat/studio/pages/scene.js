@@ -68,7 +68,7 @@ export class ScenePage {
         } catch (error) {
             if (this.closed.aborted) return;
             this.#away = true;
-            notice(reasonOf(error, "offline"));
+            notice(reasonOf(error));
             wait = 3000;
         }
         this.#timer = setTimeout(() => this.refresh(), wait);

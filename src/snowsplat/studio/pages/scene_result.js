@@ -19,7 +19,7 @@ export function resultPart(
     const reports = Object.entries(result.reports).map(([kind, path]) =>
         make(
             "a.button.plain",
-            { href: dressed(`${address}/made/${path}`), target: "_blank", rel: "noopener" },
+            { href: dressed(`${scene.made}${path}`), target: "_blank", rel: "noopener" },
             say(`report_${kind}`),
         ),
     );

@@ -59,11 +59,10 @@ const TEXTS = {
         "Drop the photos here, or the same ones again: what has arrived is kept.",
         "请把照片拖到这里；如果上传中断，请再次拖入同样的照片，已上传的部分会保留。",
     ],
-    no_answer: [
-        "The studio does not answer; try again, or start it anew with: snowsplat studio",
-        "工作室没有响应，请重试，或用此命令重新启动：snowsplat studio",
+    offline: [
+        "The studio does not answer; if it has ended or was started again, run: snowsplat studio, and use the page that it opens.",
+        "工作室没有响应；如果它已结束或已重新启动，请运行 snowsplat studio，并使用它打开的页面。",
     ],
-    offline: ["The studio does not answer; trying again …", "工作室没有响应，正在重试……"],
     looking: ["Looking at the photos …", "正在检查照片……"],
     photos: ["Photos", "照片"],
     videos: ["Videos", "视频"],

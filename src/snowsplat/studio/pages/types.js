@@ -17,6 +17,7 @@
  * @property {number} film its time; 0 if there is none
  * @property {number} map its time; 0 if there is none
  * @property {string} command a command line that does the same
+ * @property {string} made the address of its reports
  * @property {Record<string, string>} exports command lines by format
  */
 

@@ -4,7 +4,7 @@ Other users of this machine can connect to a server, and any web page can make a
 Therefore:
 
 - The Host and Origin headers of a request must be those of this server (`KnownHosts`), and its
-  path must begin with a secret token.
+  path must begin with a secret token; or with one that only reads a part (`Guard.look`).
 - The head of a request must be exactly as the protocol defines it. Only requests that carry data
   (POST, PUT) have a body, of a declared size.
 - The numbers of connections and of WebSockets are limited. A connection that is silent, sends a
@@ -18,6 +18,7 @@ Therefore:
 from __future__ import annotations
 
 import asyncio
+import base64
 import functools
 import hmac
 import logging
@@ -67,6 +68,8 @@ _ALWAYS = {
     "Referrer-Policy": "no-referrer",  # the URL contains the token
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+#: What a request has of its server: `Guard.look`; None if its own token only reads.
+LOOK = "snowsplat.look"
 _log = logging.getLogger(__name__)
 # uvicorn and websockets log each malformed request. This logger discards the messages.
 _discard = logging.getLogger(f"{__name__}.connections")
@@ -137,11 +140,13 @@ class Guard:
             return Response(status_code=HTTPStatus.FORBIDDEN)
         path: bytes = scope["raw_path"]
         given, slash, rest = path.removeprefix(b"/").partition(b"/")
-        if not path.startswith(b"/") or not hmac.compare_digest(given, self.token.encode()):
-            return _text(HTTPStatus.NOT_FOUND, "" if path.strip(b"/") else NO_TOKEN)
+        is_full = hmac.compare_digest(given, self.token.encode())
+        if not path.startswith(b"/") or not (is_full or self._may_look(given, scope)):
+            return _text(HTTPStatus.NOT_FOUND, NO_TOKEN)
         if not slash:  # relative addresses of the page need it
             return Response(
-                status_code=HTTPStatus.PERMANENT_REDIRECT, headers={"Location": f"{self.token}/"}
+                status_code=HTTPStatus.PERMANENT_REDIRECT,
+                headers={"Location": f"{given.decode()}/"},
             )
         if transport in self._unverified:
             del self._unverified[transport]
@@ -154,7 +159,19 @@ class Guard:
             self._websockets.add(transport)
         scope["raw_path"] = b"/" + rest
         scope["path"] = "/" + scope["path"].removeprefix("/").partition("/")[2]
+        scope[LOOK] = self.look if is_full else None
         return None
+
+    def look(self, path: str) -> str:
+        """A token that only reads what begins with the first three names of ``path``: "a/b/c/"."""
+        begin = "/".join(path.split("/")[:3]).encode("utf-8", "replace")
+        digest = hmac.digest(self.token.encode(), begin, "sha256")[:16]
+        return base64.urlsafe_b64encode(digest).decode().rstrip("=")
+
+    def _may_look(self, given: bytes, scope: Scope) -> bool:
+        path = scope["path"].removeprefix("/").partition("/")[2]
+        allowed = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
+        return allowed and hmac.compare_digest(given, self.look(path).encode())
 
     def connected(self, transport: asyncio.Transport) -> None:
         """Called when a connection is made."""

@@ -36,7 +36,7 @@ class WebServer:
 
     All paths begin with a secret token, which ``app`` does not see. Every response has the
     additional ``headers``, unless the app sets them. ``port``: see `listen`. ``allow_host``: names
-    of proxies; see `KnownHosts`. ``token``: the secret of an earlier server that is continued.
+    of proxies; see `KnownHosts`.
     Raises: UserError: the port is in use or not permitted, or the host is not an address of this
     machine; or an allowed name is none.
     """
@@ -48,12 +48,11 @@ class WebServer:
         port: int | None = 0,
         allow_host: Sequence[str] = (),
         headers: Mapping[str, str] | None = None,
-        token: str | None = None,
     ) -> None:
         hosts = KnownHosts(host, allow_host)
         self.host = host
         self._app = app
-        self.token = token or secrets.token_urlsafe(16)
+        self.token = secrets.token_urlsafe(16)
         self._guard = Guard(app, hosts, self.token, headers or {})
         self._socket = listen(host, port)
         self.port: int = self._socket.getsockname()[1]

@@ -9,7 +9,6 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,7 @@ from snowsplat.scene.camera_json import entries_of
 from snowsplat.scene.gaussians import Gaussians
 from snowsplat.trajectory.focus import focus_of, up_of, viewing_distance
 from snowsplat.util.errors import UserError
-from snowsplat.util.theme import THEME
-from snowsplat.viewer.http.served_file import ServedFile, served
+from snowsplat.viewer.http.served_file import FileOnDisk, Served, ServedFile, content_type
 from snowsplat.viewer.http.server import WebServer
 from snowsplat.viewer.http.static import static_app
 from snowsplat.viewer.live.browser import Browser
@@ -38,6 +36,7 @@ from snowsplat.viewer.live.messages import (
     View,
     to_json,
 )
+from snowsplat.viewer.live.page_files import FILES, INDEX, POLICY
 from snowsplat.viewer.live.photos import Photos, fitted_photo, jpeg
 from snowsplat.viewer.live.pictures import draw
 from snowsplat.viewer.live.session import RenderRequest, Session
@@ -47,13 +46,7 @@ _QUALITY = {"moving": 60, "still": 90, "idle": 90}  # of JPEG images
 _TICK = 0.02  # seconds between two checks for requested images
 _LONG_TICK = 0.5  # the same without browsers
 _POLL = 2.0  # seconds between two checks for a newer scene
-_PAGE = Path(__file__).parent / "page"
 _TITLE = "<title>snowsplat</title>"
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "connect-src 'self'; img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'self'"
-}
 
 _log = logging.getLogger(__name__)
 
@@ -131,7 +124,8 @@ class NetworkViewer:
             }
         )
         self._time_limit = ServerTimeLimit(lambda: self.session.training)
-        self.server = WebServer(self._app(label), host, port, allow_host, _HEADERS)
+        policy = {"Content-Security-Policy": POLICY}
+        self.server = WebServer(self._app(label), host, port, allow_host, policy)
         self.server.call(self._time_limit.measure)
         self.url, self.others = self.server.url, self.server.others
 
@@ -142,9 +136,11 @@ class NetworkViewer:
 
     def _app(self, label: str) -> ASGIApp:
         """What the server serves: the files of the page, and the connections of browsers."""
-        files = served(_PAGE, _PAGE.iterdir()) | served(THEME.parent, [THEME])
+        files: dict[str, Served] = {
+            name: FileOnDisk(file, content_type(file)) for name, file in FILES.items()
+        }
         title = f"<title>{html.escape(label)} - snowsplat</title>"
-        page = (_PAGE / "index.html").read_text("utf-8").replace(_TITLE, title, 1)
+        page = FILES[INDEX].read_text("utf-8").replace(_TITLE, title, 1)
         files[""] = ServedFile(page.encode(), "text/html; charset=utf-8")
         page_app = static_app(files)
 

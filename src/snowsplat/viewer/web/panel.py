@@ -2,7 +2,7 @@
 
 It names the scene, has the stops along the path of the photos, and makes links to the present view.
 Its script also fits what a view must show into the window, and frames the subject. Style sheet and
-scripts are `panel.css`, `texts.js`, `hiding.js` and `panel.js`.
+scripts are `panel.css`, `texts.js`, `hiding.js` and `panel.js`; `viewer_page.page` inserts them.
 """
 
 from __future__ import annotations
@@ -18,12 +18,8 @@ from torch import Tensor
 
 from snowsplat.scene.geometry import rotation_from_quat
 from snowsplat.scene.initial_view import InitialView
-from snowsplat.util.theme import with_colours
 from snowsplat.viewer.web.hiding import Hiding
 from snowsplat.viewer.web.stops import Stops
-
-_FOLDER = Path(__file__).parent
-_SCRIPTS = ("texts.js", "hiding.js", "panel.js")
 
 
 @dataclass(frozen=True)
@@ -106,13 +102,3 @@ def panel_settings(
         "metres": metres,
         "chosen": chosen,
     }
-
-
-def script() -> str:
-    """The script of the panel, which also creates the viewer."""
-    return "".join((_FOLDER / name).read_text("utf-8") for name in _SCRIPTS)
-
-
-def style() -> str:
-    """The style sheet of the panel."""
-    return with_colours((_FOLDER / "panel.css").read_text(encoding="utf-8"))

@@ -1,8 +1,8 @@
 """The page for finished scenes: the SuperSplat viewer of PlayCanvas, bundled with the package.
 
-The page is third-party (third_party/README.md names the version). Settings, the title and the
-initial view are inserted at the places that it provides, and the panel (panel.py) at the place
-where the page creates the viewer.
+The page is third-party (third_party/README.md names the version). Settings (viewer_settings.py),
+the title and the initial view are inserted at the places that it provides, and the panel (panel.py)
+at the place where the page creates the viewer. The studio serves it, so this needs no torch.
 """
 
 from __future__ import annotations
@@ -12,18 +12,17 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from snowsplat.scene.initial_view import InitialView
 from snowsplat.util.errors import UserError
-from snowsplat.viewer.web import panel
-from snowsplat.viewer.web.panel import view_numbers
+from snowsplat.util.safe_json import parse_json
+from snowsplat.util.theme import with_colours
 
 _FOLDER = Path(__file__).parents[2] / "_viewer"  # of the package
-#: Duration of the animation of the page.
-FILM_SECONDS = 20.0
+_PANEL = Path(__file__).parent
+_SCRIPTS = ("texts.js", "hiding.js", "panel.js")
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
 _CREATE = "createViewer({ container: document.body, settings, ...options });"
@@ -31,7 +30,15 @@ _CREATE = "createViewer({ container: document.body, settings, ...options });"
 _PLACED = "entity.setLocalEulerAngles(0, 0, 180);"
 # Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
 _HANDLER = re.compile(r' on[a-z]+=\\"([^"\\]*)\\"')
+_BOOTSTRAP = '(<script type="application/json" id="sse-bootstrap">){}(</script>)'
+_SLOT = re.compile(_BOOTSTRAP.format(r"\s*null\s*"))
+_GIVEN = re.compile(_BOOTSTRAP.format("(.*?)"), re.DOTALL)
 _INLINE_SCRIPT = re.compile(r'<script(?: type="module")?>(.*?)</script>', re.DOTALL)
+
+
+def asset_file(name: str) -> Path:
+    """The path of a file of the viewer; see `asset`."""
+    return _FOLDER / name
 
 
 def asset(name: str) -> str:
@@ -60,73 +67,14 @@ def script(scale: float = 1.0) -> str:
     return _replaced(text, _PLACED, f"{_PLACED} {larger}")
 
 
-class Annotation(NamedTuple):
-    """A text at a place: the target of the view that shows it."""
-
-    title: str
-    text: str
-    view: InitialView
+def panel_script() -> str:
+    """The script of the panel, which also creates the viewer."""
+    return "".join((_PANEL / name).read_text("utf-8") for name in _SCRIPTS)
 
 
-def settings(
-    start: InitialView,
-    background: Sequence[float],
-    film: Sequence[InitialView] = (),
-    notes: Sequence[Annotation] = (),
-) -> dict[str, Any]:
-    """The viewer's settings: its initial view, and a background colour in 0..1.
-
-    ``film``: views at equal distances in time, `FILM_SECONDS` in total: the animation of the page.
-    If there are none, the viewer uses an animation of its own.
-    """
-    off = {"enabled": False}
-    first = view_numbers(start, start.aspect)
-    return {
-        "version": 2,
-        "tonemapping": "none",  # colours are displayed as they were trained
-        "highPrecisionRendering": False,
-        "background": {"color": list(background)},
-        "postEffectSettings": {
-            "sharpness": {**off, "amount": 0},
-            "bloom": {**off, "intensity": 0.1, "blurLevel": 2},
-            "grading": {**off, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
-            "vignette": {**off, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
-            "fringing": {**off, "intensity": 0.5},
-        },
-        "animTracks": [_track(film, start.aspect)] if film else [],
-        "cameras": [{"initial": {"position": first[:3], "target": first[3:6], "fov": first[6]}}],
-        "annotations": [_annotation(note, start.aspect) for note in notes],
-        "startMode": "animTrack" if film else "default",
-    }
-
-
-def _annotation(note: Annotation, aspect: float) -> dict[str, Any]:
-    numbers = view_numbers(note.view, aspect)
-    position, target, fov = numbers[:3], numbers[3:6], numbers[6]
-    initial = {"position": position, "target": target, "fov": fov}
-    texts = {"title": note.title, "text": note.text}
-    return {"position": target, **texts, "extras": {}, "camera": {"initial": initial}}
-
-
-def _track(film: Sequence[InitialView], aspect: float) -> dict[str, Any]:
-    times = [i * FILM_SECONDS / (len(film) - 1) for i in range(len(film))]
-    keys = [view_numbers(view, aspect) for view in film]
-    return {
-        "name": "film",
-        "duration": FILM_SECONDS,
-        "frameRate": 1,  # times are in seconds
-        "loopMode": "pingpong",
-        "interpolation": "spline",
-        "smoothness": 1,
-        "keyframes": {
-            "times": times,
-            "values": {
-                "position": [x for key in keys for x in key[:3]],
-                "target": [x for key in keys for x in key[3:6]],
-                "fov": [key[6] for key in keys],
-            },
-        },
-    }
+def panel_style() -> str:
+    """The style sheet of the panel."""
+    return with_colours((_PANEL / "panel.css").read_text(encoding="utf-8"))
 
 
 def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "") -> str:
@@ -143,17 +91,16 @@ def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "
     # An empty icon; otherwise browsers would request one.
     icon = '<link rel="icon" href="data:," />'
     text = _replaced(text, '<base href="" />', f"{icon}\n        {head}" if head else icon)
-    style = f"<style>\n{panel.style()}</style>"
+    style = f"<style>\n{panel_style()}</style>"
     text = _replaced(text, _STYLESHEET, f"{_STYLESHEET}\n        {style}")
     if body:
         text = _replaced(text, "    </body>", f"{body}\n    </body>")
-    text = _replaced(text, _CREATE, f"{{\n{panel.script()}}}")  # a block: its names are its own
+    text = _replaced(text, _CREATE, f"{{\n{panel_script()}}}")  # a block: its names are its own
     # The viewer does not read the mark of an antialiased scene file.
     text = _replaced(text, "aa: url.searchParams.has('aa')", "aa: bootstrap.antialiased")
     # No animation until the user presses Play.
     text = _replaced(text, "noanim: url.searchParams.has('noanim')", "noanim: true")
-    slot = re.compile(r'(<script type="application/json" id="sse-bootstrap">)\s*null\s*(</script>)')
-    parts = slot.split(text)
+    parts = _SLOT.split(text)
     assert len(parts) == 4, "the viewer's page has no bootstrap"
     return parts[0] + parts[1] + _json_in_script(bootstrap) + parts[2] + parts[3]
 
@@ -177,6 +124,19 @@ def whole_page(title: str, bootstrap: Mapping[str, Any], body: str) -> str:
         <!-- The licence of the viewer, which must be part of every copy:
 {asset("LICENSE")}-->"""
     return _replaced(text, '<meta charset="UTF-8" />', head)
+
+
+def page_anew(text: str) -> str:
+    """The page, of which only the bootstrap is that of ``text``, which a stranger may have written.
+
+    Raises: ValueError: it has none.
+    """
+    given = _GIVEN.search(text)
+    try:
+        bootstrap = parse_json(given[2].encode()) if given else {}
+        return page(str(bootstrap["panel"]["title"]), bootstrap)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"the page of a scene has no {error}") from None
 
 
 def content_policy(page: str, sources: str) -> str:
