@@ -99,8 +99,7 @@ def only_studio(folder: Path, wait: float = _SECONDS) -> Iterator[None]:
                 stack.enter_context(locked(folder / _LOCK, str(folder), seconds))
                 break
             except InUse:
-                # Only now: another program may have the port of a studio that was killed, and it
-                # must not get the secret in the address.
+                # Only now: another program may have the port of a studio that was killed.
                 _check_running(folder)
                 if seconds == wait:
                     raise
