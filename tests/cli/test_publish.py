@@ -1,8 +1,10 @@
 """`snowsplat publish`: the files of the web site, the page in a browser, and its errors."""
 
+import contextlib
 import functools
 import http.server
 import re
+import shutil
 import threading
 from html import unescape
 
@@ -66,19 +68,48 @@ def test_page(site):
 
 
 @pytest.mark.browser
-def test_a_static_server_is_enough(site):
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
+@pytest.mark.parametrize(
+    ("missing", "told"),
+    [
+        ("", "Browsers do not load this page from disk"),  # opened by a double click
+        ("index.js", "A file of this page cannot be loaded"),  # an incomplete upload
+        ("scene.sog", "A file of this page cannot be loaded"),
+    ],
+)
+def test_a_site_that_cannot_be_loaded_says_what_to_do(site, tmp_path, missing, told):
+    folder = shutil.copytree(site, tmp_path / "site")
+    with contextlib.ExitStack() as stack:
+        url = (folder / "index.html").as_uri()
+        if missing:
+            (folder / missing).unlink()
+            url = stack.enter_context(_served(folder))
+        page = stack.enter_context(Browser(480, 360)).open(f"{url}?webgl")
+        lines = page.wait_for("document.querySelector('.snow-failure')?.innerText").splitlines()
+        assert lines[0].startswith(told)
+        assert "请" in lines[1]
+        # Dark text plate on the page: neither white nor hidden.
+        assert len(np.unique(page.screenshot().reshape(-1, 3), axis=0)) > 20
+
+
+@contextlib.contextmanager
+def _served(folder):
+    """The address of a folder on a web server that only sends files."""
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
     handler.log_message = lambda *_: None  # type: ignore[attr-defined]
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        own = f"http://127.0.0.1:{server.server_address[1]}/"
-        with Browser(480, 360) as browser:
-            page = browser.open(f"{own}?webgl")
-            page.wait_for("!!window.app", 60)
-            about = page.evaluate("document.querySelector('.snow-card').innerText")
-            assert not page.errors
-            assert all(url.startswith((own, f"blob:{own[:-1]}")) for url in page.requests)
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
         server.shutdown()
+
+
+@pytest.mark.browser
+def test_a_static_server_is_enough(site):
+    with _served(site) as own, Browser(480, 360) as browser:
+        page = browser.open(f"{own}?webgl")
+        page.wait_for("!!window.app", 60)
+        about = page.evaluate("document.querySelector('.snow-card').innerText")
+        assert not page.errors
+        assert all(url.startswith((own, f"blob:{own[:-1]}")) for url in page.requests)
     assert about.startswith("A <box>")
     assert "1,500 Gaussians" in about
 

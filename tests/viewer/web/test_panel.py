@@ -24,6 +24,7 @@ from ...browser import Browser, Page
 
 ENTITY = "window.sse.viewer.app.root.findByName('camera')"
 POSE = f"(e => [e.getPosition(), e.forward].flatMap(v => [v.x, v.y, v.z]))({ENTITY})"
+FAILURE = "document.querySelector('.snow-failure')?.textContent"
 MODE = "window.sse.viewer.state.cameraMode"
 
 
@@ -220,15 +221,36 @@ def test_the_texts_are_chinese_in_a_browser_in_chinese(file):
 
 
 @pytest.mark.browser
-def test_a_browser_without_webgl_is_told_so(file):
+@pytest.mark.parametrize("asked", ["", "?webgl"])
+def test_a_browser_without_webgl_is_told_so(file, asked):
     with Browser(600, 400, 0.25, frames=5.0) as browser:
         page = browser.open("about:blank")
         none = "HTMLCanvasElement.prototype.getContext = () => null"
         page.call("Page.addScriptToEvaluateOnNewDocument", source=none)
-        page.navigate(f"{file.as_uri()}?webgl")
-        told = page.wait_for("document.querySelector('.sse-loadingText')?.textContent")
+        page.navigate(f"{file.as_uri()}{asked}")
+        told = page.wait_for(FAILURE)
         assert told.startswith("This browser has no WebGL 2")
+        assert "请使用其他浏览器" in told
         assert any("WebGL not supported" in error for error in page.errors)
+
+
+@pytest.mark.browser
+def test_a_browser_without_modules_is_told_so(file):
+    with Browser(600, 400, 0.25, frames=5.0) as browser:
+        page = browser.open("about:blank")
+        old = "delete HTMLScriptElement.prototype.noModule"
+        page.call("Page.addScriptToEvaluateOnNewDocument", source=old)
+        page.navigate(file.as_uri())
+        assert page.wait_for(FAILURE).startswith("This browser is too old")
+
+
+@pytest.mark.browser
+def test_a_failure_of_the_loaded_page_is_not_shown(file):
+    with opened(file, 600, 400) as page:
+        page.wait_for("window.sse.viewer?.state.loaded", 60)
+        failure = "{promise: Promise.resolve(), reason: 'no full screen'}"
+        page.evaluate(f"dispatchEvent(new PromiseRejectionEvent('unhandledrejection', {failure}))")
+        assert not page.evaluate("!!document.querySelector('.snow-failure')")
 
 
 @pytest.mark.browser

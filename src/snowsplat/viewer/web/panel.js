@@ -71,17 +71,6 @@ const linkedHiding = () => {
     return numbers?.length === 2 && numbers.every(x => x >= 0 && x <= 100) ? numbers : undefined;
 };
 
-// The viewer itself would show its empty loading bar forever.
-const explainFailure = error => {
-    const canDraw = document.createElement("canvas").getContext("webgl2");
-    document.querySelector(".sse-loadingText").textContent = canDraw
-        ? error.message
-        : say(
-              "This browser has no WebGL 2, so it cannot draw the scene. Use another browser, or switch on hardware acceleration.",
-          );
-    throw error;
-};
-
 settings.cameras[0].initial = addView(linkedView() ?? start);
 createViewer({ container: document.body, settings, ...options }).then(viewer => {
     window.sse.viewer = viewer;
@@ -90,6 +79,8 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
     const { canvas } = app.graphicsDevice;
     const [subject, radius] = [scene.subject.slice(0, 3), scene.subject[3]];
     const hiding = hidingSliders(app, subject, scene.hiding);
+    // The viewer only logs that the scene cannot be loaded; an unhandled rejection is shown by failure.js.
+    app.assets.on("error", error => Promise.reject(error));
 
     // The viewer sets the field of view before each frame, once the scene is loaded.
     let fov = start[6];
@@ -247,6 +238,7 @@ createViewer({ container: document.body, settings, ...options }).then(viewer => 
         panel.classList.toggle("snow-faded", hidden && strip.hidden && hiding.element.hidden),
     );
     document.querySelector(".sse-viewer").append(panel);
+    events.on("loaded:changed", () => document.querySelector(".snow-failure")?.remove());
     // The studio adds its tools.
     window.sse.tools?.({ viewer, scene, camera, canvas, hiding, panel, presentView, flyTo });
-}, explainFailure);
+});

@@ -2,7 +2,8 @@
 
 It names the scene, has the stops along the path of the photos, and makes links to the present view.
 Its script also fits what a view must show into the window, and frames the subject. Style sheet and
-scripts are `panel.css`, `texts.js`, `hiding.js` and `panel.js`; `viewer_page.page` inserts them.
+scripts are `panel.css`, `texts.js`, `hiding.js` and `panel.js`; `viewer_page.page` inserts them,
+and `failure.js`, the script for a page that shows no scene.
 """
 
 from __future__ import annotations

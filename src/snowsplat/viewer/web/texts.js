@@ -7,8 +7,6 @@ const CHINESE = {
     "A link to the present view": "当前视角的链接",
     Copied: "已复制",
     "It is in the address bar": "链接在地址栏中",
-    "This browser has no WebGL 2, so it cannot draw the scene. Use another browser, or switch on hardware acceleration.":
-        "此浏览器没有 WebGL 2，无法显示场景。请使用其他浏览器，或打开硬件加速。",
     Photos: "照片",
     Photo: "照片",
     Scene: "场景",

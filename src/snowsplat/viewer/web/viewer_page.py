@@ -26,6 +26,10 @@ _SCRIPTS = ("texts.js", "hiding.js", "panel.js")
 _STYLESHEET = '<link rel="stylesheet" href="./index.css" />'
 _IMPORT = "import { createViewer } from './index.js';"
 _CREATE = "createViewer({ container: document.body, settings, ...options });"
+_NO_SCRIPTS = (
+    '<noscript><p class="snow-failure">This page needs JavaScript.\n'
+    "此网页需要 JavaScript。</p></noscript>"
+)
 # Where the viewer places the scene that it has loaded.
 _PLACED = "entity.setLocalEulerAngles(0, 0, 180);"
 # Event handlers in the HTML that the script creates: event.stopPropagation() of two buttons.
@@ -72,6 +76,11 @@ def panel_script() -> str:
     return "".join((_PANEL / name).read_text("utf-8") for name in _SCRIPTS)
 
 
+def failure_script() -> str:
+    """The script that says on the page why it shows no scene."""
+    return (_PANEL / "failure.js").read_text("utf-8")
+
+
 def panel_style() -> str:
     """The style sheet of the panel."""
     return with_colours((_PANEL / "panel.css").read_text(encoding="utf-8"))
@@ -91,8 +100,9 @@ def page(title: str, bootstrap: Mapping[str, Any], head: str = "", body: str = "
     # An empty icon; otherwise browsers would request one.
     icon = '<link rel="icon" href="data:," />'
     text = _replaced(text, '<base href="" />', f"{icon}\n        {head}" if head else icon)
-    style = f"<style>\n{panel_style()}</style>"
-    text = _replaced(text, _STYLESHEET, f"{_STYLESHEET}\n        {style}")
+    first = f"<style>\n{panel_style()}</style>\n        <script>\n{failure_script()}</script>"
+    text = _replaced(text, _STYLESHEET, f"{_STYLESHEET}\n        {first}")
+    text = _replaced(text, "    <body>", f"    <body>\n        {_NO_SCRIPTS}")
     if body:
         text = _replaced(text, "    </body>", f"{body}\n    </body>")
     text = _replaced(text, _CREATE, f"{{\n{panel_script()}}}")  # a block: its names are its own
