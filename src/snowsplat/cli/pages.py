@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -66,12 +67,13 @@ def show(
     if browser and has_screen():
         import webbrowser
 
-        # In the background: some browsers block the program that opens them.
-        place = (opener or opener_of(url)).as_uri()
-        opening = threading.Thread(target=webbrowser.open, args=(place,), daemon=True)
-        opening.start()
-        if opener:  # this process ends at once
-            opening.join(_OPENING_SECONDS)
+        with suppress(OSError):  # a full disk: the address is printed
+            place = (opener or opener_of(url)).as_uri()
+            # In the background: some browsers block the program that opens them.
+            opening = threading.Thread(target=webbrowser.open, args=(place,), daemon=True)
+            opening.start()
+            if opener:  # this process ends at once
+                opening.join(_OPENING_SECONDS)
 
 
 @cache
@@ -83,7 +85,7 @@ def opener_of(url: str) -> Path:
     Raises: OSError: it cannot be written.
     """
     # Browsers in packages of snap read no other folders of temporary files than their own.
-    visible = Path.home() if Path("/snap").is_dir() else None
+    visible = os.path.expanduser("~") if Path("/snap").is_dir() else None
     folder = Path(tempfile.mkdtemp(prefix="snowsplat-", dir=visible))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     file, link = folder / "open.html", html.escape(url)
