@@ -384,11 +384,31 @@ def test_the_arguments_are_those_of_gsplat() -> None:
         "absgrad": False,
         "rasterize_mode": "classic",
         "channel_chunk": 32,
+        "distributed": False,
+        "camera_model": "pinhole",
         "segmented": False,
         "covars": None,
+        "with_ut": False,
+        "with_eval3d": False,
+        "return_normals": False,
+        "global_z_order": True,
+        "rays": None,
+        "radial_coeffs": None,
+        "tangential_coeffs": None,
+        "thin_prism_coeffs": None,
+        "ftheta_coeffs": None,
+        "lidar_coeffs": None,
+        "external_distortion_coeffs": None,
+        "rolling_shutter": None,  # RollingShutterType.GLOBAL
+        "viewmats_rs": None,
+        "ut_params": None,
+        "extra_signals": None,
+        "extra_signals_sh_degree": None,
+        "renderer_config": None,
     }
     parameters = inspect.signature(snowsplat.rasterization).parameters
-    found = {n: p.default for n, p in parameters.items() if p.kind is not p.VAR_KEYWORD}
+    assert {p.kind for p in parameters.values()} == {inspect.Parameter.POSITIONAL_OR_KEYWORD}
+    found = {name: parameter.default for name, parameter in parameters.items()}
     assert list(found.items()) == list(wanted.items())
 
 
@@ -398,9 +418,8 @@ def test_the_arguments_are_those_of_gsplat() -> None:
         {"camera_model": "fisheye"},
         {"camera_model": "ortho"},
         {"distributed": True},
-        {"sparse_grad": True},
-        {"absgrad": True, "render_mode": "RGB+D", "colors": torch.zeros(40, 4)},
-        {"extra_signals": torch.zeros(40, 2)},
+        {"sparse_grad": True, **{n: t[None] for n, t in vars(inputs()).items()}},
+        {"extra_signals_sh_degree": 4},
         {"with_ut": True},
         {"with_eval3d": True},
         {"radial_coeffs": torch.zeros(2, 6)},
@@ -412,7 +431,7 @@ def test_the_arguments_are_those_of_gsplat() -> None:
     ids=str,
 )
 def test_what_is_not_supported_is_refused_by_name(options: dict[str, Any]) -> None:
-    given = {**vars(inputs()), "backgrounds": None, "width": WIDTH, "height": HEIGHT}
+    given = {**vars(inputs()), "width": WIDTH, "height": HEIGHT}
     with pytest.raises(UserError, match=r"^rasterization: ") as caught:
         rasterization(**{**given, **options})
     assert one_line(caught.value)
@@ -431,8 +450,6 @@ def test_the_defaults_of_other_arguments_are_accepted() -> None:
     others["renderer_config"] = RendererConfig_MixedBatch()
     speed = {"tile_size": 8, "channel_chunk": 1, "packed": False, "segmented": True}
     assert torch.equal(given.rendered(**others, **speed)[0], given.rendered()[0])
-    with pytest.raises(TypeError, match="no argument chanel_chunk"):
-        given.rendered(chanel_chunk=3)
 
 
 @pytest.mark.isa
@@ -476,6 +493,92 @@ def test_absolute_gradients(packed: bool) -> None:
         assert not found[meta["depths"] == 0].any()
         found = found[meta["depths"] != 0]
     assert_close(found, torch.cat([splats.abs_grad for splats in wanted[2]]), 1e-5)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_absolute_gradients_of_many_channels(packed: bool) -> None:
+    """The sum over groups of four channels."""
+    sums = []
+    for columns in (slice(0, 6), slice(0, 4), slice(4, 6)):
+        given = inputs("6").requiring_grad()
+        colors, _, meta = given.rendered(packed=packed, absgrad=True)
+        colors[..., columns].square().sum().backward()
+        sums.append(meta["means2d"].absgrad)
+    assert sums[2].any()
+    assert_close(sums[0], sums[1] + sums[2], 1e-6)
+
+
+@pytest.mark.parametrize("with_covars", [False, True])
+def test_sparse_gradients(with_covars: bool) -> None:
+    """Of means, quats and scales, for the rows of the visible Gaussians."""
+    given, dense = inputs().requiring_grad(), inputs().requiring_grad()
+    covars = 0.04 * torch.eye(3, dtype=torch.float64).expand(40, 3, 3) if with_covars else None
+    colors, alphas, meta = given.rendered(sparse_grad=True, covars=covars)
+    backward(colors, alphas)
+    backward(*dense.rendered(covars=covars)[:2])
+    grads = given.grads()
+    assert grads.keys() == dense.grads().keys()
+    for name, grad in grads.items():
+        assert grad.is_sparse == (name in ("means", "quats", "scales"))
+        if grad.is_sparse:
+            assert torch.equal(grad.coalesce().indices()[0], meta["gaussian_ids"].unique())
+            grad = grad.to_dense()
+        assert_close(grad, dense.grads()[name], 1e-9, name)
+    dense = inputs().requiring_grad()
+    backward(*dense.rendered(sparse_grad=True, packed=False)[:2])
+    assert not any(grad.is_sparse for grad in dense.grads().values())
+
+
+@pytest.mark.parametrize("kind", ["RGB", "RGB per camera", "SH", "SH per camera"])
+@pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "ED"])
+@pytest.mark.parametrize("signals", ["features", "features per camera", "harmonics"])
+def test_extra_signals(signals: str, mode: str, kind: str) -> None:
+    """The same images as those of calls of their own, and the gradients of both."""
+    degree = 2 if "SH" in kind else None
+    shape = {"features": (40, 2), "features per camera": (2, 40, 2), "harmonics": (40, 4, 3)}
+    extra = (0.5 + 0.1 * normal(generator(5), *shape[signals])).requires_grad_()
+    of_extra = 1 if signals == "harmonics" else None
+    given, apart = inputs(kind).requiring_grad(), inputs(kind).requiring_grad()
+    colors, alphas, meta = given.rendered(
+        render_mode=mode, sh_degree=degree, extra_signals=extra, extra_signals_sh_degree=of_extra
+    )
+    wanted = apart.rendered(render_mode=mode, sh_degree=degree)
+    assert_close(colors, wanted[0], 1e-9)
+    assert_close(alphas, wanted[1], 1e-9)
+    once = {**vars(apart), "colors": extra, "backgrounds": None}
+    signal = rasterization(**once, width=WIDTH, height=HEIGHT, sh_degree=of_extra)[0]
+    assert_close(meta["render_extra_signals"], signal, 1e-9)
+    (colors.square().sum() + meta["render_extra_signals"].square().sum()).backward()
+    found, extra.grad = extra.grad, None
+    (wanted[0].square().sum() + signal.square().sum()).backward()
+    assert_close(found, extra.grad, 1e-9)
+    grads = given.grads()
+    assert grads.keys() == apart.grads().keys()
+    for name, grad in grads.items():
+        assert_close(grad, apart.grads()[name], 1e-9, name)
+
+
+def test_extra_signals_of_batches_and_of_wrong_shapes() -> None:
+    given = inputs("SH")
+    options: dict[str, Any] = {"sh_degree": 1, "extra_signals_sh_degree": 1}
+    options["extra_signals"] = torch.full((40, 4, 1), -3.0, dtype=torch.float64)
+    batch = Inputs(
+        **{n: t if n == "colors" else torch.stack([t, t]) for n, t in vars(given).items()}
+    )
+    found = batch.rendered(**options)
+    wanted = given.rendered(**options)
+    assert_close(found[0][1], wanted[0], 1e-9)
+    signals = [meta["render_extra_signals"] for _, _, meta in (found, wanted)]
+    assert signals[0].min() < 0
+    assert_close(signals[0][1], signals[1], 1e-9)
+    for wrong, degree in (
+        (torch.zeros(39, 2), None),
+        (torch.zeros(3, 40, 2), None),
+        (torch.zeros(40, 4), 1),
+        (torch.zeros(40, 1, 3), 1),
+    ):
+        with pytest.raises(ValueError, match="extra_signals must be|needs 4, got 1"):
+            inputs().rendered(extra_signals=wrong.double(), extra_signals_sh_degree=degree)
 
 
 @pytest.mark.isa

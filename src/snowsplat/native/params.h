@@ -136,15 +136,15 @@ struct AdamStepParams {
 
 template <class T>
 struct AddNoiseParams {
-  int64_t n;                // Gaussians
-  T* means;                 // in and out, (n, 3)
-  const T* log_scales;      // (n, 3)
-  const T* quats;           // (n, 4)
-  const T* opacity_logits;  // (n,)
-  double amount;            // of the noise
+  int64_t n;                  // Gaussians
+  T* means;                   // in and out, (n, 3)
+  const T* log_scales;        // (n, 3)
+  const T* quats;             // (n, 4)
+  const T* opacity_logits;    // (n,)
+  double amount;              // of the noise
   double sharpness, opacity;  // k and t of σ(k (t − o))
-  double negligible;        // rows with a smaller value of this sigmoid have no noise
-  int64_t seed, first;      // row i has the random numbers number first + i of this seed
+  double negligible;          // rows with a smaller value of this sigmoid have no noise
+  int64_t seed, first;        // row i has the random numbers number first + i of this seed
   SNOW_FIELDS(n, means, log_scales, quats, opacity_logits, amount, sharpness, opacity, negligible,
               seed, first)
 };

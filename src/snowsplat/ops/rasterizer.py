@@ -38,7 +38,7 @@ def rasterize(
     Splats with α < 1/255 are skipped. A pixel is finished when the next splat would make T < 1e-4
     (Kerbl et al. 2023, section 6). Gradients flow to `background` and to every column of
     `splats.packed` except the radii. If `splats.abs_grad` is not None, the backward pass adds to it
-    (see `Splats2D`); the image may then have at most four channels, including the depth.
+    (see `Splats2D`), for each group of four channels, of which the depth is the last, separately.
 
     With `additive`, splats are added instead, in any order, as for the fitting of images by Zhang
     et al. 2024 (GaussianImage, arXiv:2403.08551): image = background + Σ w c, alpha = 0, depth =
@@ -58,9 +58,6 @@ def rasterize(
     check_tensor("rasterize", "background", background, (channels,), packed)
     if abs_grad is not None:
         check_tensor("rasterize", "abs_grad", abs_grad, (len(packed), 2), packed)
-        if channels + with_depth > GROUP_CHANNELS:
-            # Several passes would each add the absolute values of a part of the gradient.
-            raise ValueError(f"rasterize: abs_grad requires at most {GROUP_CHANNELS} channels")
     planes, alpha = _Rasterize.apply(
         packed, background, width, height, channels, with_depth, additive, capacity, abs_grad
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 from snowsplat.ops.activated import project_activated, with_centres
 from snowsplat.ops.check import check_size
 from snowsplat.ops.rasterizer import rasterize
-from snowsplat.ops.reference import JACOBIAN_MARGIN
+from snowsplat.ops.reference import JACOBIAN_MARGIN, sh_basis
 from snowsplat.ops.splats import Splats2D, radii_of_conics
 from snowsplat.ops.view import View
 from snowsplat.scene.geometry import rotation_from_quat
@@ -23,12 +23,9 @@ from snowsplat.util.native_layout import TILE
 #: eps2d of each `rasterize_mode` for which there are kernels. For others, and for covariances,
 #: PyTorch computes the shapes of the splats.
 _EPS2D = {"classic": 0.3, "antialiased": 0.1}
-#: The most channels, with the depth, for which the kernels sum absolute gradients.
-_ABSGRAD_CHANNELS = 4
 _RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 #: The value of each argument of gsplat that has only one here, and what to do.
 _FIXED: dict[str, tuple[Any, str]] = {
-    "sparse_grad": (False, "gradients are dense; leave it out"),
     "distributed": (False, "train in several processes with `snowsplat train --processes`"),
     "camera_model": ("pinhole", "undistort the photos, and use pinhole cameras"),
     "with_ut": (False, "leave it out, and use pinhole cameras"),
@@ -45,8 +42,6 @@ _FIXED: dict[str, tuple[Any, str]] = {
     "lidar_coeffs": (None, "use pinhole cameras"),
     "external_distortion_coeffs": (None, "undistort the photos, and use pinhole cameras"),
     "ut_params": (None, "leave it out, and use pinhole cameras"),
-    "extra_signals": (None, "render them as colors, by a call of their own"),
-    "extra_signals_sh_degree": (None, "render them as colors, by a call of their own"),
     "renderer_config": (None, "leave it out"),
 }
 #: Names of those defaults of gsplat that are objects.
@@ -91,10 +86,27 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     channel_chunk: int = 32,
-    *,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
-    **others: Any,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: object = None,
+    lidar_coeffs: object = None,
+    external_distortion_coeffs: object = None,
+    rolling_shutter: object = None,
+    viewmats_rs: Tensor | None = None,
+    ut_params: object = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: object = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians from C cameras: the arguments and results of `gsplat.rasterization`.
 
@@ -124,12 +136,17 @@ def rasterization(
         backgrounds: (…, C, D); None is black. Depths have the background 0.
         render_mode: "RGB", "D" (depth Σ T α z), "ED" (expected depth: D / alpha), "RGB+D" or
             "RGB+ED". "RGB" are the colours or features.
+        sparse_grad: the gradients of means, quats and scales are sparse (COO), with the rows of the
+            visible Gaussians. Only for packed, and without batch dimensions.
         absgrad: the backward pass fills ``meta["means2d"].absgrad``, the sums of absolute gradients
             of the centres over the tiles of 16×16 pixels. gsplat sums over pixels, which is more.
-            At most four channels, with the depth.
+            Of more than four channels, with the depth, it is the sum over groups of four.
         rasterize_mode: "classic"; or "antialiased", which is the 2D mip filter.
         covars: (…, N, 3, 3), used instead of quats and scales.
-        others: the other arguments of gsplat; only their defaults are possible.
+        extra_signals: features (…, N, E) or (…, C, N, E), or (N, K, E) coefficients of spherical
+            harmonics of the degree `extra_signals_sh_degree`, which are not clamped.
+        distributed, camera_model, …: the other arguments of gsplat; only their defaults are
+            possible.
 
     Returns:
         render_colors (…, C, height, width, X), where X is D, 1 or D + 1. For "RGB", the storage is
@@ -144,26 +161,41 @@ def rasterization(
         (…, C, N, 2) and so on, with zeros for the others, and the ids are None. "means2d" is
         between the Gaussians and the image, so that ``meta["means2d"].retain_grad()`` keeps its
         gradient for a density control. Also "width", "height", "tile_size", "tile_width",
-        "tile_height", "n_batches" and "n_cameras", but not the lists of intersections.
+        "tile_height", "n_batches" and "n_cameras", but not the lists of intersections; and
+        "render_extra_signals" (…, C, height, width, E), if there are any, on the background 0.
 
-    Gradients flow to means, quats, scales, covars, opacities, colors, viewmats and backgrounds.
+    Gradients flow to means, quats, scales, covars, opacities, colors, extra_signals, viewmats and
+    backgrounds.
 
-    Differences from gsplat: α is at most 0.99, not 0.999. The position of a camera, for the viewing
-    directions, is −Rᵀ t instead of that of the inverse matrix, so the gradients of viewmats agree
-    for rigid motions, not for other changes of the matrix. A Gaussian is drawn wherever α ≥ 1/255;
-    gsplat draws it in the tiles of a box whose half widths are rounded up to pixels, which is at
-    least as large.
+    Difference from the images of gsplat 1.6: the filter of "antialiased" multiplies opacities by a
+    factor that may be as small as it is; in gsplat, it is at least 0.005.
 
     Raises:
         UserError: an argument has a value that gsplat supports and snowsplat does not.
         ValueError: shapes, dtypes or devices do not match.
     """
-    _refuse_unsupported(
-        {"sparse_grad": sparse_grad, **others}, eps2d, sh_degree, render_mode, rasterize_mode
-    )
+    given = locals()
+    _refuse_unsupported({name: given[name] for name in _FIXED}, eps2d, render_mode, rasterize_mode)
+    for name in ("sh_degree", "extra_signals_sh_degree"):
+        degree = given[name]
+        if degree is not None and not 0 <= degree <= 3:
+            raise UserError(
+                "rasterization: {name}={degree} is not supported; use 0 to 3",
+                name=name,
+                degree=degree,
+            )
     check_size("rasterization", width, height)
     with_colors, with_depth = render_mode.startswith("RGB"), render_mode != "RGB"
     *batch, n, _ = means.shape
+    visible: list[Tensor] = []
+    if sparse_grad and packed:
+        if batch:
+            raise UserError(
+                "rasterization: sparse_grad is not supported for batches; use sparse_grad=False"
+            )
+        means = _RowGradient.apply(means, visible)
+        if covars is None and quats is not None and scales is not None:
+            quats, scales = (_RowGradient.apply(tensor, visible) for tensor in (quats, scales))
     if not with_colors:  # a depth needs no colours; one feature is the cheapest
         colors, sh_degree, backgrounds = means[..., :1].detach(), None, None
     if covars is not None:
@@ -179,6 +211,7 @@ def rasterization(
     of_views = (*batch, *viewmats.shape[-3:-2])
     row: tuple[int, ...] = colors.shape[-1:] if sh_degree is None else colors.shape[-2:]
     per_camera = colors.dim() - len(row) == len(batch) + 2
+    harmonic = extra_signals_sh_degree is not None
     for name, tensor, shape in (
         ("quats", quats, (*batch, n, 4)),
         ("scales", scales, (*batch, n, 3)),
@@ -188,13 +221,22 @@ def rasterization(
         ("viewmats", viewmats, (*of_views, 4, 4)),
         ("Ks", Ks, (*of_views, 3, 3)),
         ("backgrounds", backgrounds, (*of_views, row[-1])),
+        ("extra_signals", extra_signals, _shape_of_signals(extra_signals, of_views, n, harmonic)),
     ):
         if tensor is not None and tuple(tensor.shape) != shape:
             raise ValueError(f"rasterization: {name} must be {shape}, got {tuple(tensor.shape)}")
 
-    if absgrad and row[-1] + (with_colors and with_depth) > _ABSGRAD_CHANNELS:
-        what = f"absgrad is supported for {_ABSGRAD_CHANNELS} channels; render fewer at a time"
-        raise UserError("rasterization: {what}", what=what)
+    signals = 0
+    if extra_signals is not None:
+        signals = extra_signals.shape[-1]
+        parts = [_features(extra_signals, extra_signals_sh_degree, means, viewmats)]
+        if with_colors:
+            own = _features(colors, sh_degree, means, viewmats)
+            parts.insert(0, own if sh_degree is None else own.clamp_min(0.0))
+        if backgrounds is not None:
+            backgrounds = torch.nn.functional.pad(backgrounds, (0, signals))
+        colors, sh_degree, per_camera = torch.cat(parts, -1), None, True
+        row = colors.shape[-1:]
     if covars is None and eps2d != _EPS2D[rasterize_mode]:
         factors = rotation_from_quat(quats) * scales[..., None, :]
         covars = factors @ factors.mT
@@ -232,6 +274,7 @@ def rasterization(
             mip = rasterize_mode == "antialiased"
             splats = _reshaped(splats, each_means[b], each_covars[b], view, eps2d, mip, radius_clip)
         projected.append((splats, means2d))
+    visible += [splats.ids.long() for splats, _ in projected if splats.ids is not None]
     meta, centres = _meta(projected, packed, of_views, n)
     meta |= {
         "width": width,
@@ -245,11 +288,14 @@ def rasterization(
 
     if absgrad:
         _keep_absgrad(meta["means2d"], projected, packed)
-    images, alphas = [], []
+    images, alphas, extras = [], [], []
     behind = [None] * len(projected) if backgrounds is None else _items(backgrounds, 1)
     for (splats, _), means2d, background in zip(projected, centres, behind, strict=True):
         splats = with_centres(splats, means2d)
         image, alpha, depth = rasterize(splats, width, height, background, with_depth=with_depth)
+        if signals:
+            extras.append(image[..., -signals:])
+            image = image[..., :-signals]
         if depth is not None:
             if render_mode.endswith("ED"):
                 depth = depth / alpha.clamp(min=1e-10)
@@ -257,19 +303,60 @@ def rasterization(
             image = torch.cat([image, depth], dim=2) if with_colors else depth
         images.append(image)
         alphas.append(alpha[..., None])
+    if signals:
+        meta["render_extra_signals"] = _stack_images(extras, of_views)
     return _stack_images(images, of_views), _stack_images(alphas, of_views), meta
 
 
+class _RowGradient(torch.autograd.Function):
+    """The identity, of tensors (N, …). Its gradient is sparse, with the rows in `visible`, a list
+    that is filled before the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, visible: list[Tensor]) -> Tensor:
+        ctx.visible = visible
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        rows = torch.cat(ctx.visible).unique()
+        return torch.sparse_coo_tensor(
+            rows[None], grad[rows], grad.shape, check_invariants=False
+        ), None
+
+
+def _shape_of_signals(
+    signals: Tensor | None, of_views: tuple[int, ...], n: int, harmonic: bool
+) -> tuple[int, ...]:
+    if signals is None:
+        return ()
+    if harmonic:
+        return (n, *signals.shape[-2:])
+    items = of_views if signals.dim() == len(of_views) + 2 else of_views[:-1]
+    return (*items, n, signals.shape[-1])
+
+
+def _features(values: Tensor, degree: int | None, means: Tensor, viewmats: Tensor) -> Tensor:
+    """Features (…, C, N, D) of each camera, from features or harmonics, which are not clamped."""
+    of_views = (*viewmats.shape[:-2], means.shape[-2])
+    if values.dim() == viewmats.dim() - (degree is None):  # the same of all cameras
+        values = values.unsqueeze(-3 if degree is None else -4)
+    if degree is None:
+        return values.expand(*of_views, -1)
+    if values.shape[-2] < (count := (degree + 1) ** 2):
+        what = f"got {values.shape[-2]} coefficients"
+        raise ValueError(f"rasterization: degree {degree} needs {count}, {what}")
+    rotations, shifts = viewmats[..., :3, :3], viewmats[..., :3, 3:]
+    towards = means[..., None, :, :] + (rotations.mT @ shifts).mT  # the camera is at −Rᵀ t
+    towards = torch.nn.functional.normalize(towards, dim=-1).flatten(0, -2)
+    basis = sh_basis(towards, degree).unflatten(0, of_views)
+    return 0.5 + (basis[..., None] * values[..., :count, :]).sum(-2)
+
+
 def _refuse_unsupported(
-    given: dict[str, Any],
-    eps2d: float,
-    sh_degree: int | None,
-    render_mode: str,
-    rasterize_mode: str,
+    given: dict[str, Any], eps2d: float, render_mode: str, rasterize_mode: str
 ) -> None:
     for name, value in given.items():
-        if name not in _FIXED:
-            raise TypeError(f"rasterization: there is no argument {name}")
         only, remedy = _FIXED[name]
         names = {str(value), type(value).__name__}
         if value is not only and value != only and names.isdisjoint(_DEFAULTS):
@@ -284,10 +371,6 @@ def _refuse_unsupported(
         raise UserError("rasterization: {what}", what=what)
     if not 0.0 < eps2d < math.inf:
         raise UserError("rasterization: eps2d={eps2d} is not positive; use 0.3", eps2d=eps2d)
-    if sh_degree is not None and not 0 <= sh_degree <= 3:
-        raise UserError(
-            "rasterization: sh_degree={sh_degree} is not supported; use 0 to 3", sh_degree=sh_degree
-        )
 
 
 @torch.no_grad()

@@ -19,7 +19,6 @@ namespace {
 constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 constexpr int kAxisBits = 21;
 
-
 template <class T>
 struct alignas(16) Point {
   T x, y, z, unused;
