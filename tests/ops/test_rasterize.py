@@ -717,10 +717,6 @@ WRONG = {
     "abs_grad of another dtype": {
         "splats": Splats2D(torch.zeros(2, 16), None, 3, torch.zeros(2, 2).double())
     },
-    "abs_grad with two groups of channels": {
-        "splats": Splats2D(torch.zeros(2, 16), None, 4, torch.zeros(2, 2)),
-        "with_depth": True,
-    },
     "half": {"splats": Splats2D(torch.zeros(2, 16, dtype=torch.float16), None, 3)},
     "integers": {"splats": Splats2D(torch.zeros(2, 16, dtype=torch.int64), None, 3)},
 }
