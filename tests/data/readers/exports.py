@@ -362,3 +362,166 @@ def llff(folder: Path):
     np.save(folder / "poses_bounds.npy", np.array(rows))
     photos(folder / "images")
     return expected
+
+
+def matrices(folder: Path, layout: str):
+    """A layout of `snowsplat.data.readers.pose_matrices`, with depth maps if it has any; of cameras
+    without distortion, except for TUM."""
+    fx, fy, cx, cy = 55.0, 52.0, 30.5, 25.0
+    k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    integer = k - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # the centre of the first pixel is (0, 0)
+    worlds = []
+    for rotation, translation in rig().values():
+        matrix = np.eye(4)
+        matrix[:3] = np.column_stack([rotation.T, -rotation.T @ translation])
+        worlds.append(matrix)
+
+    def text(path: str, *rows, head="") -> None:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        lines = (" ".join(repr(float(value)) for value in row) for row in rows)
+        (folder / path).write_text(head + "\n".join(lines) + "\n")
+
+    folder.mkdir(exist_ok=True)
+
+    def depth(path: str, unit: float) -> None:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((6, 8), round(1.25 / unit), np.uint16)).save(folder / path)
+
+    if layout == "ScanNet":
+        names = [f"color/{i}.jpg" for i in range(4)]
+        for i, world in enumerate(worlds):
+            text(f"pose/{i}.txt", *world)
+            depth(f"depth/{i}.png", 1e-3)
+        text("pose/4.txt", *np.full((4, 4), -np.inf))  # tracking was lost
+        text("intrinsic/intrinsic_color.txt", *np.pad(k, (0, 1)))
+    elif layout == "NSVF":
+        names = [f"rgb/{i // 3}_{i:04d}.png" for i in range(4)]
+        for name, world in zip(names, worlds, strict=True):
+            text(f"pose/{name[4:-4]}.txt", *world)
+        text("intrinsics.txt", (fx, cx, cy, 0), (0, 0, 0), (0,), (1,), (HEIGHT, WIDTH))
+        fy = fx
+    elif layout == "KITTI":
+        names = [f"image_2/{i:06d}.png" for i in range(4)]
+        shift = np.eye(4)
+        shift[0, 3] = 0.1  # of the colour camera, from the grey one
+        text("poses.txt", *(np.ravel((world @ shift)[:3]) for world in worlds))
+        projection = integer @ np.linalg.inv(np.linalg.inv(shift))[:3]
+        lines = [f"P{i}: " + " ".join(map(repr, projection.ravel().tolist())) for i in (0, 2)]
+        (folder / "calib.txt").write_text("\n".join(lines) + "\n")
+    elif layout == "MVSNet":
+        names = [f"images/{i:08d}.jpg" for i in range(4)]
+        for i, world in enumerate(worlds):
+            text(f"cams/{i:08d}_cam.txt", *np.linalg.inv(world), head="extrinsic\n")
+            with open(folder / f"cams/{i:08d}_cam.txt", "a") as file:
+                file.write("\nintrinsic\n")
+                np.savetxt(file, k)
+                file.write("\n0.5 0.1\n")
+    elif layout == "IDR":
+        names = [f"image/{i:06d}.png" for i in range(4)]
+        cameras = {}
+        for i, world in enumerate(worlds):
+            cameras[f"scale_mat_{i}"] = np.diag([3.0, 3, 3, 1])
+            cameras[f"world_mat_{i}"] = -2.5 * np.pad(integer, (0, 1)) @ np.linalg.inv(world)
+        np.savez(folder / "cameras_sphere.npz", **cameras)
+    elif layout == "TUM":
+        names = [f"rgb/13{i}.04.png" for i in range(4)]
+        rows = []
+        for i, world in enumerate(worlds):
+            w, x, y, z = quaternion(world[:3, :3])
+            rows += [(130 + i + 0.039, *world[:3, 3], x, y, z, w), (130.5 + i, 9, 9, 9, 0, 0, 0, 1)]
+            depth(f"depth/13{i}.05.png", 1 / 5000)
+        text("groundtruth.txt", *rows, head="# time tx ty tz qx qy qz qw\n")
+        text("intrinsics.txt", (fx, fy, cx, cy, 0.03, -0.02, 0.002, -0.003, 0.01))
+    elif layout == "Replica":
+        names = [f"results/frame{i:06d}.jpg" for i in range(4)]
+        text("traj.txt", *(world.ravel() for world in worlds))
+        camera = {"w": WIDTH, "h": HEIGHT, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "scale": 6553.5}
+        (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+        for i in range(4):
+            depth(f"results/depth{i:06d}.png", 1 / 6553.5)
+    elif layout == "Tanks and Temples":
+        names = [f"Barn/{i + 1:06d}.jpg" for i in range(4)]
+        text("Barn.log", *(row for i, w in enumerate(worlds) for row in [(i, i, 0), *w]))
+        text("intrinsics.txt", (fx, fy, cx, cy))
+    else:
+        names = [f"frame_{i:05d}.jpg" for i in range(4)]
+        for i, world in enumerate(worlds):
+            pose = (world @ np.diag([1.0, -1, -1, 1])).ravel().tolist()
+            frame = {"cameraPoseARFrame": pose, "intrinsics": k.ravel().tolist(), "time": i}
+            (folder / f"frame_{i:05d}.json").write_text(json.dumps(frame))
+            depth(f"depth_{i:05d}.png", 1e-3)
+    for name in names:
+        photos((folder / name).parent, [Path(name).name])
+    expected = {}
+    for number, name in enumerate(names):
+        x, y, z = in_camera(NAMES[number])
+        x, y = x / z, y / z
+        if layout == "TUM":
+            k1, k2, p1, p2, k3 = 0.03, -0.02, 0.002, -0.003, 0.01
+            r2 = x * x + y * y
+            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+            x, y = (
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            )
+        expected[Path(name).name] = np.column_stack([fx * x + cx, fy * y + cy])
+    return expected
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w x y z of a rotation (3, 3): the eigenvector of Bar-Itzhack's matrix (2000)."""
+    q = rotation
+    n = np.array(
+        [
+            [q[0, 0] + q[1, 1] + q[2, 2], q[2, 1] - q[1, 2], q[0, 2] - q[2, 0], q[1, 0] - q[0, 1]],
+            [0, q[0, 0] - q[1, 1] - q[2, 2], q[0, 1] + q[1, 0], q[0, 2] + q[2, 0]],
+            [0, 0, q[1, 1] - q[0, 0] - q[2, 2], q[1, 2] + q[2, 1]],
+            [0, 0, 0, q[2, 2] - q[0, 0] - q[1, 1]],
+        ]
+    )
+    return np.linalg.eigh(n, UPLO="U")[1][:, -1]
+
+
+def realitycapture(folder: Path):
+    """An XMP file for each photo."""
+    unit, focal, px, py = max(WIDTH, HEIGHT), 30.0, 0.02, -0.03
+    k1, k2, k3, t1, t2 = 0.03, -0.02, 0.01, 0.002, -0.003
+    expected = {}
+    folder.mkdir(exist_ok=True)
+    for name, (rotation, translation) in rig().items():
+        attributes = {
+            "DistortionModel": "brown3t2",
+            "FocalLength35mm": focal,
+            "Skew": 0,
+            "AspectRatio": 1,
+            "PrincipalPointU": px,
+            "PrincipalPointV": py,
+        }
+        head = " ".join(f'xcr:{key}="{value}"' for key, value in attributes.items())
+        elements = {
+            "Rotation": rotation.ravel(),
+            "Position": -rotation.T @ translation,
+            "DistortionCoeficients": (k1, k2, k3, 0, t1, t2),
+        }
+        body = "".join(
+            f"<xcr:{key}>{' '.join(repr(float(v)) for v in values)}</xcr:{key}>"
+            for key, values in elements.items()
+        )
+        (folder / name).with_suffix(".xmp").write_text(
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+            'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
+            f'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" {head}>{body}'
+            "</rdf:Description></rdf:RDF></x:xmpmeta>"
+        )
+        x, y, z = in_camera(name)
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        u = x * radial + 2 * t2 * x * y + t1 * (r2 + 2 * x * x)
+        v = y * radial + t2 * (r2 + 2 * y * y) + 2 * t1 * x * y
+        f = focal / 36 * unit
+        expected[name] = np.column_stack(
+            [f * u + px * unit + WIDTH / 2, f * v + py * unit + HEIGHT / 2]
+        )
+    photos(folder)
+    return expected

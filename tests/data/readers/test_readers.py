@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from snowsplat.data.load import load_dataset
+from snowsplat.data.maps.map_files import read_depth_file
 from snowsplat.data.readers import NoPosesError, find_poses, photo_folder, read_poses
+from snowsplat.data.readers.pose_matrices import LAYOUTS
 from snowsplat.data.readers.projects import advice
 from snowsplat.pipeline.describe import describe
 from snowsplat.util.errors import SettingError, UserError
@@ -55,6 +57,8 @@ CASES = {
     "alicevision": (exports.alicevision, {}),
     "alicevision 1.2.0": (exports.alicevision, {"newer": False}),
     "llff": (exports.llff, {}),
+    "realitycapture": (exports.realitycapture, {}),
+    **{layout.name: (exports.matrices, {"layout": layout.name}) for layout in LAYOUTS},
 }
 
 
@@ -321,22 +325,66 @@ def test_projects_that_are_not_readable_are_explained(name, tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "program"),
     [
-        ("pose/0.txt", "1 0 0 0\n0 1 0 0\n", "ScanNet and NSVF"),
+        ("pose/0.txt", "1 0 0 0\n0 1 0 0\n", "ScanNet"),
         ("groundtruth.txt", "# time x y z\n1.5 0 0 1 0 0 0 1\n", "TUM"),
         ("poses.txt", "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI"),
         ("a/b.txt", "1 0 0 0\n", None),
         ("poses.txt", "poses: none\n", None),
-        ("A.xmp", "<x/>", None),
-        ("A.xmp", '<x xmlns:xcr="http://www.capturingreality.com/ns"/>', "RealityCapture"),
-        ("frame_0.json", '{"cameraPoseARFrame": []}', "3d Scanner App"),
     ],
 )
-def test_poses_that_are_not_read_are_named(tmp_path, name, text, program):
+def test_poses_without_a_camera_are_named(tmp_path, name, text, program):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(text)
     found = advice(tmp_path)
     assert (found is None) == (program is None)
-    assert program is None or f"{name!r} has camera poses in the layout of {program}" in str(found)
+    first = name.partition("/")[0]
+    assert program is None or f"{first!r} has camera poses in the layout of {program}" in str(found)
+
+
+def test_depth_maps_of_layouts_have_the_unit_of_their_program(tmp_path):
+    for layout in ("ScanNet", "TUM", "Replica", "3d Scanner App"):
+        exports.matrices(tmp_path / layout, layout)
+        found = read_poses(tmp_path / layout)
+        for image in found.images:
+            assert float(read_depth_file(image.depth).mean()) * image.depth_unit == pytest.approx(
+                1.25, abs=1e-3
+            )
+        assert found.metres_per_unit == 1.0
+
+
+def test_a_frame_without_tracking_and_a_damaged_one(tmp_path, caplog):
+    exports.matrices(tmp_path, "ScanNet")
+    (tmp_path / "pose/2.txt").write_text("1 0 0 x\n")
+    found = read_poses(tmp_path)
+    assert [image.path.name for image in found.images] == ["0.jpg", "1.jpg", "3.jpg"]
+    assert "3 of 5 photos aligned" in str(found.description)
+    assert "should be numbers" in caplog.text
+
+
+def test_the_prefix_of_a_pose_of_nsvf_is_its_split(tmp_path):
+    exports.matrices(tmp_path, "NSVF")
+    found = {image.path.name: image.split for image in read_poses(tmp_path).images}
+    assert found["0_0002.png"] == "train"
+    assert found["1_0003.png"] == "test"
+
+
+def test_the_cameras_of_tum_are_known_by_their_names(tmp_path):
+    folder = tmp_path / "rgbd_dataset_freiburg3_office"
+    exports.matrices(folder, "TUM")
+    (folder / "intrinsics.txt").unlink()
+    assert read_poses(folder).images[0].lens.params[0] == 535.4
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("brown3t2", "division"), ('Skew="0"', 'Skew="0.1"'), ("</rdf:RDF>", "")],
+)
+def test_a_lens_model_of_realitycapture_that_is_not_read(tmp_path, caplog, old, new):
+    exports.realitycapture(tmp_path)
+    file = tmp_path / "b.xmp"
+    file.write_text(file.read_text().replace(old, new))
+    assert len(read_poses(tmp_path).images) == 3
+    assert "1 of 4 photos are left out: b.xmp" in caplog.text
 
 
 def test_other_files_are_no_exports(tmp_path):

@@ -19,6 +19,7 @@ from snowsplat.data.readers import (
     openmvg,
     opensfm,
     polycam,
+    pose_matrices,
     realityscan,
     record3d,
     transforms_json,
@@ -31,6 +32,7 @@ from snowsplat.util.errors import UserError
 PROGRAMS = (
     metashape.READER,
     realityscan.READER,
+    realityscan.XMP_READER,
     polycam.READER,
     record3d.READER,
     openmvg.READER,
@@ -38,6 +40,7 @@ PROGRAMS = (
     bundler.READER,
     opensfm.READER,
     llff.READER,
+    *pose_matrices.READERS,
 )
 #: All readers; the first one that finds its files in a folder is used.
 READERS = (colmap.READER, transforms_json.READER, *PROGRAMS)

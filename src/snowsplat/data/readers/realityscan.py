@@ -1,9 +1,13 @@
-"""RealityScan and RealityCapture: the CSV file "Internal/External camera parameters".
+"""RealityScan and RealityCapture: the CSV file "Internal/External camera parameters", and the XMP
+file of each photo.
 
 The position is in the world frame, whose z is up. Heading, pitch and roll in degrees are rotations
 about z (clockwise), x and y, of a camera with y up that looks along −z. Lengths in the photo are in
 units of its larger side, except that the focal length is multiplied by 36 mm. RealityScan's own
 export for OpenCV shows that t₁ and t₂ are p₂ and p₁ of OpenCV.
+
+An XMP file has cam_from_world as a rotation, by rows, in OpenCV axes, and the position of the
+camera (the help page "RealityCapture XMP Camera Math"). Its lengths are as those of the table.
 """
 
 from __future__ import annotations
@@ -11,10 +15,13 @@ from __future__ import annotations
 import csv
 import logging
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from snowsplat.data.lens.lens import Lens
 from snowsplat.data.photos.decode import read_header
 from snowsplat.data.readers import parse
 from snowsplat.data.readers.lenses import perspective
@@ -29,6 +36,10 @@ logger = logging.getLogger(__name__)
 _RENAMED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 _NEEDED = {"name", "x", "y", "alt", "heading", "pitch", "roll", "f"}
 _POSITIONS = {"name", "x", "y", "alt"}
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "t1", "t2")
+_XCR = "http://www.capturingreality.com/ns/xcr/1.1#"
+_XMP_KEYS = {"f": "FocalLength35mm", "px": "PrincipalPointU", "py": "PrincipalPointV"}
+_MODELS = ("perspective", "brown")
 
 
 def is_realityscan(path: Path) -> bool:
@@ -69,19 +80,9 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             found.total += 1
             if (photo := found.photo(photos, values["name"])) is None:
                 continue
-            header = read_header(photos.root / photo)
-            width, height = header.width, header.height
-            unit = max(width, height)
-            focal = parse.number(where, values, "f") * unit / 36.0
-            cx = parse.number(where, values, "px", 0.0) * unit + width / 2
-            cy = parse.number(where, values, "py", 0.0) * unit + height / 2
-            radial = [parse.number(where, values, f"k{i}", 0.0) for i in (1, 2, 3, 4)]
-            tangential = (
-                parse.number(where, values, "t2", 0.0),
-                parse.number(where, values, "t1", 0.0),
-            )
-            lens = perspective(where, width, height, (focal, focal, cx, cy), radial, tangential)
-            division &= radial[0] != 0 and not any((*radial[1:], *tangential))
+            coefficients = [parse.number(where, values, key, 0.0) for key in _COEFFICIENTS]
+            lens = _lens(where, photos.root / photo, values, coefficients)
+            division &= coefficients[0] != 0 and not any(coefficients[1:])
             position = [parse.number(where, values, key) for key in ("x", "y", "alt")]
             angles = [
                 math.radians(parse.number(where, values, k)) for k in ("heading", "pitch", "roll")
@@ -89,6 +90,62 @@ def read(path: Path, photos: PhotoFolder) -> Reconstruction:
             pose = np.column_stack([_rotation(*angles), position])
             found.add(photos, photo, lens, parse.from_opengl(where, pose))
     _warn(path, found, division)
+    points_beside(path.parent, found)
+    return found
+
+
+def _lens(
+    where: str, photo: Path, values: Mapping[str, Any], coefficients: Sequence[float]
+) -> Lens:
+    """``values``: f, px and py; ``coefficients``: k₁ k₂ k₃ k₄ t₁ t₂."""
+    header = read_header(photo)
+    width, height = header.width, header.height
+    unit = max(width, height)
+    focal = parse.number(where, values, "f") * unit / 36.0
+    cx = parse.number(where, values, "px", 0.0) * unit + width / 2
+    cy = parse.number(where, values, "py", 0.0) * unit + height / 2
+    *radial, t1, t2 = coefficients
+    return perspective(where, width, height, (focal, focal, cx, cy), radial, (t2, t1))
+
+
+def is_xmp(path: Path) -> bool:
+    """Whether a file is the XMP of a photo with a pose."""
+    if path.suffix.lower() != ".xmp":
+        return False
+    head = parse.head_of(path)
+    return _XCR.encode() in head and b"Position" in head
+
+
+def read_xmp(path: Path, photos: PhotoFolder) -> Reconstruction:
+    """Read the XMP files of all photos in the folder of ``path``, and the points of a PLY file."""
+    found = Reconstruction()
+    for file in sorted(path.parent.glob("*.[xX][mM][pP]")):
+        if not is_xmp(file):
+            continue
+        found.total += 1
+        with found.one(file.name):
+            if (photo := found.photo(photos, file.stem)) is None:
+                continue
+            values: dict[str, str] = {}
+            for element in parse.load_xml(file).iter():
+                values |= element.attrib | {element.tag: element.text or ""}
+            values = {key.removeprefix("xcr:"): text for key, text in values.items()}
+            model = values.get("DistortionModel", "")
+            exact = [parse.number(file, values, key, 0.0) for key in ("Skew", "AspectRatio")]
+            if not model.startswith(_MODELS) or exact[0] != 0 or exact[1] not in (0, 1):
+                raise UserError(
+                    "{path}: the lens model {model} is not supported; align with Brown3, without "
+                    "skew and aspect ratio",
+                    path=file,
+                    model=quoted(model),
+                )
+            numbers = values.get("DistortionCoeficients", "0 0 0 0 0 0").split()
+            coefficients = parse.numbers(file, numbers, 6).tolist()
+            named = {short: values[key] for short, key in _XMP_KEYS.items() if key in values}
+            lens = _lens(str(file), photos.root / photo, named, coefficients)
+            rotation = parse.numbers(file, values.get("Rotation", "").split(), 9).reshape(3, 3)
+            position = parse.numbers(file, values.get("Position", "").split(), 3)
+            found.add(photos, photo, lens, parse.rigid(file, rotation, -rotation @ position))
     points_beside(path.parent, found)
     return found
 
@@ -128,3 +185,4 @@ def _warn(path: Path, found: Reconstruction, division: bool) -> None:
 
 
 READER = program("RealityScan", ("*.csv",), is_realityscan, read)
+XMP_READER = program("RealityCapture", ("*.xmp",), is_xmp, read_xmp)
