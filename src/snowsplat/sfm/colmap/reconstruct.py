@@ -109,12 +109,12 @@ class PoseEstimation:
             remove_database(self.strong_database)
             raise error
         self.runner.progress.show_poses(best.models[0], True)
-        for model in best.models:
-            best.mapping.align_features(model, best.matched.effort.image_size)
-            best.mapping.add_points(model)
+        image_size = best.matched.effort.image_size
+        models = [best.mapping.complete(model, image_size) for model in best.models]
+        for model in models:
             model.extract_colors_for_all_images(self.dataset.photos, self.runner.threads)
-        write_models(best.models, self.dataset.distorted_models)
-        names = [names_in(model) for model in best.models]
+        write_models(models, self.dataset.distorted_models)
+        names = [names_in(model) for model in models]
         evidence = self.runner.evidence(best.matched)
         unregistered = explain(self.photos, evidence, names, best.excluded)
         if best.matched.database == self.strong_database:
@@ -127,7 +127,7 @@ class PoseEstimation:
                 "between neighbouring photos agree with them"
             )
         return result_of(
-            best.models,
+            models,
             self.photos,
             exif=best.lens.exif,
             held=best.mapping.held,
@@ -135,7 +135,7 @@ class PoseEstimation:
             pairs=best.matched.choice.description,
             attempts=self.log,
             doubts=doubts + self._doubt_about_fisheye(best),
-            zooms="" if self.photos is given else camera_groups.describe(best.models[0]),
+            zooms="" if self.photos is given else camera_groups.describe(models[0]),
             agreement=best.agreement,
             fisheye=self._describe_fisheye(best),
         )

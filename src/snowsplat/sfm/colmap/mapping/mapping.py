@@ -21,6 +21,7 @@ from snowsplat.sfm.colmap.database import (
 from snowsplat.sfm.colmap.features.alignment import align_features
 from snowsplat.sfm.colmap.features.extraction import SEED
 from snowsplat.sfm.colmap.lenses.lens import robust_adjustment
+from snowsplat.sfm.colmap.lenses.principal_point import refine_principal_points
 from snowsplat.sfm.colmap.mapping.incremental import IncrementalMapper
 from snowsplat.sfm.colmap.mapping.view_graph import ViewGraph, spread_subset
 from snowsplat.sfm.colmap.options import photos_with_adjustment
@@ -148,15 +149,23 @@ class Mapping:
             model.update_point_3d_errors()
         return mapping._refine(model)
 
-    def align_features(self, model: pycolmap.Reconstruction, image_size: int) -> None:
-        """Align the features of each point, and run bundle adjustment. Changes ``model``.
+    def complete(self, model: pycolmap.Reconstruction, image_size: int) -> pycolmap.Reconstruction:
+        """The final poses, lenses and points of ``model``, which may be changed.
+
+        The features of each point are aligned, and bundle adjustment estimates principal points,
+        too, if it has estimated the focal lengths.
 
         ``image_size``: the longest side of the photos in which the features were detected.
         """
         align_features(model, self.database, self.images, image_size, self.threads)
         self._refine(model, _MIN_POINTS_ALIGNED, tolerances=_ALIGNED_TOLERANCES)
+        if not self.held:
+            model = refine_principal_points(model, self.threads)
+            self._remove_outliers(model, _MIN_POINTS_ALIGNED)
+        self._add_points(model)
+        return model
 
-    def add_points(self, model: pycolmap.Reconstruction) -> None:
+    def _add_points(self, model: pycolmap.Reconstruction) -> None:
         """Add points that only two photos of ``model`` see, for the training. Changes ``model``."""
         with closing_database(self.database) as database:  # they may have another camera model now
             for camera in model.cameras.values():
