@@ -1,6 +1,4 @@
-"""Focal length and location from EXIF data, and implausible values."""
-
-import math
+"""Focal length and camera from EXIF data, and implausible values."""
 
 import pycolmap
 import pytest
@@ -44,26 +42,6 @@ def test_focal_length_over_the_size_of_a_pixel():
 )
 def test_unusable_focal_lengths(details):
     assert read_exif(exif(details=details), 4000, 3000).focal is None
-
-
-def test_location():
-    latitude, longitude, altitude = read_exif(exif(gps=GPS), 100, 100).location
-    assert latitude == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600))
-    assert (longitude, altitude) == (pytest.approx(151.2), 12.5)
-    assert read_exif(exif(gps=GPS | {5: b"\x01"}), 100, 100).location[2] == -12.5
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)},
-        {2: (133.0, 0.0, 0.0)},
-        {2: 33.5},
-        {4: (math.nan, 0.0, 0.0)},
-    ],
-)
-def test_invalid_locations(change):
-    assert read_exif(exif(gps=GPS | change), 100, 100).location is None
 
 
 def test_missing_data_and_an_invalid_orientation():

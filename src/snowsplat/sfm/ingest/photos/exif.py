@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
+from PIL.ExifTags import IFD, Base
 
 from snowsplat.sfm.ingest.photo import Attitude
 from snowsplat.sfm.ingest.photos.attitude import read_attitude
+from snowsplat.sfm.ingest.photos.location import Location, number, read_location
 
 _SRGB = 1
 _PLANE_UNITS_IN_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -29,7 +30,7 @@ class ExifInfo:
     orientation: int = 1  # EXIF value, 1 to 8
     camera: str = ""  # make, model and focal lengths, which identify a lens and its zoom
     focal: float | None = None  # pixels of the stored photo, before any resizing
-    location: tuple[float, float, float] | None = None  # latitude, longitude (°), altitude (m)
+    location: Location | None = None  # latitude, longitude (°), altitude (m)
     location_error: float | None = None  # m, horizontal, as the receiver states it
     attitude: Attitude | None = None  # in the frame of the upright photo
 
@@ -39,7 +40,7 @@ def read_exif(
 ) -> ExifInfo:
     """Read the metadata of a photo with ``width`` × ``height`` stored pixels.
 
-    ``xmp`` is the XMP packet of the file, in which drones store the angles of their gimbal.
+    ``xmp`` is the XMP packet of the file, in which drones store positions and gimbal angles.
     ``taken`` is the orientation with which the photo was taken, if the pixels have been turned
     since, as in a HEIC file that is open.
 
@@ -49,13 +50,14 @@ def read_exif(
     stored = exif.get(Base.Orientation, 1)
     orientation = stored if stored in range(1, 9) else 1
     named = [str(exif.get(tag) or "").strip("\0 ") for tag in (Base.Make, Base.Model)]
-    zoom = [_number(details.get(tag)) for tag in (Base.FocalLength, Base.FocalLengthIn35mmFilm)]
+    zoom = [number(details.get(tag)) for tag in (Base.FocalLength, Base.FocalLengthIn35mmFilm)]
+    location, location_error = read_location(gps, xmp)
     return ExifInfo(
         orientation=orientation,
         camera=" ".join([*filter(None, named), *(f"{f:g} mm" for f in zoom if f)]),
         focal=_focal(details, width, height),
-        location=_location(gps),
-        location_error=_number(gps.get(GPS.GPSHPositioningError)),
+        location=location,
+        location_error=location_error,
         attitude=read_attitude(exif, details, gps, xmp, taken or orientation),
     )
 
@@ -69,49 +71,18 @@ def _focal(details: Mapping[int, Any], width: int, height: int) -> float | None:
     the original. Therefore the result is multiplied by the ratio of the longest sides.
     """
     focal = None
-    equivalent = _number(details.get(Base.FocalLengthIn35mmFilm))
-    length = _number(details.get(Base.FocalLength))
-    density = _number(details.get(Base.FocalPlaneXResolution))
+    equivalent = number(details.get(Base.FocalLengthIn35mmFilm))
+    length = number(details.get(Base.FocalLength))
+    density = number(details.get(Base.FocalPlaneXResolution))
     unit = _PLANE_UNITS_IN_MM.get(details.get(Base.FocalPlaneResolutionUnit, 2))
     if equivalent:
         focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(width, height)
     elif length and density and unit:
-        sizes = [_number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
+        sizes = [number(details.get(tag)) for tag in (Base.ExifImageWidth, Base.ExifImageHeight)]
         original = max((size for size in sizes if size), default=max(width, height))
         focal = length * density / unit * max(width, height) / original
     plausible = focal is not None and _WIDEST < focal / max(width, height) < _NARROWEST
     return focal if plausible else None
-
-
-def _location(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S")
-    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W")
-    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return None
-    if latitude == 0 and longitude == 0:  # GPS receivers store this if they have no position
-        return None
-    altitude = _number(gps.get(GPS.GPSAltitude)) or 0.0
-    below_sea = gps.get(GPS.GPSAltitudeRef) in (1, b"\x01")
-    return latitude, longitude, -altitude if below_sea else altitude
-
-
-def _degrees(value: Any, side: Any, negative: str) -> float | None:
-    if not isinstance(value, tuple | list) or len(value) != 3:
-        return None
-    parts = [_number(part, zero=True) for part in value]
-    if any(part is None for part in parts):
-        return None
-    degrees = sum(part / 60**i for i, part in enumerate(parts) if part)
-    return -degrees if str(side).strip("\0 ").upper() == negative else degrees
-
-
-def _number(value: Any, zero: bool = False) -> float | None:
-    """A positive finite number (or 0 if ``zero``); None for all other values of a tag."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) and (number > 0 or (zero and number == 0)) else None
 
 
 def _ifd(exif: Image.Exif, tag: int) -> Mapping[int, Any]:
