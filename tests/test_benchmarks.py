@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from snowsplat import Gaussians, load_dataset, write_gaussians
-from snowsplat.ops import native
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 
 from . import fork_server
@@ -64,21 +63,6 @@ def test_every_script_starts():
     run = fork_server.run("-c", HELP, BENCHMARKS, *SCRIPTS)
     assert run.returncode == 0, run.stderr
     assert run.stdout.split() == SCRIPTS
-
-
-@pytest.mark.nightly
-def test_stages_of_an_iteration(tmp_path):
-    isa = native.available_isas()[-1]
-    flags = ("--size", "tiny", "--isa", isa, "--threads", 1, "--repeats", 2)
-    text = benchmark("stages.py", *flags, "--json", tmp_path / "stages.json")
-    for stage in ("project: cull", "tiles: fill", "blend backward", "adam step"):
-        assert min(row(text, stage)) > 0, stage
-    (measured,) = json.loads((tmp_path / "stages.json").read_text())
-    stages = [wall[0] for name, wall in measured["wall"].items() if name != "total"]
-    assert sum(stages) == pytest.approx(measured["wall"]["total"][0])
-    text = benchmark("stages.py", *flags, "--versus", ROOT / "src")
-    ratio = float(next(line for line in text.splitlines() if line.startswith("total")).split()[1])
-    assert 0.1 < ratio < 10  # both are the same library; the machine may be busy
 
 
 def test_psnr_against_time(dataset, tmp_path):

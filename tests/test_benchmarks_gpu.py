@@ -2,9 +2,6 @@
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -20,9 +17,6 @@ from .ops.test_cuda_build import kernels_in
 
 ROOT = Path(__file__).resolve().parents[1]
 BENCHMARKS = ROOT / "benchmarks"
-#: A sleep duration that no other process uses, which identifies the children of these tests.
-LONG = 70 + os.getpid() * 1e-7
-
 pytestmark = pytest.mark.slow
 
 
@@ -33,29 +27,6 @@ def gpu_modules(monkeypatch):
     monkeypatch.setenv("SNOWSPLAT_GARDEN", "none")
 
 
-def run_jobs(folder, *jobs, seconds=60.0, width=4):
-    import gpu_jobs
-
-    found, log = [], folder / "log"
-    log.write_bytes(b"")
-    runner = gpu_jobs.Runner(
-        folder,
-        log,
-        time.monotonic() + seconds,
-        width,
-        lambda job, one: found.append((job, one)),
-        say=lambda line: None,
-    )
-    runner.run(jobs)
-    return {outcome.job: outcome for outcome in runner.outcomes}, found, log.read_text()
-
-
-def job(name, code, limit=30.0, **more):
-    import gpu_jobs
-
-    return gpu_jobs.Job(name, [sys.executable, "-c", code], limit, **more)
-
-
 def test_without_a_gpu_it_prints_one_line(tmp_path):
     environment = fork_server.ENVIRONMENT | {"CUDA_VISIBLE_DEVICES": ""}
     run = fork_server.run(BENCHMARKS / "gpu.py", "--out", tmp_path / "out", env=environment)
@@ -63,49 +34,6 @@ def test_without_a_gpu_it_prints_one_line(tmp_path):
     assert run.stdout.startswith("gpu: nothing was measured: ")
     assert len(run.stdout.splitlines()) == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_a_job_that_crashes_or_hangs_does_not_affect_others(gpu_modules, tmp_path):
-    report = 'print(\'@@ {"kind": "x", "value": 1}\', flush=True); '
-    outcomes, found, log = run_jobs(
-        tmp_path,
-        job("a child of its own", f"import subprocess; subprocess.run(['sleep', '{LONG}'])", 1.0),
-        job("crash", report + "import os; print('last words', flush=True); os.abort()"),
-        job("error", report + "raise ValueError('what was wrong')"),
-        job("normal", report + "print('@@ not json'); print('@@ {\"half', end='')"),
-    )
-    assert {name: outcome.state for name, outcome in outcomes.items()} == {
-        "a child of its own": "late",
-        "crash": "failed",
-        "error": "failed",
-        "normal": "done",
-    }
-    assert outcomes["crash"].reason == "SIGABRT; last words"
-    assert outcomes["error"].reason == "ValueError: what was wrong"
-    # Their earlier findings are not lost.
-    assert sorted(name for name, _ in found) == ["crash", "error", "normal"]
-    assert "===== crash: failed" in log
-    running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True).stdout
-    assert f"sleep {LONG}" not in running
-
-
-def test_timed_jobs_run_alone_and_others_together(gpu_modules, tmp_path):
-    """The others wait for each other; the timed one finds none of them."""
-    busy = f"import pathlib; busy = pathlib.Path({str(tmp_path)!r}) / 'busy'; "
-    together = [
-        job(
-            f"together {i}",
-            f"{busy}import time; busy.mkdir(exist_ok=True); (busy / '{i}').touch()\n"
-            "while len(list(busy.iterdir())) < 3: time.sleep(0.01)\n"
-            f"(busy / 'left {i}').touch()\n"
-            "while len(list(busy.glob('left *'))) < 3: time.sleep(0.01)\n",
-        )
-        for i in range(3)
-    ]
-    alone = job("alone", f"{busy}assert len(list(busy.glob('left *'))) in (0, 3)", alone=True)
-    outcomes, _, log = run_jobs(tmp_path, *together, alone, job("never", "", least=1000.0))
-    states = [outcome.state for outcome in outcomes.values()]
-    assert states == ["done"] * 4 + ["not run"], log
 
 
 def test_the_jobs_of_a_run(gpu_modules, tmp_path):
@@ -123,37 +51,6 @@ def test_the_jobs_of_a_run(gpu_modules, tmp_path):
     assert all(job.alone for job in planned[first_alone:])
     for job in planned:
         gpu_parts.parse(list(job.command[2:]))
-
-
-def part(name, *arguments, limit=100.0, **environment):
-    import gpu_jobs
-
-    paths = os.pathsep.join([str(ROOT / "src"), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return gpu_jobs.Job(
-        name,
-        [sys.executable, str(BENCHMARKS / "gpu_parts.py"), *map(str, arguments)],
-        limit,
-        environment={"PYTHONPATH": paths, **environment},
-    )
-
-
-def test_tests_continue_in_a_new_process_after_a_lost_gpu(gpu_modules, tmp_path):
-    """The GPU is lost after a test; each new process can use it again."""
-    test = tmp_path / "test_them.py"
-    test.write_text(
-        "import pytest\n"
-        "pytestmark = pytest.mark.gpu\n"
-        "def test_a():\n"
-        "    import sys; sys.modules['__main__'].gpu_is_lost = lambda: True\n"
-        "    assert 1 == 2, 'one is not two'\n"
-        "def test_b(): pass\n"
-    )
-    arguments = ["tests", str(test), "--done", str(tmp_path / "done")]
-    outcomes, found, log = run_jobs(tmp_path, part("t", *arguments))
-    assert outcomes["t"].state == "done", log
-    last = [one for _, one in found if one["kind"] == "tests"][-1]
-    assert last == {"kind": "tests", "passed": 1, "failed": 1, "skipped": 0, "total": 2}
-    assert any(f["kind"] == "failure" and "one is not two" in f["line"] for _, f in found)
 
 
 class FakeEvent:

@@ -44,28 +44,6 @@ def test_excerpts_are_current(excerpts):
         assert current, f"{page}: renew the excerpts with: python docs/excerpts.py"
 
 
-def test_an_excerpt_is_an_object_or_lines(excerpts, tmp_path, monkeypatch):
-    monkeypatch.setattr(excerpts, "ROOT", tmp_path)
-    source = (
-        "class A:\n    @property\n    def f(self):\n        x = 1\n        return x\n\n\ny = 2\n"
-    )
-    (tmp_path / "a.py").write_text(source)
-    page = tmp_path / "page.md"
-    for comment, code in [
-        ("a.py A.f", "@property\ndef f(self):\n    x = 1\n    return x"),
-        ('a.py A.f from "x = 1" to "return"', "x = 1\nreturn x"),
-        ('a.py from "x = 1" before "return"', "x = 1"),
-    ]:
-        for old in ("", "\n```python\nold\n\nlines\n```"):
-            page.write_text(f"text\n\n<!-- code: {comment} -->{old}\n\nmore\n")
-            block = f"<!-- code: {comment} -->\n```python\n{code}\n```"
-            assert excerpts.renewed(page) == f"text\n\n{block}\n\nmore\n"
-    for comment in ("a.py B", "b.py A", 'a.py A from "y = 2"'):
-        page.write_text(f"<!-- code: {comment} -->\n")
-        with pytest.raises(ValueError, match=r"page\.md: <!-- code"):
-            excerpts.renewed(page)
-
-
 def test_pages_of_the_course_need_no_directive():
     assert len(COURSE) >= 30
     for page in COURSE:

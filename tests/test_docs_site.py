@@ -1,7 +1,6 @@
 """The documentation site: it can be built without warnings, and describes all public names."""
 
 import importlib.util
-import json
 import re
 import subprocess
 import sys
@@ -119,28 +118,3 @@ def test_every_flag_is_described(site, capsys):
         assert len(flags) > 1
         for flag in set(flags) - {"help"}:
             assert f"cmdoption-snowsplat-{name}-{flag}" in anchors, flag
-
-
-@pytest.mark.parametrize(
-    ("words", "page"),
-    [
-        ("blurry holes floaters upside memory slow black", "guides/troubleshooting"),
-        ("delete share clean blurry", "quick-start"),
-        ("offline docker uv macos", "installation"),
-    ],
-)
-def test_the_search_finds_what_users_type(site, words, page):
-    from sphinx.search.en import SearchEnglish
-
-    text = (site / "searchindex.js").read_text(encoding="utf-8")
-    index = json.loads(text.removeprefix("Search.setIndex(").removesuffix(")"))
-    number = index["docnames"].index(page)
-    for word in words.split():
-        term = SearchEnglish({}).stem(word)
-        found = [index[kind].get(term, []) for kind in ("terms", "titleterms")]
-        assert any(number in listed(pages) for pages in found), word
-
-
-def listed(pages: int | list[int]) -> list[int]:
-    """The index has a number instead of a list of one."""
-    return [pages] if isinstance(pages, int) else pages

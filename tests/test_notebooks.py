@@ -154,21 +154,6 @@ def test_stored_without_outputs_and_with_the_installation_first(path):
     assert notebook["metadata"].keys() == {"kernelspec", "language_info"}
 
 
-@NAME
-def test_linked_files_exist(path):
-    for cell in cells(path, "markdown"):
-        for link in re.findall(r"\]\(([^):]+)\)", cell["source"]):
-            assert (path.parent / link).exists(), link  # without #: headings move
-
-
-def test_exercises_and_chapters_link_to_each_other():
-    for path in EXERCISES:
-        (link,) = re.findall(r"Chapter: \[.*\]\((.*)\)", cells(path, "markdown")[0]["source"])
-        chapter = (path.parent / link).resolve()
-        text = chapter.read_text(encoding="utf-8")
-        assert f"](../../notebooks/exercises/{path.name})" in text, chapter
-
-
 class Installed(Exception):
     """Instead of an installation."""
 
@@ -208,18 +193,6 @@ def test_the_first_cell_installs_a_wheel_or_the_checkout(first_cell, tmp_path, m
     fitting = tmp_path / "dist" / f"snowsplat-0.1.0-py3-none-any_{platform.machine().lower()}.whl"
     fitting.touch()
     assert first_cell() == str(fitting)
-
-
-@pytest.mark.parametrize("uploaded", [{"snowsplat-0.1.0.whl": b""}, {}])
-def test_in_colab_the_first_cell_asks_for_a_wheel(first_cell, monkeypatch, uploaded):
-    colab = types.ModuleType("google.colab")
-    colab.files = types.SimpleNamespace(upload=lambda: uploaded)
-    monkeypatch.setitem(sys.modules, "google.colab", colab)
-    if uploaded:
-        assert first_cell() == "snowsplat-0.1.0.whl"
-    else:
-        with pytest.raises(SystemExit, match="set SOURCE"):
-            first_cell()
 
 
 def solution(path: Path) -> str:

@@ -240,52 +240,6 @@ def test_make_without_a_compiler_names_the_package_to_install(bare_path):
     assert result.stderr.splitlines()[0] == NO_COMPILER
 
 
-@pytest.mark.parametrize(
-    ("driver", "index", "fails", "installed"),
-    [
-        (True, True, "", ["uv checkout"]),
-        (True, True, "'-m uv '*", ["uv checkout", "pip checkout"]),
-        (False, True, "", ["uv torch", "uv checkout"]),
-        (False, False, "*' torch'", ["uv torch", "uv checkout"]),
-        (False, None, "", ["uv checkout"]),
-    ],
-)
-def test_make_takes_the_small_build_of_pytorch_without_a_driver(
-    tmp_path, driver, index, fails, installed
-):
-    """The environment is a script that notes what it is asked to install; pip is the second choice.
-
-    ``index``: whether that of PyTorch can be reached; None: there is none. ``fails``: the pattern
-    of the commands that fail.
-    """
-    shutil.copy(REPOSITORY / "Makefile", tmp_path)
-    (tmp_path / "pyproject.toml").touch()
-    log = tmp_path / "log"
-    bootstrap, python = tmp_path / "bootstrap", tmp_path / ".venv" / "bin" / "python"
-    python.parent.mkdir(parents=True)
-    bootstrap.write_text(f"#!/bin/sh\nexit {int(not driver)}\n")
-    ends = f"case $* in {fails}) exit 1;; esac\n" if fails else ""
-    python.write_text(f'#!/bin/sh\necho "$*" >>{log}\n{ends}')
-    for script in (bootstrap, python):
-        script.chmod(0o755)
-    (tmp_path / ".venv" / ".tools").touch()
-    command = ["make", f"BOOTSTRAP={bootstrap}", ".venv/.installed"]
-    command += ["TORCH_BACKEND="] if index is None else []
-    # The caller's choice of the build, and its variables of make, are not those of this test.
-    own = {"TORCH_BACKEND", "MAKEFLAGS", "PYTHON"}
-    environment = {name: value for name, value in os.environ.items() if name not in own}
-    result = run(*command, cwd=tmp_path, env=environment | {"CXX": "sh"})
-    assert result.returncode == 0, result.stderr
-    lines = log.read_text().splitlines()
-    found = [
-        f"{line.split()[1]} {'checkout' if '--editable .[dev,docs]' in line else line.split()[-1]}"
-        for line in lines
-    ]
-    assert found == installed
-    assert all("--torch-backend=cpu" in line for line in lines if line.endswith(" torch"))
-    assert ("the default build is installed" in result.stderr) == (index is False)
-
-
 def test_command_is_installed():
     pyproject = (REPOSITORY / "pyproject.toml").read_text()
     assert 'snowsplat = "snowsplat.__main__:main"' in pyproject

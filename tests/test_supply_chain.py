@@ -1,5 +1,6 @@
 """What runs with the rights of the project or of its users is fixed, and has few rights."""
 
+import json
 import re
 from pathlib import Path
 
@@ -16,6 +17,13 @@ def test_actions_are_pinned_by_commit():
     for name, comment in others:
         assert re.fullmatch(r"[\w.-]+/[\w./-]+@[0-9a-f]{40}", name), name
         assert re.fullmatch(r" # v[\d.]+", comment), f"{name}: add its version as a comment"
+
+
+def test_packages_of_other_viewers_have_exact_versions():
+    """`benchmarks/viewers.py` runs them in a browser."""
+    file = ROOT / "benchmarks" / "viewers" / "package.json"
+    for name, version in json.loads(file.read_text(encoding="utf-8"))["dependencies"].items():
+        assert re.fullmatch(r"\d+\.\d+\.\d+", version), name
 
 
 def test_images_of_the_container_do_not_run_as_root():

@@ -2,8 +2,7 @@
 
 The target is A exp(−|x|² / 2τ²), the model a exp(−|x − d|² / 2σ²), both isotropic in n dimensions,
 without a normalising factor. The loss is L = ½ ∫ (model − target)² dx. docs/learn/initialisation.md
-derives the formulas, and tests/learn/test_initialisation.py compares them with numerical integrals
-and automatic derivatives. Lengths have the unit of τ. Arguments are floats or float64 tensors of
+derives the formulas. Lengths have the unit of τ. Arguments are floats or float64 tensors of
 shapes that can be broadcast; so are the results.
 """
 

@@ -82,24 +82,6 @@ def test_adam():
         assert float(parameters["opacity_logits"]) == pytest.approx(x)
 
 
-def test_the_step_does_not_depend_on_the_size_of_the_gradient():
-    steps = []
-    for size in (1e-6, 1.0, 1e6):
-        m = v = 0.0
-        t = 19
-        for _ in range(t):
-            m, v = 0.9 * m + 0.1 * size, 0.999 * v + 0.001 * size**2
-        steps.append((m / (1 - 0.9**t)) / math.sqrt(v / (1 - 0.999**t)))
-    assert steps == pytest.approx([1, 1, 1])
-
-
-def test_steps_are_longer_after_averages_of_zero_at_a_late_step():
-    """A constant gradient, with m = v = 0 where the correction has become 1: up to 6.6 rates."""
-    steps = [(1 - 0.9**k) / math.sqrt(1 - 0.999**k) for k in range(1, 4000)]
-    assert max(steps) == pytest.approx(6.6, abs=0.05)
-    assert steps[-1] == pytest.approx(1, abs=0.02)
-
-
 def test_the_rate_of_the_positions():
     rates, schedule = LearningRates(means_steps=1.0), Schedule(1000)
     for step in (0, 250, 500, 1000):
@@ -136,7 +118,3 @@ def test_ssim_by_its_formula():
     found = reference.ssim(a[:, :, None], b[:, :, None])
     assert float(found) == pytest.approx(float(torch.stack(values).mean()))
     assert float(reference.ssim(a[:, :, None], a[:, :, None])) == pytest.approx(1)
-
-
-def test_exercise_1():
-    assert math.ceil(2 * math.log(9) / 0.05) == 88

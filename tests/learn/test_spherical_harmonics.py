@@ -19,49 +19,6 @@ def directions(n: int) -> torch.Tensor:
     return v / v.norm(dim=1, keepdim=True)
 
 
-def sphere_mean(function) -> torch.Tensor:
-    """The mean over the sphere of polynomials up to degree 6: exact by Gauss-Legendre in z."""
-    # The nodes and weights of order 4 in z, and 8 equal angles.
-    z = torch.tensor(
-        [-0.8611363115940526, -0.3399810435848563, 0.3399810435848563, 0.8611363115940526]
-    )
-    w = torch.tensor(
-        [0.3478548451374538, 0.6521451548625461, 0.6521451548625461, 0.3478548451374538]
-    )
-    z, w = z.double(), w.double() / 2
-    angle = torch.arange(8, dtype=torch.float64) * math.pi / 4
-    r = (1 - z * z).sqrt()
-    v = torch.stack(
-        [r[:, None] * angle.cos(), r[:, None] * angle.sin(), z[:, None].expand(4, 8)], dim=2
-    ).reshape(-1, 3)
-    weights = (w[:, None] / 8).expand(4, 8).reshape(-1)
-    values = function(v)
-    return (weights.reshape(-1, *[1] * (values.ndim - 1)) * values).sum(dim=0)
-
-
-def test_the_integrals_of_the_page():
-    for function, expected in (
-        (lambda v: v[:, 0] ** 2, 4 * math.pi / 3),
-        (lambda v: v[:, 0] ** 4, 4 * math.pi / 5),
-        (lambda v: v[:, 0] ** 2 * v[:, 1] ** 2, 4 * math.pi / 15),
-        (lambda v: (v[:, 0] ** 2 - v[:, 1] ** 2) ** 2, 16 * math.pi / 15),
-        (lambda v: v[:, 0] ** 6, 4 * math.pi / 7),
-        (lambda v: v[:, 0] ** 4 * v[:, 1] ** 2, 4 * math.pi / 35),
-        (lambda v: v.prod(dim=1) ** 2, 4 * math.pi / 105),
-    ):
-        assert 4 * math.pi * float(sphere_mean(function)) == pytest.approx(expected, rel=1e-7)
-
-
-def test_the_functions_are_orthonormal():
-    def products(v: torch.Tensor) -> torch.Tensor:
-        Y = reference.sh_basis(v, 3)
-        return Y[:, :, None] * Y[:, None, :]
-
-    # float32 nodes limit the accuracy.
-    gram = 4 * math.pi * sphere_mean(products)
-    assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-6)
-
-
 def test_the_table_is_that_of_the_code():
     """Every row: function, factor as a root, and factor as a number."""
     rows = re.findall(
@@ -122,8 +79,3 @@ def test_rotation_of_coefficients():
         D[block, block] = 0
     D[0, 0] = 0
     assert D.abs().max() < 1e-10  # the degrees do not mix
-
-
-def test_exercise_1():
-    red = 0.5 / reference.C0
-    assert red == pytest.approx(1.7725, abs=5e-5)

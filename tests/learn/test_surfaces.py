@@ -1,7 +1,6 @@
 """The formulas of docs/learn/surfaces.md."""
 
 import math
-from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from snowsplat.training.parts.depth_supervision import depth_term
 from snowsplat.training.parts.surfaces import planes_of
 
 DOUBLE = {"dtype": torch.float64}
-NORMAL = NormalDist()
 
 
 def depths_of(alphas: list[float], depths: list[float]) -> tuple[float, float]:
@@ -45,17 +43,6 @@ def test_mean_and_median_at_an_edge(alpha, mean, median):
     assert found == (pytest.approx(mean, abs=5e-3), median)
     w1, w2 = alpha, 0.9 * (1 - alpha)
     assert found[0] - 2 == pytest.approx((5 - 2) * w2 / (w1 + w2))
-
-
-@pytest.mark.parametrize(
-    ("opacity", "mean", "median"), [(0.75, -0.38, 0.0), (0.9, -0.60, -0.52), (0.99, -1.03, -1.03)]
-)
-def test_a_wall_of_faint_gaussians_appears_too_near(opacity, mean, median):
-    n, kappa = 300, -math.log(1 - opacity)
-    depths = [NORMAL.inv_cdf((i + 0.5) / n) for i in range(n)]
-    found = depths_of([1 - (1 - opacity) ** (1 / n)] * n, [10 + z for z in depths])
-    assert found == (pytest.approx(10 + mean, abs=0.02), pytest.approx(10 + median, abs=0.02))
-    assert NORMAL.inv_cdf(math.log(2) / kappa) == pytest.approx(median, abs=5e-3)
 
 
 def one_gaussian(scales: list[float]) -> tuple[Gaussians, torch.Tensor]:
@@ -123,13 +110,6 @@ def test_the_pull_of_a_wrong_depth(residual, pull):
     assert float(inverse.grad[0, 0]) * inverse.numel() == pytest.approx(pull, abs=5e-3)
 
 
-def test_the_pull_of_a_wrong_normal():
-    c = 1 - math.cos(math.radians(15))
-    assert c == pytest.approx(0.034, abs=5e-4)
-    assert 1 / (1 + (1 - math.cos(math.radians(60))) / c) == pytest.approx(0.06, abs=5e-3)
-    assert 1 - math.cos(math.radians(20)) == pytest.approx(0.060, abs=5e-4)
-
-
 def fused_at(z: np.ndarray, maps: list[tuple[float, float]], truncation: float) -> np.ndarray:
     """(len(z), 2): W and D of voxels at depths, by the reference."""
     sums = torch.zeros(len(z), 1, 1, 1, 2, **DOUBLE)
@@ -159,13 +139,3 @@ def test_a_surface_net_crosses_where_the_field_is_zero():
     vertices, faces = zero_level(Volume(1.0, block_keys(np.zeros((1, 3), int)), sums))
     assert np.allclose(vertices[:, 2], 2.75)
     assert len(faces) == 2 * (SIDE - 2) ** 2
-
-
-def test_exercises():
-    kappa = -math.log(1e-4)
-    assert 2 * NORMAL.inv_cdf(math.log(2) / kappa) == pytest.approx(-2.9, abs=0.05)
-    mean, d = np.array([0.3, -0.2, 3.0]), np.array([0.2, 0.1, 1.0])
-    foot = d * (d @ mean) / (d @ d)
-    assert np.linalg.norm(foot - mean / 2) == pytest.approx(np.linalg.norm(mean / 2))
-    front, back = ((s, 1 + min(s, 0)) for s in (-0.5, 0.25))
-    assert front[0] * front[1] + back[0] * back[1] == pytest.approx(0)

@@ -30,6 +30,13 @@ def test_the_target_projects_to_the_principal_point(camera):
     assert torch.allclose(depth, torch.tensor([14.0**0.5], dtype=F64))
 
 
+def test_points_are_projected_by_the_pose_then_the_focal_lengths(camera):
+    points = torch.randn(20, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+    x, y, z = camera.cam_from_world[:, :3] @ points.T + camera.cam_from_world[:, 3:]
+    expected = torch.stack([500.0 * x / z + 320.25, 510.0 * y / z + 241.5], 1)
+    torch.testing.assert_close(camera.project(points), (expected, z))
+
+
 def test_scaling_scales_projections(camera):
     points = torch.randn(20, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
     small = camera.scaled(320, 241)
