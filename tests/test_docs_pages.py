@@ -152,6 +152,7 @@ def browser(request):
 
 
 @pytest.mark.browser
+@pytest.mark.nightly
 def test_a_plain_renderer_shows_every_figure(browser, tmp_path):
     markdown_it = pytest.importorskip("markdown_it", reason="comes with the documentation tools")
     markdown = markdown_it.MarkdownIt("commonmark").enable("table")

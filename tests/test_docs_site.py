@@ -1,4 +1,7 @@
-"""The documentation site: it can be built without warnings, and describes all public names."""
+"""The documentation site: it can be built without warnings, and describes all public names.
+
+The build takes as long as a hundred other tests, so it is for the night; `make docs` does the same.
+"""
 
 import importlib.util
 import re
@@ -20,7 +23,7 @@ extras.register()
 ROOT = Path(__file__).resolve().parents[1]
 
 pytestmark = [
-    pytest.mark.build,
+    pytest.mark.nightly,
     pytest.mark.skipif(
         importlib.util.find_spec("sphinx") is None, reason="needs Sphinx (make dev installs it)"
     ),

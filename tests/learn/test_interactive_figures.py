@@ -1,4 +1,8 @@
-"""The interactive figures of the course in a real browser: by keys, mouse and touch."""
+"""The interactive figures of the course in a real browser: by keys, mouse and touch.
+
+They are a part of the documentation, not of the package: only whether they work is tested with each
+change, in both languages; what they show, at night.
+"""
 
 from __future__ import annotations
 
@@ -127,6 +131,7 @@ def test_every_page_has_its_figures():
         assert sorted(re.findall('data-figure="(.*?)"', text)) == sorted(FIGURES)
 
 
+@pytest.mark.nightly
 def test_covariance(page):
     """The matrix is that of the sliders; the entries can be no covariance."""
     put(page, "covariance", "s1", 2)
@@ -149,6 +154,7 @@ def test_covariance(page):
     assert data(page, "covariance", "valid") == "true"
 
 
+@pytest.mark.nightly
 def test_projection(page):
     """A small Gaussian is projected as the theory says; a near and large one is not. By touch."""
     exact = 1 - math.exp(-2)  # inside of k = 2, in two dimensions
@@ -163,6 +169,7 @@ def test_projection(page):
     assert "Behind the camera" in status
 
 
+@pytest.mark.nightly
 def test_harmonics(page):
     """The coefficients are those of the reference, and each degree lowers the error."""
     put(page, "harmonics", "target", "soft")
@@ -196,6 +203,7 @@ def test_harmonics(page):
     assert len(set(pictures)) == 3
 
 
+@pytest.mark.nightly
 def test_blending(page):
     """The colour of the pixel is that of the formula, in the order of depth and of the list."""
     colours = np.array([[214, 69, 65], [60, 140, 220], [242, 183, 5], [72, 160, 90]])
@@ -219,6 +227,7 @@ def test_blending(page):
     np.testing.assert_allclose(shown(), pixel([1, 0, 2, 3]), atol=1)
 
 
+@pytest.mark.nightly
 def test_tiles(page):
     """Each tile has the splats that reach one of its pixels, and few others; the list is sorted."""
     text = (DOCS / "static" / "interactive" / "tiles-data.js").read_text(encoding="utf-8")
@@ -263,6 +272,7 @@ def test_tiles(page):
     np.testing.assert_allclose(seen[:3], 255 * colour, atol=2)
 
 
+@pytest.mark.nightly
 def test_density_control(page):
     count = int(data(page, "density", "count"))
     for stage in ("fitted", "judged", "changed", "fitted", "judged"):
@@ -280,6 +290,7 @@ def test_density_control(page):
     assert int(data(page, "density", "count")) == count
 
 
+@pytest.mark.nightly
 def test_gradients_of_the_live_fit(page):
     """Against central differences, for all nine parameters of overlapping Gaussians."""
     worst = page.evaluate(
@@ -304,6 +315,7 @@ def test_gradients_of_the_live_fit(page):
     assert worst < 1e-6
 
 
+@pytest.mark.nightly
 def test_live_fit_of_a_dropped_picture(page, tmp_path):
     y, x = np.mgrid[0:48, 0:64]
     pixels = np.stack([4 * x, 5 * y, np.where((x // 16 + y // 16) % 2, 200, 40)], axis=-1)
