@@ -22,8 +22,10 @@ import pytest
 import torch
 
 from snowsplat.pipeline.quality import PRESETS
-from snowsplat.synthetic import light, photographer
+from snowsplat.synthetic import photographer
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
+
+from .scenes.coarse import coarse_still_life
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -260,9 +262,7 @@ def test_runs_at_a_small_scale(path, here, monkeypatch):
     display = pytest.importorskip("IPython.display", reason="needs ipykernel")
     shown_later = types.SimpleNamespace(update=lambda image: None)
     monkeypatch.setattr(display, "display", lambda **_: shown_later)
-    # Light at fewer points: building the still life takes most of the time.
-    monkeypatch.setattr(light, "_SPACING", 0.1)
-    monkeypatch.setattr(light, "_MOST_POINTS", 12)
+    coarse_still_life(monkeypatch)
     monkeypatch.setattr(photographer, "RAYS", 1)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=30))
     if path.stem == "06_your_own_photos":  # with poses: other tests are about finding them

@@ -13,7 +13,8 @@ from snowsplat.pipeline import demo
 from snowsplat.pipeline.compute import Compute
 from snowsplat.pipeline.options.make import MakeOptions
 from snowsplat.pipeline.quality import PRESETS
-from snowsplat.synthetic import light
+
+from ..scenes.coarse import coarse_still_life
 
 
 @pytest.fixture
@@ -23,9 +24,7 @@ def small(monkeypatch) -> None:
         snowsplat.synthetic.write_synthetic_photos, n_views=14, width=320, height=240
     )
     monkeypatch.setattr(demo, "write_synthetic_photos", photos)
-    # Light at fewer points: building the still life takes most of the time.
-    monkeypatch.setattr(light, "_SPACING", 0.1)
-    monkeypatch.setattr(light, "_MOST_POINTS", 12)
+    coarse_still_life(monkeypatch, 2.0)
     monkeypatch.setitem(PRESETS, "draft", replace(PRESETS["draft"], iterations=30))
     monkeypatch.setattr(demo, "_OPTIONS", MakeOptions("draft", compute=Compute(threads=1)))
     monkeypatch.setattr(demo, "MAX_DEGREES", 3.0)

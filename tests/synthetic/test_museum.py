@@ -6,12 +6,12 @@ import torch
 from PIL import Image
 
 from snowsplat import load_dataset
-from snowsplat.synthetic import light
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid
 
+from ..scenes.coarse import coarse_light
 from ..scenes.glass import GlassScene
 from ..scenes.museum import Museum, write_museum_dataset
 from ..scenes.shutter import Shutter, photograph
@@ -85,10 +85,8 @@ def test_glass_shows_what_is_behind_it_and_reflects_what_is_before_it():
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    # Light at fewer points: building the hall takes most of the time.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(light, "_SPACING", 0.5)
-        patch.setattr(light, "_MOST_POINTS", 12)
+        coarse_light(patch, 0.5)
         folder = tmp_path_factory.mktemp("museum")
         return write_museum_dataset(folder, Museum(gloss=False), 4, 80, 60, points_per_view=60)
 

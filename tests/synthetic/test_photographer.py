@@ -7,13 +7,14 @@ from PIL import Image
 
 from snowsplat.data.colmap.model import read_model
 from snowsplat.scene.geometry import rotation_from_quat, transform_points
-from snowsplat.synthetic import light, still_life, write_synthetic_photos
+from snowsplat.synthetic import write_synthetic_photos
 from snowsplat.synthetic.lens import Lens
 from snowsplat.synthetic.light import Lamp
 from snowsplat.synthetic.photographer import photograph, walk
 from snowsplat.synthetic.scene import Scene, SceneObject
 from snowsplat.synthetic.shapes import Box, Ellipsoid, Frustum, Ring
 
+from ..scenes.coarse import coarse_still_life
 from ..scenes.lenses import FisheyeLens
 
 pytestmark = pytest.mark.slow
@@ -27,15 +28,8 @@ DISTORTIONS = [
 
 @pytest.fixture(scope="module")
 def coarse_scene():
-    """The still life with fewer texels and light at fewer points: the photos are small.
-
-    Otherwise, most of the time would be spent on building the scene.
-    """
-    size = still_life._size
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(still_life, "_size", lambda metres, texel: size(metres, 4 * texel))
-        patch.setattr(light, "_SPACING", 0.1)
-        patch.setattr(light, "_MOST_POINTS", 12)
+        coarse_still_life(patch)
         yield
 
 

@@ -7,8 +7,8 @@ from PIL import Image
 
 from snowsplat import load_dataset
 from snowsplat.scene.geometry import transform_points
-from snowsplat.synthetic import light
 
+from ..scenes.coarse import coarse_light
 from ..scenes.street_dataset import walk_along, write_street_dataset
 
 pytestmark = pytest.mark.slow
@@ -16,10 +16,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    # Light at fewer points: building the street takes most of the time.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(light, "_SPACING", 0.5)
-        patch.setattr(light, "_MOST_POINTS", 12)
+        coarse_light(patch, 0.5)
         return write_street_dataset(tmp_path_factory.mktemp("street"), 6, 96, 64, seed=1)
 
 

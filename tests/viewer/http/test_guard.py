@@ -85,14 +85,6 @@ def test_bodies(server):
         assert put(server, "size", bytes(count)) == (200, str(count).encode())
 
 
-def test_a_body_that_contains_a_request_is_not_one(server):
-    inner = head(server, "size", "Content-Length: 0")
-    both = head(server, "size", f"Content-Length: {len(inner)}") + inner
-    answer = clients.ask(server.url, both + head(server, "size", "Connection: close"))
-    assert answer.count(b"HTTP/1.1 200") == 2
-    assert answer.split(b"\r\n\r\n")[1].startswith(str(len(inner)).encode())
-
-
 def test_an_answer_before_the_body_is_received(server):
     """The rest of the body is read, and is not taken for a request."""
     request = head(server, "early", "Content-Length: 300000") + bytes(300_000)
@@ -195,13 +187,6 @@ def test_floods_are_disconnected(server, data):
     with websocket(server, "echo") as socket:  # others are served
         socket.send("hello")
         assert socket.recv() == "hello"
-
-
-def test_a_page_may_send_its_messages(server):
-    with websocket(server, "echo") as socket:
-        for i in range(300):
-            socket.send(str(i))
-            assert socket.recv() == str(i)
 
 
 def test_a_websocket_that_does_not_read_is_disconnected(server, monkeypatch):

@@ -1,4 +1,4 @@
-"""Training with hostile clients: it continues, nearly as fast, with a bit-identical result."""
+"""Training with hostile clients: it continues, with a bit-identical result."""
 
 import dataclasses
 import os
@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from snowsplat.data import Dataset, load_dataset
 from snowsplat.synthetic.toy_dataset import write_toy_dataset
 from snowsplat.training.core.trainer import Trainer
 from snowsplat.training.settings.config import TrainConfig
-from snowsplat.viewer.live import time_limit
 from snowsplat.viewer.live.curves import SampledPsnr
 from snowsplat.viewer.live.training import TrainingViewer
 from snowsplat.viewer.live.viewer import NetworkViewer
@@ -26,7 +24,6 @@ from ..clients import Visitor
 
 pytestmark = pytest.mark.slow
 
-TICKS = os.sysconf("SC_CLK_TCK")
 STEPS = 1_000_000
 
 
@@ -38,29 +35,10 @@ class Watched:
         self.viewer = NetworkViewer(dataset)
         sampled_psnr = SampledPsnr(dataset.train, self.viewer.background)
         self._training = TrainingViewer(self.viewer, sampled_psnr)
-        self._stat = Path(f"/proc/self/task/{self.viewer.server.thread.native_id}/stat")
 
     def step(self) -> None:
         loss = self.trainer.step_once()
         self._training.after_step(self.trainer.step, STEPS, loss, self.trainer.gaussians)
-
-    def run(self, seconds: float) -> float:
-        """Make steps for this time; returns the steps per second.
-
-        Half of the time is idle: each step is repeated later without clients, and an idle thread
-        does not limit the server's share.
-        """
-        began, first = time.monotonic(), self.trainer.step
-        while time.monotonic() - began < seconds:
-            step_began = time.monotonic()
-            self.step()
-            time.sleep(time.monotonic() - step_began)
-        return (self.trainer.step - first) / (time.monotonic() - began)
-
-    def server_seconds(self) -> float:
-        """Processor time of the server's thread."""
-        fields = self._stat.read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / TICKS
 
     def close(self) -> None:
         self.viewer.close()
@@ -96,9 +74,7 @@ def attack(url: str, seconds: float, **kinds: int) -> subprocess.Popen[str]:
 
 
 def test_the_training_continues_bit_identically(watched, dataset, capfd):
-    """The server's thread uses at most its share; the scene is the same as without clients."""
-    watched.run(0.5)
-    seconds = 3.0
+    """The scene is the same as without clients. For the server's share, see test_time_limit.py."""
     for kinds in (
         {"half_open": 10, "strangers": 4},  # of the first, a thousand connections
         {
@@ -110,13 +86,9 @@ def test_the_training_continues_bit_identically(watched, dataset, capfd):
             "keys": 2,
         },
     ):
-        process = attack(watched.viewer.url, seconds + 1.0, **kinds)
-        before = watched.server_seconds()
-        began = time.monotonic()
-        rate = watched.run(seconds)
-        share = (watched.server_seconds() - before) / (time.monotonic() - began)
-        assert share < time_limit._SHARE + 0.15
-        assert rate > 0
+        process = attack(watched.viewer.url, 600.0, **kinds)
+        for _ in range(150):
+            watched.step()
         process.kill()
         process.wait()
     plain = Trainer(dataset, TrainConfig(iterations=STEPS))

@@ -1,0 +1,60 @@
+"""The server's share of a core while it is in the process that trains."""
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+
+from snowsplat.viewer.live import time_limit
+from snowsplat.viewer.live.time_limit import ServerTimeLimit
+
+
+class Clock:
+    """Seconds of the clock, and of the processor in this thread."""
+
+    now = used = 100.0
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def work(self, seconds: float) -> None:
+        self.now += seconds
+        self.used += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Clock:
+    clock = Clock()
+    fake = SimpleNamespace(
+        monotonic=lambda: clock.now, thread_time=lambda: clock.used, sleep=clock.sleep
+    )
+    monkeypatch.setattr(time_limit, "time", fake)
+    loop = SimpleNamespace(call_later=lambda seconds, measure: clock.sleep(seconds))
+    monkeypatch.setattr(asyncio, "get_running_loop", lambda: loop)
+    return clock
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_busy_server_has_a_fifth_of_a_core_during_training(clock, training):
+    limit = ServerTimeLimit(lambda: training)
+    limit.measure()
+    begun, used = clock.now, clock.used
+    for _ in range(50):
+        clock.work(0.03)
+        limit.measure()
+    share = (clock.used - used) / (clock.now - begun)
+    assert share == pytest.approx(0.2 if training else 0.03 / 0.08, rel=0.03)
+
+
+def test_a_pause_is_at_most_a_second_and_work_for_the_training_is_not_counted(clock):
+    limit = ServerTimeLimit(lambda: True)
+    limit.measure()
+    clock.work(10.0)
+    before = clock.now
+    limit.measure()
+    assert clock.now - before == pytest.approx(1.0 + time_limit._TICK)
+    with limit.uncounted():
+        clock.work(10.0)
+    before = clock.now
+    limit.measure()
+    assert clock.now - before == pytest.approx(time_limit._TICK)
