@@ -33,6 +33,8 @@ class Reason:
     grade: Grade  # the best grade that is possible with this reason; "good": only a remark
     text: Message  # a clause without a full stop
     advice: Message = _NO_ADVICE  # what to do next time, an imperative clause; empty: nothing
+    # A prediction from the photos alone. What photos show that were held out has priority.
+    predicted: bool = False
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,8 @@ def told(verdict: Verdict) -> str:
     [
         (evaluation(0.95, 0.96, 0.97), SHARP, "good", "reproduces 96% of the contrast"),
         (evaluation(0.85, 0.86, 0.87), evaluation(0.9), "usable", "reproduces only 86%"),
-        (evaluation(0.85, 0.86, 0.87), SHARP, "poor", "the error is 2.6 times"),
+        (evaluation(0.85, 0.86, 0.87), SHARP, "usable", "the error is 2.6 times"),
+        (evaluation(0.7, 0.7, 0.7), SHARP, "poor", "the error is 3.9 times"),
         (evaluation(0.6, 0.6, 0.6), evaluation(0.8), "poor", "reproduces only 60%"),
         (evaluation(-0.2), evaluation(0.3), "poor", "0.3 of"),
         (evaluation(0.95, 0.96, 0.97, ssim=0.6), SHARP, "usable", "blurred in held-out photos"),
@@ -108,10 +109,31 @@ def test_what_the_training_has_found(dataset):
     assert scene_verdict(good, SHARP, dataset, found[:1]).grade == "good"
 
 
-def test_the_verdict_on_the_photos_counts_but_held_out_photos_outweigh_it(dataset):
-    far = Verdict.of([Reason("poor", "the photos are far apart")])
-    assert scene_verdict(evaluation(0.95), SHARP, dataset, capture=far).grade == "poor"
-    many = evaluation(0.95, 0.96, 0.97)
-    assert scene_verdict(many, SHARP, dataset, capture=far).grade == "usable"
-    nice = Verdict.of([Reason("good", "50 photos")])
+@pytest.mark.parametrize(
+    ("grade", "predicted", "held_out", "as_part_of"),
+    [
+        ("poor", False, evaluation(0.95), "poor"),
+        ("poor", False, evaluation(0.95, 0.96, 0.97), "usable"),
+        ("poor", True, evaluation(0.7), "poor"),
+        ("poor", True, evaluation(0.8), "usable"),
+        ("poor", True, evaluation(0.95, 0.96, 0.97), "usable"),
+        ("usable", True, evaluation(0.95), "usable"),
+        ("usable", True, evaluation(0.95, 0.96, 0.97), "good"),
+        ("usable", True, evaluation(0.95, 0.96, 0.97, ssim=0.6), "usable"),
+        ("usable", False, evaluation(0.95, 0.96, 0.97), "usable"),
+        ("good", False, evaluation(0.5), "good"),
+    ],
+)
+def test_the_verdict_on_the_photos_counts_but_held_out_photos_outweigh_it(
+    dataset, grade, predicted, held_out, as_part_of
+):
+    of_photos = Reason(grade, message("photo"), message("move"), predicted)
+    verdict = scene_verdict(held_out, SHARP, dataset, capture=Verdict.of([of_photos]))
+    (reason,) = [each for each in verdict.reasons if str(each.text) == "photo"]
+    assert reason.grade == as_part_of
+    assert (reason.advice == message("move")) == (as_part_of != "good" or grade == "good")
+
+
+def test_few_held_out_photos_do_not_contradict_the_verdict_on_the_photos(dataset):
+    nice = Verdict.of([Reason("good", message("50 photos"))])
     assert scene_verdict(evaluation(0.5), SHARP, dataset, capture=nice).grade == "poor"

@@ -76,9 +76,10 @@ def capture_verdict(
     # A few photos are enough for one side of a scene.
     if photos < _TOO_FEW:
         too_few = message("{count} photos are too few", count=photos)
-        reasons.append(Reason("poor", too_few, many))
+        reasons.append(Reason("poor", too_few, many, predicted=True))
     elif photos < _FEW and not (one_way and step <= _SMALL_STEP):
-        reasons.append(Reason("usable", message("{count} photos are few", count=photos), many))
+        few_photos = message("{count} photos are few", count=photos)
+        reasons.append(Reason("usable", few_photos, many, predicted=True))
     if repeats := int((coverage.step < _SAME_PLACE).sum()):
         places = photos - repeats // 2  # each such place has at least two photos
         text = message(
@@ -98,7 +99,7 @@ def capture_verdict(
         advice = message(
             "leave out photos that are blurred or show moving objects, or try another --camera"
         )
-        reasons.append(Reason("usable", text, advice))
+        reasons.append(Reason("usable", text, advice, predicted=True))
     if problems and len(problems) >= _BAD_PHOTOS * len(coverage.names):
         most, number = Counter(problems.values()).most_common(1)[0]
         text = message(
@@ -107,7 +108,7 @@ def capture_verdict(
             count=len(coverage.names),
             what=PROBLEMS[most].what,
         )
-        reasons.append(Reason("usable", text, PROBLEMS[most].advice))
+        reasons.append(Reason("usable", text, PROBLEMS[most].advice, predicted=True))
     if one_way:
         text = message(
             "all photos look in about the same direction: the scene can be seen from there only"
@@ -166,9 +167,10 @@ def _distances(confirmed: float, step: float) -> list[Reason]:
             "only one other photo",
             share=1 - confirmed,
         )
-        reasons.append(Reason("poor", why, _CLOSER))
+        reasons.append(Reason("poor", why, _CLOSER, predicted=True))
     if step > _LARGE_STEP:
-        reasons.append(Reason("poor" if step > _HUGE_STEP else "usable", far, _CLOSER))
+        grade: Grade = "poor" if step > _HUGE_STEP else "usable"
+        reasons.append(Reason(grade, far, _CLOSER, predicted=True))
     return reasons
 
 

@@ -2,18 +2,20 @@
 
 The held-out photos are the evidence. Their PSNR depends on the contrast of the photos, so the share
 of the variance that the rendering explains decides; see `ViewMetrics.explained`. The comparison
-with training photos tells why: if those look right, the scene lacks photos, not steps.
+with training photos tells why: if those look right, the scene lacks photos, not steps. What the
+verdict on the photos only predicts has less weight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from snowsplat.data.dataset import Dataset, View
 from snowsplat.evaluation.metrics import Evaluation, ViewMetrics
-from snowsplat.evaluation.verdict import Reason, Verdict
+from snowsplat.evaluation.verdict import Grade, Reason, Verdict
 from snowsplat.training.starts.point_colors import point_pixels
 from snowsplat.util.messages import Message, message, plural
 from snowsplat.util.names import first_names
@@ -69,19 +71,29 @@ def scene_verdict(
         of_parts: the reasons of the parts of the training, see `Part.report`.
         capture: the verdict on the photos of the dataset.
     """
-    typical = _typical(held_out)
     reasons = [
         *_new_views(held_out, trained_on, dataset),
         *_worst(held_out, dataset),
         *_sharpness(held_out),
         *of_parts,
+        *(_in_this_scene(reason, held_out) for reason in (capture.reasons if capture else ())),
     ]
-    sure = typical >= _GOOD and len(held_out.views) >= _EVIDENCE
-    for reason in capture.reasons if capture is not None else ():
-        # What the held-out photos do not show is no fault of the scene, but limits it.
-        grade = "usable" if reason.grade == "poor" and sure else reason.grade
-        reasons.append(Reason(grade, reason.text, reason.advice))
     return Verdict.of(reasons)
+
+
+def _in_this_scene(reason: Reason, held_out: Evaluation) -> Reason:
+    """A reason of the verdict on the photos, in view of the held-out photos.
+
+    What these do not show is no fault of the scene, but limits it. A prediction that they refute is
+    only a remark.
+    """
+    share, grade = _typical(held_out), reason.grade
+    sure = share >= _GOOD and len(held_out.views) >= _EVIDENCE
+    if grade == "poor" and (sure or (reason.predicted and share >= _USABLE)):
+        grade = "usable"
+    elif reason.predicted and sure and not _sharpness(held_out):
+        return Reason("good", reason.text)
+    return replace(reason, grade=grade)
 
 
 def _new_views(held_out: Evaluation, trained_on: Evaluation, dataset: Dataset) -> list[Reason]:
@@ -112,16 +124,17 @@ def _new_views(held_out: Evaluation, trained_on: Evaluation, dataset: Dataset) -
         "({psnr:.1f} dB, colour-aligned, {photos})",
         **values,
     )
+    grade: Grade = "poor" if share < _USABLE else "usable"
     factor = 10.0 ** ((_psnr(trained_on) - _psnr(held_out)) / 20.0)
     if factor < _LACKS_PHOTOS:
-        return [Reason("poor" if share < _USABLE else "usable", text)]
+        return [Reason(grade, text)]
     text = message(
         "{text}; the error is {factor:.1f} times that of the photos that it was trained on",
         text=text,
         factor=factor,
     )
     worst = min(held_out.views, key=_share).name
-    return [Reason("poor", text, _advice(worst, dataset))]
+    return [Reason(grade, text, _advice(worst, dataset))]
 
 
 def _advice(name: str, dataset: Dataset) -> Message:
